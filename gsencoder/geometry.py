@@ -1,0 +1,181 @@
+"""Rotations, covariances, projection and spherical harmonics: pure functions of torch tensors, in any float type.
+
+Frames are named in the arguments (`target_from_source`). Camera axes are OpenCV's, quaternions are wxyz, pixel centres
+lie at .5, scales are standard deviations. Every function keeps the dtype and device that it is given.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+ALPHA_MIN = 1 / 255
+"""Below this a Gaussian does not mark a pixel (Kerbl et al. 2023; gsplat)."""
+
+ALPHA_MAX = 0.999
+"""One Gaussian never closes a ray completely, so that log1p(-alpha) stays finite."""
+
+
+class Projected(NamedTuple):
+    """Gaussians on one image plane.
+
+    Attributes:
+        means2d: centres in pixels.
+        conics: a, b, c of the inverse 2D covariance [[a, b], [b, c]], in 1/pixel².
+        depths: z in the camera, world units.
+        mahalanobis2: squared Mahalanobis radius at which alpha falls to ALPHA_MIN; 0 where it never reaches it.
+        extents: half width and half height in pixels of the ellipse of that radius.
+        valid: in front of the near plane, not too faint, and touching the image.
+    """
+
+    means2d: Float[Tensor, "N 2"]
+    conics: Float[Tensor, "N 3"]
+    depths: Float[Tensor, " N"]
+    mahalanobis2: Float[Tensor, " N"]
+    extents: Float[Tensor, "N 2"]
+    valid: Bool[Tensor, " N"]
+
+
+def normalize_quats(quats: Float[Tensor, "*n 4"], eps: float = 1e-12) -> Float[Tensor, "*n 4"]:
+    """Unit quaternions; the eps stands inside the root, so a zero quaternion has a finite gradient."""
+    return quats / torch.sqrt((quats * quats).sum(dim=-1, keepdim=True) + eps * eps)
+
+
+def rotmats_from_quats(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
+    """Rotation matrices of quaternions wxyz, which are normalised first."""
+    w, x, y, z = normalize_quats(quats).unbind(dim=-1)
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def covariances(quats: Float[Tensor, "*n 4"], scales: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """Σ = R S Sᵀ Rᵀ (SplatDistill sec. 3.1), in squared world units."""
+    half = rotmats_from_quats(quats) * scales.unsqueeze(-2)
+    return half @ half.mT
+
+
+def transform(target_from_source: Float[Tensor, "4 4"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Rigid motion of points."""
+    return points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
+
+
+def invert_rigid(target_from_source: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
+    """source_from_target of a rigid transform: [Rᵀ | −Rᵀt]."""
+    rotation = target_from_source[..., :3, :3].mT
+    inverse = torch.zeros_like(target_from_source)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -(rotation @ target_from_source[..., :3, 3:]).squeeze(-1)
+    inverse[..., 3, 3] = 1
+    return inverse
+
+
+def project(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    cam_from_world: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+    width: int,
+    height: int,
+    *,
+    eps2d: float = 0.3,
+    near: float = 0.01,
+) -> Projected:
+    """Perspective EWA splatting (Zwicker et al. 2001) with gsplat's conventions.
+
+    The Jacobian is taken at x/z and y/z clamped to 30 % of the half field of view beyond the image: without that, a
+    Gaussian just beside the camera covers the whole image. `eps2d` pixels² are added to both variances.
+
+    Args:
+        means, quats, scales, opacities: N Gaussians, world units.
+        cam_from_world: rigid.
+        K: intrinsics in pixels.
+        width, height: image size in pixels.
+        eps2d: low-pass variance in pixels².
+        near: smallest depth, world units.
+    """
+    rotation = cam_from_world[:3, :3]
+    x, y, z = transform(cam_from_world, means).unbind(dim=-1)
+    front = z > near
+    # Rows behind the near plane are masked out; a harmless depth keeps their arithmetic, and its gradient, finite.
+    z = torch.where(front, z, torch.ones_like(z))
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
+    tx = torch.minimum(torch.maximum(x / z, -(cx / fx + slack_x)), (width - cx) / fx + slack_x)
+    ty = torch.minimum(torch.maximum(y / z, -(cy / fy + slack_y)), (height - cy) / fy + slack_y)
+    inv_z = 1 / z
+    # Rows of J R S', where S' = R_g diag(s): the two image-plane rows of the square root of the 2D covariance.
+    half = rotation @ (rotmats_from_quats(quats) * scales.unsqueeze(-2))
+    row_x = (fx * inv_z).unsqueeze(-1) * (half[:, 0] - tx.unsqueeze(-1) * half[:, 2])
+    row_y = (fy * inv_z).unsqueeze(-1) * (half[:, 1] - ty.unsqueeze(-1) * half[:, 2])
+    xx = (row_x * row_x).sum(-1) + eps2d
+    yy = (row_y * row_y).sum(-1) + eps2d
+    xy = (row_x * row_y).sum(-1)
+    # |row_x × row_y|² = det without the cancellation of xx·yy − xy², which a needle of aspect 10⁶ would not survive.
+    cross = torch.linalg.cross(row_x, row_y)
+    det = (cross * cross).sum(-1) + eps2d * ((xx - eps2d) + (yy - eps2d)) + eps2d * eps2d
+    conics = torch.stack((yy / det, -xy / det, xx / det), dim=-1)
+    means2d = torch.stack((fx * x * inv_z + cx, fy * y * inv_z + cy), dim=-1)
+    visible = opacities > ALPHA_MIN
+    mahalanobis2 = torch.where(visible, 2 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN), 0)
+    extents = torch.sqrt(mahalanobis2.unsqueeze(-1) * torch.stack((xx, yy), dim=-1))
+    limit = torch.tensor([width, height], dtype=means.dtype, device=means.device)
+    inside = ((means2d + extents > 0) & (means2d - extents < limit)).all(dim=-1)
+    return Projected(means2d, conics, z, mahalanobis2, extents, front & visible & inside)
+
+
+_SH_C0 = 0.5 / math.sqrt(math.pi)
+
+
+def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n K"]:
+    """Real spherical harmonics of unit directions up to `degree` ≤ 3, in the order and signs of the INRIA files.
+
+    Args:
+        directions: unit vectors from the camera to the Gaussian, world axes.
+        degree: 0 to 3.
+    """
+    x, y, z = directions.unbind(dim=-1)
+    pi = math.pi
+    columns = [torch.full_like(x, _SH_C0)]
+    if degree >= 1:
+        c = math.sqrt(3 / (4 * pi))
+        columns += [-c * y, c * z, -c * x]
+    if degree >= 2:
+        c = math.sqrt(15 / (4 * pi))
+        zz = math.sqrt(5 / (16 * pi)) * (3 * z * z - 1)
+        columns += [c * x * y, -c * y * z, zz, -c * x * z, c / 2 * (x * x - y * y)]
+    if degree >= 3:
+        c33, c32 = math.sqrt(35 / (32 * pi)), math.sqrt(105 / (4 * pi))
+        c31, c30 = math.sqrt(21 / (32 * pi)), math.sqrt(7 / (16 * pi))
+        columns += [
+            -c33 * y * (3 * x * x - y * y),
+            c32 * x * y * z,
+            -c31 * y * (5 * z * z - 1),
+            c30 * z * (5 * z * z - 3),
+            -c31 * x * (5 * z * z - 1),
+            c32 / 2 * z * (x * x - y * y),
+            -c33 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(columns, dim=-1)
+
+
+def colors_from_sh(
+    sh: Float[Tensor, "n K 3"], means: Float[Tensor, "n 3"], camera_center: Float[Tensor, "3"]
+) -> Float[Tensor, "n 3"]:
+    """View-dependent colours in [0, ∞): Σ_k Y_k(direction)·sh_k + ½, negative values cut at 0."""
+    directions = means - camera_center
+    directions = directions / torch.sqrt((directions * directions).sum(-1, keepdim=True) + 1e-24)
+    basis = sh_basis(directions, math.isqrt(sh.shape[1]) - 1)
+    return ((basis.unsqueeze(-1) * sh).sum(dim=1) + 0.5).clamp(min=0)
+
+
+def sh_from_colors(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
+    """Degree-0 coefficients that show `colors` (0 to 1) from everywhere."""
+    return ((colors - 0.5) / _SH_C0).unsqueeze(1)

@@ -1,0 +1,202 @@
+"""What the options of a command are: their names, types, defaults and meanings, read off its settings class."""
+
+import difflib
+import types
+import typing
+from collections.abc import Iterable
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+Kind = Literal["text", "list", "value"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Option:
+    """One setting of a command, as the dataclasses declare it.
+
+    Attributes:
+        key: its full dotted name.
+        annotation: its type.
+        default: its value where nobody says otherwise.
+        help: its meaning, in one line.
+        metavar: what stands for its value in the help.
+        required: whether the command can run without it.
+        member: the member of a choice that it belongs to, such as "teacher=onnx"; empty where it always applies.
+        kind: "text" and "list" (of text) take the user's characters as they are; "value" is parsed.
+    """
+
+    key: str
+    annotation: Any
+    default: Any
+    help: str
+    metavar: str
+    required: bool
+    member: str
+    kind: Kind
+
+
+def near(word: str, known: Iterable[str]) -> str:
+    """`; did you mean …?` where some known name is close to `word`, else nothing."""
+    names = sorted(set(known))
+    close = difflib.get_close_matches(word, names, n=3, cutoff=0.6)
+    close += [name for name in names if name not in close and name.rpartition(".")[2] == word.rpartition(".")[2]]
+    return f"; did you mean {' or '.join(close[:3])}?" if close else ""
+
+
+def union_members(annotation: Any) -> tuple[Any, ...]:
+    """The types that a value may have, None left out."""
+    if get_origin(annotation) in (Union, types.UnionType):
+        return tuple(member for member in get_args(annotation) if member is not type(None))
+    return (annotation,)
+
+
+def allows_none(annotation: Any) -> bool:
+    return get_origin(annotation) in (Union, types.UnionType) and type(None) in get_args(annotation)
+
+
+def _is_text(annotation: Any) -> bool:
+    return annotation in (str, Path)
+
+
+def kind_of(annotation: Any) -> Kind:
+    """Whether an option's characters are the user's own ("text", "list") or Hydra's to parse ("value")."""
+    members = union_members(annotation)
+    if all(_is_text(member) for member in members):
+        return "text"
+    if len(members) == 1 and get_origin(members[0]) is tuple:
+        items = get_args(members[0])
+        if len(items) == 2 and items[1] is Ellipsis:
+            item = items[0]
+            words = get_origin(item) is Literal and all(isinstance(value, str) for value in get_args(item))
+            return "list" if _is_text(item) or words else "value"
+    return "value"
+
+
+def describe(annotation: Any) -> str:
+    """A type in words, for error messages."""
+    names = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path"}
+    members = union_members(annotation)
+    words = []
+    for member in members:
+        items = get_args(member)
+        if get_origin(member) is Literal:
+            words.append(f"{'one of ' if len(items) > 1 else ''}{', '.join(map(str, items))}")
+        elif get_origin(member) is tuple and len(items) == 2 and items[1] is Ellipsis:
+            words.append(f"a list, each {describe(items[0])}")
+        elif get_origin(member) is tuple:
+            words.append(f"a list of {len(items)} ({', '.join(describe(item) for item in items)})")
+        else:
+            words.append(names.get(member, getattr(member, "__name__", str(member))))
+    if allows_none(annotation):
+        words.append("null")
+    return " or ".join(words)
+
+
+def split_list(text: str) -> tuple[str, ...]:
+    """The items of a list of text: commas separate, `\\,` is a comma, and a backslash elsewhere is itself.
+
+    Before a comma backslashes pair up (`\\\\,` is one backslash, then a separator), so every list can be written.
+    Blanks belong to the items; the empty text is the empty list.
+    """
+    items, current, index = [], "", 0
+    while index < len(text):
+        run = len(text) - index - len(text[index:].lstrip("\\"))
+        if text[index + run : index + run + 1] == ",":
+            current += "\\" * (run // 2)
+            if run % 2:
+                current += ","
+            else:
+                items.append(current)
+                current = ""
+            index += run + 1
+        else:
+            step = max(run, 1)
+            current += text[index : index + step]
+            index += step
+    return (*items, current) if text else ()
+
+
+def join_list(items: Iterable[str]) -> str:
+    """The text that `split_list` reads as these items (a single empty item cannot be written)."""
+    written = []
+    for number, item in enumerate(items := tuple(items)):
+        pieces = item.split(",")
+        for index, piece in enumerate(pieces):
+            if index < len(pieces) - 1 or number < len(items) - 1:
+                piece += "\\" * (len(piece) - len(piece.rstrip("\\")))
+            pieces[index] = piece
+        written.append("\\,".join(pieces))
+    return ",".join(written)
+
+
+@cache
+def hints(cls: type) -> dict[str, Any]:
+    return typing.get_typehints(cls)
+
+
+def sections(annotation: Any) -> tuple[type, ...]:
+    """The dataclasses that a section's value may have; empty for a plain option."""
+    return tuple(member for member in union_members(annotation) if is_dataclass(member) and isinstance(member, type))
+
+
+def name_of(member: type) -> str:
+    return str(get_args(hints(member)["name"])[0])
+
+
+def _default(item: Any) -> Any:
+    if item.default is not MISSING:
+        return item.default
+    return item.default_factory() if item.default_factory is not MISSING else None
+
+
+def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
+    """Every option of a settings class, sections included, in order of declaration."""
+    found = []
+    for item in fields(cls):
+        key, annotation = prefix + item.name, hints(cls)[item.name]
+        sections = sections(annotation)
+        if sections:
+            for section in sections:
+                owner = f"{key}={name_of(section)}" if len(sections) > 1 else member
+                found += options_of(section, key + ".", owner)
+        elif not (item.name == "name" and member and get_origin(annotation) is Literal):
+            found.append(
+                Option(
+                    key=key,
+                    annotation=annotation,
+                    default=_default(item),
+                    help=item.metadata.get("help", ""),
+                    metavar=item.metadata.get("metavar", ""),
+                    required=item.metadata.get("required", False),
+                    member=member,
+                    kind=kind_of(annotation),
+                )
+            )
+    return found
+
+
+def options_by_key(cls: type, prefix: str = "") -> dict[str, Option]:
+    """The options of a class by full key; where members of a choice share a key, the first one's."""
+    return {option.key: option for option in reversed(options_of(cls, prefix))}
+
+
+def wrong_value(option: Option, value: Any) -> str:
+    """The message for a value of the wrong type."""
+    if isinstance(value, (list, tuple)) and option.kind == "list":
+        value = join_list(map(str, value))
+    allowed = [str(word) for word in _words(option.annotation)]
+    hint = near(str(value), allowed) if allowed else ""
+    meaning = f" ({option.help})" if option.help and not hint else ""
+    return f"{option.key}: expected {describe(option.annotation)}, got {value!r}{hint}{meaning}"
+
+
+def _words(annotation: Any) -> tuple[Any, ...]:
+    found: tuple[Any, ...] = ()
+    for member in union_members(annotation):
+        if get_origin(member) is Literal:
+            found += get_args(member)
+        elif get_origin(member) is tuple:
+            found += tuple(word for item in get_args(member) if item is not Ellipsis for word in _words(item))
+    return found

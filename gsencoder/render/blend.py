@@ -1,0 +1,267 @@
+"""Blend: the sparse matrix B (rays or patches × Gaussians) of front-to-back compositing weights for one view.
+
+With the geometry frozen, rendering anything is `B @ values`, lifting maps onto Gaussians is `Bᵀ @ maps`, and each is
+the other's gradient. B depends on geometry and camera alone; it is made once per view and kept.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from gsencoder import geometry
+from gsencoder.errors import InputError
+from gsencoder.render import reference
+from gsencoder.render.lattice import Lattice, grid_lattice, patch_lattice, pixel_lattice
+from gsencoder.types import Cameras, FeatureMap, Gaussians
+
+Backend = Literal["auto", "cpu", "reference"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlendConfig:
+    """The accuracy knobs of B, each an explicit bound.
+
+    Attributes:
+        rays_per_patch: rays averaged into a patch row: 1, 4, 9, 16, …
+        min_weight: entries below this are dropped; a row loses at most (entries dropped) × min_weight.
+        stop_transmittance: a ray ends where less than this share of it is left.
+        near: smallest depth, world units.
+        eps2d: low-pass variance added to every projected Gaussian, pixels².
+        backend: "cpu" (numba), "reference" (plain torch, any device and float type), or "auto".
+    """
+
+    rays_per_patch: int = field(default=4, metadata={"help": "rays averaged into one patch: 1, 4, 9, 16, …"})
+    min_weight: float = field(default=0.0, metadata={"help": "smallest blending weight that is kept"})
+    stop_transmittance: float = field(default=1e-4, metadata={"help": "a ray ends where less than this is left of it"})
+    near: float = field(default=0.01, metadata={"help": "near plane in world units"})
+    eps2d: float = field(default=0.3, metadata={"help": "low-pass variance of projected Gaussians in pixels²"})
+    backend: Backend = field(default="auto", metadata={"help": "cpu (numba), reference (torch), or auto"})
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_weight < 1:
+            raise InputError(f"min_weight: expected a number in [0, 1), got {self.min_weight}")
+        if not 0 < self.stop_transmittance < 1:
+            raise InputError(f"stop_transmittance: expected a number in (0, 1), got {self.stop_transmittance}")
+        if not self.near > 0 or not self.eps2d > 0:
+            raise InputError(f"near and eps2d: expected positive numbers, got {self.near} and {self.eps2d}")
+
+
+class Blend:
+    """B in compressed rows: `weight[crow[p]:crow[p+1]]` belong to Gaussians `col[crow[p]:crow[p+1]]`, front to back.
+
+    Attributes:
+        crow: row starts, P + 1 of them; rows are pixels or patches, row-major.
+        col: Gaussian of each entry.
+        weight: T·α of each entry, averaged over the row's rays.
+        depths: z of each Gaussian in this camera, world units; only entries of `col` are meaningful.
+        lattice: where the rays are.
+        config: the knobs it was made with.
+    """
+
+    def __init__(
+        self,
+        crow: Int64[Tensor, " P_plus_1"],
+        col: Int32[Tensor, " nnz"],
+        weight: Float[Tensor, " nnz"],
+        depths: Float[Tensor, " N"],
+        lattice: Lattice,
+        config: BlendConfig,
+    ) -> None:
+        self.crow, self.col, self.weight = crow, col, weight
+        self.depths, self.lattice, self.config = depths, lattice, config
+
+    @property
+    def rows(self) -> int:
+        """Number of rows P."""
+        return len(self.crow) - 1
+
+    @property
+    def gaussians(self) -> int:
+        """Number of columns N."""
+        return len(self.depths)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows as a grid: (height, width)."""
+        return self.lattice.height, self.lattice.width
+
+    @cached_property
+    def transposed(self) -> tuple[Int64[Tensor, " M"], Int64[Tensor, " M_plus_1"], Int32[Tensor, " nnz"], Tensor]:
+        """The M columns that occur, and Bᵀ restricted to them: (columns, crow, row, weight)."""
+        if self.weight.device.type == "cpu":
+            from gsencoder.render import cpu
+
+            parts = cpu.transpose(self.crow.numpy(), self.col.numpy(), self.weight.numpy(), self.gaussians)
+            return tuple(torch.from_numpy(part) for part in parts)  # type: ignore[return-value]
+        return reference.transpose(self.crow, self.col, self.weight)
+
+    @property
+    def columns(self) -> Int64[Tensor, " M"]:
+        """The Gaussians that this view sees, ascending."""
+        return self.transposed[0]
+
+    @cached_property
+    def alpha(self) -> Float[Tensor, " P"]:
+        """Row sums of B: how opaque each ray or patch is."""
+        return self.render(torch.ones_like(self.depths))
+
+    @cached_property
+    def depth(self) -> Float[Tensor, " P"]:
+        """Expected depth Σ w·z / Σ w in world units; 0 where nothing is hit."""
+        return self.render(self.depths) / self.alpha.clamp(min=torch.finfo(self.alpha.dtype).tiny)
+
+    @cached_property
+    def median_depth(self) -> Float[Tensor, " P"]:
+        """Depth at which a ray has lost half its light, for single rays; 0 where it never does.
+
+        Raises:
+            InputError: the rows pool several rays, which have no common order.
+        """
+        if self.lattice.side != 1:
+            raise InputError(f"median_depth needs one ray a row; this blend pools {self.lattice.side**2} rays")
+        total = torch.cat((self.weight.new_zeros(1), self.weight)).double().cumsum(0)
+        start, end = total[self.crow[:-1]], self.crow[1:]
+        entry = torch.searchsorted(total[1:].contiguous(), start + 0.5)
+        reached = entry < end
+        if not reached.any():
+            return torch.zeros_like(start, dtype=self.depths.dtype)
+        entry = entry.clamp(max=len(self.col) - 1)
+        return torch.where(reached, self.depths[self.col[entry].long()], 0)
+
+    def render(self, values: Float[Tensor, "N *D"]) -> Float[Tensor, "P *D"]:
+        """B @ values: any per-Gaussian quantity as seen in this view. Differentiable in `values`."""
+        flat = values.reshape(len(values), -1)
+        return _Render.apply(flat, self).reshape(self.rows, *values.shape[1:])
+
+    def lift(self, maps: Float[Tensor, "P *D"]) -> Float[Tensor, "N *D"]:
+        """Bᵀ @ maps: what each Gaussian receives from this view. Differentiable in `maps`.
+
+        Gaussians that the view does not see receive zero; use `lift_into` to sum many views without dense copies.
+        """
+        flat = maps.reshape(len(maps), -1)
+        return _Lift.apply(flat, self).reshape(self.gaussians, *maps.shape[1:])
+
+    def lift_into(self, maps: Float[Tensor, "P D"], sums: Float[Tensor, "N D"]) -> None:
+        """Adds Bᵀ @ maps to `sums`, touching only the rows of Gaussians that the view sees."""
+        columns, crow, row, weight = self.transposed
+        _multiply_into(crow, row, weight, maps, columns, sums)
+
+    def keep(self, entries: Tensor) -> "Blend":
+        """The same blend with only the entries where the boolean mask `entries` is True."""
+        row = torch.repeat_interleave(torch.arange(self.rows, device=self.crow.device), self.crow.diff())[entries]
+        crow = torch.zeros_like(self.crow)
+        crow[1:] = torch.bincount(row, minlength=self.rows).cumsum(0)
+        return Blend(crow, self.col[entries], self.weight[entries], self.depths, self.lattice, self.config)
+
+
+def _multiply_into(crow: Tensor, col: Tensor, weight: Tensor, values: Tensor, targets: Tensor, out: Tensor) -> None:
+    if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
+        from gsencoder.render import cpu
+
+        arrays = (crow, col, weight, values.detach().contiguous(), targets, out)
+        cpu.product(*(array.numpy() for array in arrays))
+    else:
+        out.index_add_(0, targets, reference.product(crow, col, weight, values.detach()))
+
+
+class _Render(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, blend: Blend) -> Tensor:
+        ctx.blend = blend
+        out = values.new_zeros(blend.rows, values.shape[1])
+        rows = torch.arange(blend.rows, device=values.device)
+        _multiply_into(blend.crow, blend.col, blend.weight, values, rows, out)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        return _Lift.apply(grad, ctx.blend), None
+
+
+class _Lift(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, maps: Tensor, blend: Blend) -> Tensor:
+        ctx.blend = blend
+        out = maps.new_zeros(blend.gaussians, maps.shape[1])
+        blend.lift_into(maps, out)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        return _Render.apply(grad, ctx.blend), None
+
+
+def blend(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    view: int = 0,
+    *,
+    patch: int | None = None,
+    like: FeatureMap | None = None,
+    config: BlendConfig = BlendConfig(),  # noqa: B008 - frozen
+    device: str | torch.device = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Blend:
+    """The blending weights of one view.
+
+    Args:
+        gaussians: the splat.
+        cameras: in the same world.
+        view: which camera.
+        patch: pixels along the side of a square patch; None for one row a pixel.
+        like: a feature map whose grid the rows follow, in place of `patch`.
+        config: accuracy knobs.
+        device: where the result lives; other than "cpu" needs the torch backend.
+        dtype: float type of the reference backend; the numba backend computes in float64 and stores float32.
+
+    Raises:
+        InputError: no such view, or knobs out of range.
+    """
+    if not -len(cameras) <= view < len(cameras):
+        raise InputError(f"view: expected 0 to {len(cameras) - 1}, got {view}")
+    width, height = int(cameras.widths[view]), int(cameras.heights[view])
+    if like is not None:
+        lattice = grid_lattice(like.grid_from_image, like.width, like.height, config.rays_per_patch)
+    elif patch is not None:
+        lattice = patch_lattice(width, height, patch, config.rays_per_patch)
+    else:
+        lattice = pixel_lattice(width, height)
+    backend = config.backend
+    if backend == "auto":
+        backend = "cpu" if torch.device(device).type == "cpu" and dtype == torch.float32 else "reference"
+    if backend == "cpu":
+        return _blend_cpu(gaussians, cameras, view, lattice, config)
+    projected = _project(gaussians, cameras, view, config, device, dtype)
+    opacities = torch.as_tensor(gaussians.opacities, device=device, dtype=dtype)
+    crow, col, weight = reference.blend_weights(
+        projected, opacities, lattice, stop=config.stop_transmittance, keep=config.min_weight
+    )
+    return Blend(crow, col, weight, projected.depths, lattice, config)
+
+
+def _project(
+    gaussians: Gaussians, cameras: Cameras, view: int, config: BlendConfig, device: Any, dtype: torch.dtype
+) -> geometry.Projected:
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    arrays += (cameras.cam_from_world[view], cameras.Ks[view])
+    tensors = [torch.as_tensor(array, device=device).to(dtype) for array in arrays]
+    width, height = int(cameras.widths[view]), int(cameras.heights[view])
+    return geometry.project(*tensors, width, height, eps2d=config.eps2d, near=config.near)
+
+
+def _blend_cpu(gaussians: Gaussians, cameras: Cameras, view: int, lattice: Lattice, config: BlendConfig) -> Blend:
+    from gsencoder.render import cpu
+
+    size = int(cameras.widths[view]), int(cameras.heights[view])
+    projected, index = cpu.project(
+        gaussians, cameras.cam_from_world[view], cameras.Ks[view], *size, eps2d=config.eps2d, near=config.near
+    )
+    parts = cpu.blend_weights(lattice, projected, index, stop=config.stop_transmittance, keep=config.min_weight)
+    depths = np.zeros(len(gaussians), np.float32)
+    depths[index] = projected[9]
+    return Blend(*(torch.from_numpy(part) for part in parts), torch.from_numpy(depths), lattice, config)

@@ -1,0 +1,92 @@
+"""The plain twin of the fast backends: blending weights and sparse products in torch alone, any device and float type.
+
+It says what B is in few lines and in float64 serves tests as a check of the numba kernels; on a GPU it is also what
+runs until kernels are at hand.
+"""
+
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN, Projected
+from gsencoder.render.lattice import Lattice
+
+
+def blend_weights(
+    projected: Projected, opacities: Float[Tensor, " N"], lattice: Lattice, *, stop: float, keep: float
+) -> tuple[Int64[Tensor, " P_plus_1"], Int32[Tensor, " nnz"], Float[Tensor, " nnz"]]:
+    """CSR (crow, col, weight) of B.
+
+    For each tile the Gaussians whose ellipse of alpha ≥ 1/255 may touch it are composited over the tile's rays as a
+    dense rays × Gaussians table: w = α·exp(Σ_before log1p(−α)).
+
+    Args:
+        projected: see geometry.project.
+        opacities: of the same N Gaussians.
+        lattice: where the rays are.
+        stop: transmittance at which a ray ends, the Gaussian that would cross it excluded.
+        keep: smallest weight stored.
+    """
+    device = opacities.device
+    valid = projected.valid.nonzero().squeeze(1)
+    order = valid[torch.argsort(projected.depths[valid], stable=True)]
+    origin = torch.tensor([lattice.x0, lattice.y0], device=device, dtype=opacities.dtype)
+    step = torch.tensor([lattice.dx, lattice.dy], device=device, dtype=opacities.dtype)
+    low = (projected.means2d - projected.extents - origin) / step
+    high = (projected.means2d + projected.extents - origin) / step
+    rows, cols, weights = [], [], []
+    tile, side = lattice.tile, lattice.side
+    for v0 in range(0, lattice.height * side, tile):
+        v1 = min(v0 + tile, lattice.height * side)
+        line = order[(low[order, 1] <= v1 - 1) & (high[order, 1] >= v0)]
+        for u0 in range(0, lattice.width * side, tile):
+            u1 = min(u0 + tile, lattice.width * side)
+            members = line[(low[line, 0] <= u1 - 1) & (high[line, 0] >= u0)]
+            u = torch.arange(u0, u1, device=device)
+            v = torch.arange(v0, v1, device=device)
+            rays = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1).reshape(-1, 2)
+            w = _composite(projected, opacities, members, rays * step + origin, stop)
+            cell = (rays[:, 1] // side) * lattice.width + rays[:, 0] // side
+            cells, slot = torch.unique(cell, return_inverse=True)
+            pooled = w.new_zeros(len(cells), len(members)).index_add_(0, slot, w) / side**2
+            at, member = (pooled >= keep if keep > 0 else pooled > 0).nonzero(as_tuple=True)
+            rows.append(cells[at])
+            cols.append(members[member])
+            weights.append(pooled[at, member])
+    row, col, weight = torch.cat(rows), torch.cat(cols), torch.cat(weights)
+    # Tiles emit whole rows in depth order; a stable sort by row only interleaves tiles.
+    order = torch.argsort(row, stable=True)
+    crow = torch.zeros(lattice.rows + 1, dtype=torch.int64, device=device)
+    crow[1:] = torch.bincount(row, minlength=lattice.rows).cumsum(0)
+    return crow, col[order].to(torch.int32), weight[order]
+
+
+def _composite(projected: Projected, opacities: Tensor, members: Tensor, rays: Tensor, stop: float) -> Tensor:
+    """Weights of `members` (front to back) on rays given in pixels: [rays, members]."""
+    d = rays.unsqueeze(1) - projected.means2d[members]
+    a, b, c = projected.conics[members].unbind(-1)
+    power = 0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) + b * d[..., 0] * d[..., 1]
+    alpha = (opacities[members] * torch.exp(-power)).clamp(max=ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+    after = torch.log1p(-alpha).cumsum(dim=1)
+    before = torch.cat((torch.zeros_like(after[:, :1]), after[:, :-1]), dim=1) if len(members) else after
+    return torch.where(after.exp() > stop, alpha * before.exp(), 0)
+
+
+def transpose(crow: Tensor, col: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The columns that occur, and Bᵀ restricted to them as CSR: (columns, crow, row, weight)."""
+    row = torch.repeat_interleave(torch.arange(len(crow) - 1, device=crow.device), crow.diff())
+    order = torch.argsort(col, stable=True)
+    columns, uses = torch.unique_consecutive(col[order].long(), return_counts=True)
+    return columns, torch.cat((uses.new_zeros(1), uses.cumsum(0))), row[order].to(torch.int32), weight[order]
+
+
+def product(crow: Tensor, col: Tensor, weight: Tensor, values: Float[Tensor, "n D"]) -> Float[Tensor, "rows D"]:
+    """CSR @ values by sorted segment sums, which on every device give the same bits each time."""
+    index, weight = col.long(), weight.to(values.dtype).unsqueeze(1)
+    # Sixteen channels at a time bound the gathered products to nnz × 16.
+    parts = [
+        torch.segment_reduce(weight * part[index], "sum", offsets=crow, axis=0, initial=0.0)
+        for part in values.split(16, dim=1)
+    ]
+    return torch.cat(parts, dim=1)

@@ -1,0 +1,31 @@
+"""Fixtures that all tests share."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import config as jaxtyping_config
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of real scenes and models; the test is skipped where it is missing."""
+    folder = Path(os.environ.get("GSENCODER_SHARED", "../shared"))
+    if not (folder / "scenes").is_dir():
+        pytest.skip(f"no real data at {folder} (set GSENCODER_SHARED)")
+    return folder
+
+
+@pytest.fixture
+def no_jaxtyping() -> Iterator[None]:
+    """Switches runtime shape checks off, so that a test can meet the package's own errors."""
+    jaxtyping_config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping_config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
