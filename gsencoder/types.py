@@ -43,6 +43,8 @@ def _check_rows(owner: str, name: str, good: np.ndarray, wanted: str, values: np
 
 
 def _check_finite(owner: str, name: str, array: np.ndarray) -> None:
+    if array.size == 0:
+        return
     flat = array.reshape(len(array), -1)
     # The sum of a row is finite unless an entry is not (or it overflows): one pass, no boolean array of full size.
     with np.errstate(over="ignore", invalid="ignore"):

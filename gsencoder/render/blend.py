@@ -94,9 +94,9 @@ class Blend:
     def transposed(self) -> tuple[Int64[Tensor, " M"], Int64[Tensor, " M_plus_1"], Int32[Tensor, " nnz"], Tensor]:
         """The M columns that occur, and Bᵀ restricted to them: (columns, crow, row, weight)."""
         if self.weight.device.type == "cpu":
-            from gsencoder.render import cpu
+            from gsencoder.render import products
 
-            parts = cpu.transpose(self.crow.numpy(), self.col.numpy(), self.weight.numpy(), self.gaussians)
+            parts = products.transpose(self.crow.numpy(), self.col.numpy(), self.weight.numpy(), self.gaussians)
             return tuple(torch.from_numpy(part) for part in parts)  # type: ignore[return-value]
         return reference.transpose(self.crow, self.col, self.weight)
 
@@ -135,7 +135,7 @@ class Blend:
 
     def render(self, values: Float[Tensor, "N *D"]) -> Float[Tensor, "P *D"]:
         """B @ values: any per-Gaussian quantity as seen in this view. Differentiable in `values`."""
-        flat = values.reshape(len(values), -1)
+        flat = values.flatten(1) if values.ndim > 1 else values.unsqueeze(1)
         return _Render.apply(flat, self).reshape(self.rows, *values.shape[1:])
 
     def lift(self, maps: Float[Tensor, "P *D"]) -> Float[Tensor, "N *D"]:
@@ -143,13 +143,27 @@ class Blend:
 
         Gaussians that the view does not see receive zero; use `lift_into` to sum many views without dense copies.
         """
-        flat = maps.reshape(len(maps), -1)
+        flat = maps.flatten(1) if maps.ndim > 1 else maps.unsqueeze(1)
         return _Lift.apply(flat, self).reshape(self.gaussians, *maps.shape[1:])
 
     def lift_into(self, maps: Float[Tensor, "P D"], sums: Float[Tensor, "N D"]) -> None:
         """Adds Bᵀ @ maps to `sums`, touching only the rows of Gaussians that the view sees."""
         columns, crow, row, weight = self.transposed
         _multiply_into(crow, row, weight, maps, columns, sums)
+
+    def lift_codes_into(self, codes: Int32[Tensor, " P"], sums: Float[Tensor, "N C"]) -> None:
+        """`lift_into` for maps that are one code a row: adds each entry's weight to sums[Gaussian, code].
+
+        Rows of code −1 give nothing. By linearity `sums @ table` is what lifting `table[codes]` would have given.
+        """
+        columns, crow, row, weight = self.transposed
+        if codes.device.type == "cpu":
+            from gsencoder.render import products
+
+            products.count_codes(*(part.numpy() for part in (crow, row, weight, codes, columns, sums)))
+        else:
+            one_hot = torch.nn.functional.one_hot(codes.long() + 1, sums.shape[1] + 1)[:, 1:].to(sums.dtype)
+            self.lift_into(one_hot, sums)
 
     def keep(self, entries: Tensor) -> "Blend":
         """The same blend with only the entries where the boolean mask `entries` is True."""
@@ -161,10 +175,10 @@ class Blend:
 
 def _multiply_into(crow: Tensor, col: Tensor, weight: Tensor, values: Tensor, targets: Tensor, out: Tensor) -> None:
     if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
-        from gsencoder.render import cpu
+        from gsencoder.render import products
 
         arrays = (crow, col, weight, values.detach().contiguous(), targets, out)
-        cpu.product(*(array.numpy() for array in arrays))
+        products.product(*(array.numpy() for array in arrays))
     else:
         out.index_add_(0, targets, reference.product(crow, col, weight, values.detach()))
 

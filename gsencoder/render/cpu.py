@@ -1,42 +1,23 @@
-"""Blending weights and sparse products on a CPU: numba kernels without the GIL, run by a pool of Python threads.
-
-Threads rather than numba's parallel loops: an OpenMP pool aborts a process that was forked after its first use, which
-data loaders do. Work is cut into pieces whose results do not depend on how many threads there are, so neither do the
-bits. The plain twin of everything here is reference.py.
-"""
+"""Blending weights on a CPU: numba kernels that project, bin and composite; the plain twin is reference.py."""
 
 import math
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import no_type_check
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64, Int32, Int64
-from numba import njit
 
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render.lattice import Lattice
+from gsencoder.render.threads import PIECES, even_cuts, kernel, parallel
 from gsencoder.types import Gaussians
-
-_PIECES = 32
-"""Work is cut into so many pieces: enough to balance a dozen cores, few enough to cost nothing on two."""
 
 _ENTRIES = 48
 """Room for so many entries a row is set aside; memory that is not touched costs nothing."""
 
 
-def _parallel(work: Callable[[int], Any], pieces: Iterable[int]) -> list[Any]:
-    threads = min(torch.get_num_threads(), os.cpu_count() or 1)
-    if threads == 1:
-        return [work(piece) for piece in pieces]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, pieces))
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d, near, alpha_min, out, index):  # type: ignore[no-untyped-def]
+@kernel
+@no_type_check
+def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d, near, alpha_min, out, index):
     """geometry.project of rows [first, last) in one pass; valid rows are packed into out[first:first + count]."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     width, height = size
@@ -98,7 +79,7 @@ def project(
     """
     n = len(gaussians)
     out, index = np.empty((10, n)), np.empty(n, np.int32)
-    cuts = np.linspace(0, n, _PIECES + 1).astype(np.int64)
+    cuts = np.linspace(0, n, PIECES + 1).astype(np.int64)
     pose, K = pose.astype(np.float64), K.astype(np.float64)
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
 
@@ -106,13 +87,14 @@ def project(
         bounds = (cuts[piece], cuts[piece + 1])
         return _project(*bounds, *arrays, pose, K, (float(width), float(height)), eps2d, near, ALPHA_MIN, out, index)
 
-    counts = _parallel(work, range(_PIECES))
+    counts = parallel(work, range(PIECES))
     keep = [slice(start, start + count) for start, count in zip(cuts[:-1], counts, strict=True)]
     return np.concatenate([out[:, part] for part in keep], axis=1), np.concatenate([index[part] for part in keep])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _bin_tiles(u, v, hu, hv, order, tile, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
+@kernel
+@no_type_check
+def _bin_tiles(u, v, hu, hv, order, tile, tiles_x, tiles_y):
     """Counting sort of (tile, Gaussian) pairs that keeps the depth order within a tile."""
     n = len(order)
     bounds = np.empty((n, 4), np.int32)
@@ -144,8 +126,9 @@ def _bin_tiles(u, v, hu, hv, order, tile, tiles_x, tiles_y):  # type: ignore[no-
     return starts, members
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, rows, cols, weights):  # type: ignore[no-untyped-def]
+@kernel
+@no_type_check
+def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, rows, cols, weights):
     """Front-to-back compositing of tiles [first, last): entries (row, Gaussian, weight), depth-ordered in a row.
 
     Gaussians are the outer loop, so that one that several rays of a patch meet becomes a single entry at once. Along
@@ -234,14 +217,16 @@ def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, row
     return rows[:count], cols[:count], weights[:count]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _count(rows, crow):  # type: ignore[no-untyped-def]
+@kernel
+@no_type_check
+def _count(rows, crow):
     for e in range(len(rows)):
         crow[rows[e] + 1] += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _scatter(rows, cols, weights, index, where, out_cols, out_weights):  # type: ignore[no-untyped-def]
+@kernel
+@no_type_check
+def _scatter(rows, cols, weights, index, where, out_cols, out_weights):
     for e in range(len(rows)):
         at = where[rows[e]]
         where[rows[e]] = at + 1
@@ -278,8 +263,7 @@ def blend_weights(
     order = np.argsort(gaussians[9], kind="stable").astype(np.int32)
     starts, members = _bin_tiles(*gaussians[:4], order, tile, tiles_x, tiles_y)
     shape = (lattice.height, lattice.width, lattice.side, tile, tiles_x)
-    cuts = np.searchsorted(starts, np.linspace(0, starts[-1], _PIECES + 1)[1:-1])
-    cuts = np.concatenate(([0], cuts, [tiles_x * tiles_y]))
+    cuts = even_cuts(starts)
     # Room for the entries is taken from numpy in one block, which the kernel of the operating system backs with
     # huge pages: fresh small pages cost more than the compositing. What does not fit grows inside the kernel.
     room = np.concatenate(([0], np.cumsum(_ENTRIES * (tile // lattice.side) ** 2 * np.diff(cuts))))
@@ -290,60 +274,12 @@ def blend_weights(
         bounds = (cuts[piece], cuts[piece + 1])
         return _blend_tiles(*bounds, starts, members, gaussians, shape, stop, keep, *space)
 
-    pieces = _parallel(work, range(_PIECES))
+    pieces = parallel(work, range(PIECES))
     crow = np.zeros(lattice.rows + 1, np.int64)
-    _parallel(lambda piece: _count(pieces[piece][0], crow), range(_PIECES))
+    parallel(lambda piece: _count(pieces[piece][0], crow), range(PIECES))
     np.cumsum(crow, out=crow)
     where = crow[:-1].copy()
     cols, weights = np.empty(crow[-1], np.int32), np.empty(crow[-1], np.float32)
     # A row belongs to one tile, a tile to one piece: the pieces write to disjoint places.
-    _parallel(lambda piece: _scatter(*pieces[piece], index, where, cols, weights), range(_PIECES))
+    parallel(lambda piece: _scatter(*pieces[piece], index, where, cols, weights), range(PIECES))
     return crow, cols, weights
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _transpose(crow, cols, weights, where, out_rows, out_weights):  # type: ignore[no-untyped-def]
-    for row in range(len(crow) - 1):
-        for e in range(crow[row], crow[row + 1]):
-            at = where[cols[e]]
-            where[cols[e]] = at + 1
-            out_rows[at] = row
-            out_weights[at] = weights[e]
-
-
-def transpose(
-    crow: np.ndarray, cols: np.ndarray, weights: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The columns that occur, and Bᵀ restricted to them as CSR: (columns, crow, row, weight)."""
-    uses = np.bincount(cols, minlength=count)
-    ends = np.cumsum(uses)
-    out_rows, out_weights = np.empty(len(cols), np.int32), np.empty(len(cols), weights.dtype)
-    _transpose(crow, cols, weights, ends - uses, out_rows, out_weights)
-    columns = np.flatnonzero(uses)
-    return columns, np.concatenate(([0], ends[columns])), out_rows, out_weights
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _product(first, last, crow, cols, weights, values, targets, out):  # type: ignore[no-untyped-def]
-    for row in range(first, last):
-        line = out[targets[row]]
-        for e in range(crow[row], crow[row + 1]):
-            weight = weights[e]
-            source = values[cols[e]]
-            for d in range(len(line)):
-                line[d] += weight * source[d]
-
-
-def product(
-    crow: np.ndarray, cols: np.ndarray, weights: np.ndarray, values: np.ndarray, targets: np.ndarray, out: np.ndarray
-) -> None:
-    """Adds row i of CSR @ values to out[targets[i]]; targets are distinct, so that threads never meet."""
-    cuts = np.searchsorted(crow, np.linspace(0, crow[-1], _PIECES + 1)[1:-1])
-    cuts = np.concatenate(([0], cuts, [len(crow) - 1]))
-    if values.shape[1] * crow[-1] < 1 << 16:
-        _product(0, len(crow) - 1, crow, cols, weights, values, targets, out)
-        return
-    _parallel(
-        lambda piece: _product(cuts[piece], cuts[piece + 1], crow, cols, weights, values, targets, out),
-        range(_PIECES),
-    )

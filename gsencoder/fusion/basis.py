@@ -1,0 +1,122 @@
+"""The affine subspace that a scene's features live in: the smallest rank that keeps a stated share of the energy.
+
+Lifting and rendering are linear, so features may be fused, stored and rendered as R coordinates in place of D
+channels. Because rows of B sum to alpha and not to 1, a rendered map decodes as `(B @ z) @ components + alpha·mean`.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+from gsencoder.errors import InputError
+from gsencoder.types import FeatureBasis, FeatureSpace
+
+
+class Moments:
+    """Streaming first and second moments of feature vectors, in float64, one chunk at a time."""
+
+    def __init__(self, channels: int) -> None:
+        self.count = 0.0
+        self.sum: Float64[np.ndarray, " D"] = np.zeros(channels)
+        self.outer: Float64[np.ndarray, "D D"] = np.zeros((channels, channels))
+        self._shift: np.ndarray | None = None
+
+    def add(self, vectors: Float[np.ndarray, "n D"]) -> None:
+        """Takes more vectors into account.
+
+        Raises:
+            InputError: a vector is not finite.
+        """
+        if len(vectors) == 0:
+            return
+        if self._shift is None:
+            # Moments are taken about the first chunk's mean: features whose mean is large against their spread, as
+            # those of vision transformers are, would otherwise lose the spread to cancellation.
+            self._shift = vectors.mean(axis=0, dtype=np.float64)
+        shifted = vectors - self._shift.astype(np.float32)
+        gram = (shifted.T @ shifted).astype(np.float64)
+        if not np.isfinite(gram).all():
+            bad = int((~np.isfinite(vectors).all(axis=1)).sum())
+            raise InputError(f"features: expected finite values, got {bad} bad rows of {len(vectors)}")
+        self.count += len(vectors)
+        self.sum += shifted.sum(axis=0, dtype=np.float64)
+        self.outer += gram
+
+    @property
+    def mean(self) -> Float64[np.ndarray, " D"]:
+        """Mean of everything added."""
+        if self._shift is None or self.count == 0:
+            raise InputError("features: no view has any cell with features; nothing to fit a basis to")
+        return self._shift.astype(np.float32) + self.sum / self.count
+
+    def covariance(self) -> Float64[np.ndarray, "D D"]:
+        """Second moment about the mean."""
+        offset = self.sum / max(self.count, 1.0)
+        return self.outer / max(self.count, 1.0) - np.outer(offset, offset)
+
+
+def fit_basis(
+    mean: Float64[np.ndarray, " D"],
+    covariance: Float64[np.ndarray, "D D"],
+    space: FeatureSpace,
+    *,
+    energy: float,
+    max_rank: int = 0,
+) -> FeatureBasis:
+    """The leading eigenvectors of a covariance.
+
+    Args:
+        mean: the space's mean.
+        covariance: second moment about that mean.
+        space: what the vectors are.
+        energy: share of the trace to keep, in (0, 1].
+        max_rank: at most so many components; 0 = no limit. `energy_kept` of the result tells what it cost.
+
+    Raises:
+        InputError: knobs out of range.
+    """
+    if not 0 < energy <= 1:
+        raise InputError(f"energy: expected a share in (0, 1], got {energy}")
+    if max_rank < 0:
+        raise InputError(f"max_rank: expected 0 (no limit) or more, got {max_rank}")
+    values, vectors = np.linalg.eigh(covariance)
+    values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
+    total = values.sum()
+    if total == 0:
+        rank = 1
+    else:
+        # Below rounding a component holds nothing; without this cut energy = 1 would keep every channel.
+        meaningful = int((values > values[0] * 1e-7).sum())
+        rank = min(int(np.searchsorted(values.cumsum() / total, energy - 1e-9)) + 1, meaningful)
+    if max_rank:
+        rank = min(rank, max_rank)
+    kept = float(values[:rank].sum() / total) if total else 1.0
+    components = vectors[:, :rank].T
+    # The sign of an eigenvector is arbitrary; its largest entry is made positive so that reruns agree.
+    largest = np.abs(components).argmax(axis=1)
+    components = components * np.sign(components[np.arange(rank), largest])[:, None]
+    return FeatureBasis(
+        mean=mean.astype(np.float32),
+        components=np.ascontiguousarray(components, np.float32),
+        energy_kept=min(kept, 1.0),
+        space=space,
+    )
+
+
+def table_basis(
+    table: Float32[np.ndarray, "C D"], mean: Float32[np.ndarray, " D"], space: FeatureSpace, *, energy: float
+) -> FeatureBasis:
+    """A basis for coded maps. Every row of the table counts once: a name matters however few pixels it has."""
+    centred = table.astype(np.float64) - mean
+    return fit_basis(mean.astype(np.float64), centred.T @ centred / len(table), space, energy=energy)
+
+
+def encode(basis: FeatureBasis, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:
+    """Coordinates of vectors: (x − mean) @ componentsᵀ."""
+    return ((vectors - basis.mean) @ basis.components.T).astype(np.float32)
+
+
+def decode_map(
+    basis: FeatureBasis, coordinates: Float32[np.ndarray, "*n R"], alpha: Float32[np.ndarray, "*n"]
+) -> Float32[np.ndarray, "*n D"]:
+    """The features of rendered coordinates: (B @ z) @ components + alpha · mean."""
+    return coordinates @ basis.components + alpha[..., None] * basis.mean

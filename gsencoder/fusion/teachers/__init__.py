@@ -1,0 +1,34 @@
+"""Teachers: what gives each view a map of features. One file each; all share the contract below."""
+
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+
+class Teacher(Protocol):
+    """Turns one view into a feature map.
+
+    Attributes:
+        space: what its vectors are.
+        table: the vectors that all its maps are codes into; None where maps are dense or each has its own table.
+        mean: the space's mean, where it is known without looking at the scene.
+        needs_images: whether it looks at photographs (a splat without views is then rendered for it).
+        cheap: whether making a map twice costs less than keeping it on disk.
+    """
+
+    space: FeatureSpace
+    table: Float32[np.ndarray, "C D"] | None
+    mean: Float32[np.ndarray, " D"] | None
+    needs_images: bool
+    cheap: bool
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """The features of one view."""
+        ...
+
+    def settings(self) -> dict[str, Any]:
+        """Everything that changes its output, as JSON values: stored beside the features, compared on resuming."""
+        ...

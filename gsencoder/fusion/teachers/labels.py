@@ -1,0 +1,77 @@
+"""The `labels` teacher: instance maps and a table of name embeddings. An exact oracle for labelled scenes."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsencoder.errors import InputError
+from gsencoder.types import FeatureMap, FeatureSpace, SceneObject, Views
+
+
+class LabelsTeacher:
+    """Each pixel has the embedding of its object's name; pixels without a name the normalised mean of the table.
+
+    The mean is a direction too, so "other" is something that a Gaussian can be, and not a hole. Maps are coded: an
+    index for each pixel into the names of this scene.
+    """
+
+    needs_images = False
+    cheap = True
+
+    def __init__(
+        self,
+        objects: Sequence[SceneObject],
+        names: Sequence[str],
+        embeddings: Float32[np.ndarray, "C D"],
+        space: FeatureSpace,
+    ) -> None:
+        """Makes the scene's table.
+
+        Args:
+            objects: which instance value has which name.
+            names: the words of the table.
+            embeddings: their unit vectors.
+            space: what these are.
+
+        Raises:
+            InputError: no objects, or a name that the table lacks.
+        """
+        if not objects:
+            raise InputError("teacher labels: the scene lists no objects; it needs an objects.json beside its views")
+        row_of = {name: row for row, name in enumerate(names)}
+        used = sorted({o.name for o in objects if o.name is not None})
+        missing = [name for name in used if name not in row_of]
+        if missing:
+            raise InputError(f"teacher labels: {len(missing)} object names are not in the table, first {missing[0]!r}")
+        mean = embeddings.mean(axis=0, dtype=np.float64)
+        other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)
+        self.names = ("other", *used)
+        self.table = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)
+        self.mean = mean.astype(np.float32)
+        self.space = space
+        self._code = {o.id: self.names.index(o.name) for o in objects if o.name is not None}
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """Codes at image resolution.
+
+        Raises:
+            InputError: the scene has no instance maps.
+        """
+        if views.instances is None:
+            raise InputError("teacher labels: the scene has no instance maps (instance_file_path in transforms.json)")
+        instances = views.instances[view]
+        values, inverse = np.unique(instances, return_inverse=True)
+        codes = np.array([self._code.get(int(value), 0) for value in values], np.int32)
+        return FeatureMap(
+            codes=codes[inverse].reshape(instances.shape),
+            table=self.table,
+            grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]),
+            space=self.space,
+        )
+
+    def settings(self) -> dict[str, Any]:
+        digest = hashlib.sha256(self.table.tobytes() + repr(sorted(self._code.items())).encode()).hexdigest()[:16]
+        return {"teacher": "labels", "table": digest}

@@ -1,0 +1,183 @@
+"""The `onnx` teacher: any dense ONNX backbone, run by onnxruntime; outputs as they are or as mixtures of word vectors."""
+
+import hashlib
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float32
+from PIL import Image
+
+from gsencoder.errors import InputError
+from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnnxTeacherConfig:
+    """How to feed a dense ONNX backbone and read its output."""
+
+    model: str = field(default="", metadata={"help": "path of the .onnx file"})
+    name: str = field(default="", metadata={"help": "short name of its feature space"})
+    input: str = field(default="", metadata={"help": "input tensor [B,3,H,W]; empty = the model's first"})
+    output: str = field(default="", metadata={"help": "output tensor; empty = the model's first"})
+    layout: Literal["tokens", "grid"] = field(
+        default="tokens", metadata={"help": "output as [B, T, D] tokens or as [B, D, h, w] grid"}
+    )
+    skip_tokens: int = field(default=0, metadata={"help": "leading tokens that are no patches (CLS, registers)"})
+    patch: int = field(default=14, metadata={"help": "pixels of the resized picture per cell; sizes are multiples of it"})
+    size: int = field(default=448, metadata={"help": "longer side of the resized picture in pixels"})
+    scale: float = field(default=255.0, metadata={"help": "8-bit values are divided by this, then mean and std apply"})
+    mean: tuple[float, ...] = field(default=(0.485, 0.456, 0.406), metadata={"help": "subtracted per channel"})
+    std: tuple[float, ...] = field(default=(0.229, 0.224, 0.225), metadata={"help": "divided per channel"})
+    classes: str = field(default="", metadata={"help": ".npz with class vectors: logits become mixtures of word vectors"})
+    top_k: int = field(default=5, metadata={"help": "classes in a mixture"})
+    temperature: float = field(default=1.0, metadata={"help": "softmax temperature of the posteriors"})
+    text_encoder: str = field(default="", metadata={"help": "what turns words into this space; empty if nothing does"})
+    threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
+
+
+class OnnxTeacher:
+    """A dense backbone behind onnxruntime. The whole picture is resized to multiples of the patch, without a crop."""
+
+    table = None
+    mean = None
+    needs_images = True
+    cheap = False
+
+    def __init__(self, config: OnnxTeacherConfig) -> None:
+        """Reads the model's signature and, for a classifier, the class vectors.
+
+        Raises:
+            InputError: a missing or unreadable model, or names that it does not have.
+        """
+        import onnxruntime
+
+        self.config = config
+        path = Path(config.model)
+        if not path.is_file():
+            raise InputError(f"teacher onnx: no model at {path}; set teacher.model to an .onnx file")
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        if config.threads:
+            options.intra_op_num_threads = config.threads
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises its own classes, which share only this base
+            raise InputError(f"teacher onnx: {path} is no model that onnxruntime reads: {str(error)[:120]}") from error
+        inputs = [tensor.name for tensor in self._session.get_inputs()]
+        outputs = [tensor.name for tensor in self._session.get_outputs()]
+        self._input, self._output = config.input or inputs[0], config.output or outputs[0]
+        if self._input not in inputs or self._output not in outputs:
+            raise InputError(
+                f"teacher onnx: {path.name} has inputs {inputs} and outputs {outputs}, "
+                f"not {self._input!r} and {self._output!r}"
+            )
+        self._classes = _load_classes(Path(config.classes)) if config.classes else None
+        shape = self._session.get_outputs()[outputs.index(self._output)].shape
+        channels = shape[-1] if config.layout == "tokens" else shape[1]
+        if self._classes is not None:
+            channels = self._classes.shape[1]
+        if not isinstance(channels, int):
+            channels = self._probe()
+        self.space = FeatureSpace(
+            name=config.name or path.stem,
+            channels=channels,
+            teacher="onnx",
+            weights=self._fingerprint,
+            layer=self._output + (f", top {config.top_k} classes as words" if config.classes else ""),
+            preprocessing=f"resized to {config.size} px in multiples of {config.patch}",
+            text_encoder=config.text_encoder,
+        )
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        return hashlib.sha256(Path(self.config.model).read_bytes()).hexdigest()[:16]
+
+    def _probe(self) -> int:
+        side = self.config.patch * 2
+        return int(self._run(np.zeros((side, side, 3), np.uint8)).shape[-1])
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """The backbone's cells for one picture.
+
+        Raises:
+            InputError: no pictures, or an output whose grid does not fit the input.
+        """
+        if views.images is None:
+            raise InputError("teacher onnx: the scene has no pictures")
+        image, patch = views.images[view], self.config.patch
+        height, width = image.shape[:2]
+        ratio = self.config.size / max(height, width)
+        rows, columns = max(1, round(height * ratio / patch)), max(1, round(width * ratio / patch))
+        resized = Image.fromarray(image).resize((columns * patch, rows * patch), Image.Resampling.BICUBIC)
+        features = self._run(np.asarray(resized))
+        if features.shape[:2] != (rows, columns):
+            raise InputError(
+                f"teacher onnx: expected {rows}×{columns} cells of {patch} pixels, the model gave "
+                f"{features.shape[0]}×{features.shape[1]}; check teacher.patch and teacher.skip_tokens"
+            )
+        return FeatureMap(
+            features=features,
+            grid_from_image=np.array([[columns / width, 0, 0], [0, rows / height, 0]]),
+            space=self.space,
+        )
+
+    def _run(self, image: np.ndarray) -> Float32[np.ndarray, "h w D"]:
+        config = self.config
+        mean, std = np.array(config.mean, np.float32), np.array(config.std, np.float32)
+        tensor = ((image.astype(np.float32) / config.scale - mean) / std).transpose(2, 0, 1)[None]
+        result = self._session.run([self._output], {self._input: np.ascontiguousarray(tensor)})[0][0]
+        if config.layout == "grid":
+            result = result.transpose(1, 2, 0)
+        else:
+            result = result[config.skip_tokens :]
+            rows, columns = image.shape[0] // config.patch, image.shape[1] // config.patch
+            if len(result) != rows * columns:
+                raise InputError(
+                    f"teacher onnx: expected {rows * columns} patch tokens, the model gave {len(result)}; "
+                    f"check teacher.patch and teacher.skip_tokens"
+                )
+            result = result.reshape(rows, columns, -1)
+        if self._classes is not None:
+            result = self._mix(result.reshape(-1, result.shape[-1])).reshape(*result.shape[:2], -1)
+        return np.ascontiguousarray(result, np.float32)
+
+    def _mix(self, logits: Float32[np.ndarray, "n classes"]) -> Float32[np.ndarray, "n D"]:
+        """Unit-norm mixture of the word vectors of the most probable classes, weighted by their probabilities."""
+        assert self._classes is not None
+        if logits.shape[1] != len(self._classes):
+            raise InputError(f"teacher onnx: {logits.shape[1]} classes but {len(self._classes)} class vectors")
+        known = np.isfinite(self._classes[:, 0])
+        logits = np.where(known, logits / self.config.temperature, -np.inf)
+        k = min(self.config.top_k, int(known.sum()))
+        best = np.argpartition(-logits, k - 1, axis=1)[:, :k]
+        top = np.take_along_axis(logits, best, axis=1)
+        share = np.exp(top - top.max(axis=1, keepdims=True))
+        mixed = np.einsum("nk,nkd->nd", share / share.sum(axis=1, keepdims=True), self._classes[best])
+        return (mixed / np.sqrt((mixed * mixed).sum(axis=1, keepdims=True) + 1e-12)).astype(np.float32)
+
+    def settings(self) -> dict[str, Any]:
+        values = {name: getattr(self.config, name) for name in self.config.__dataclass_fields__}
+        del values["threads"]
+        values["model"] = self._fingerprint
+        values["classes"] = Path(self.config.classes).name
+        return {"teacher": "onnx", **{k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}}
+
+
+def _load_classes(path: Path) -> Float32[np.ndarray, "classes D"]:
+    """Word vectors of a classifier's classes; NaN rows for those without one.
+
+    Raises:
+        InputError: no such file, or one without `embeddings` and `known`.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            vectors, known = data["embeddings"].astype(np.float32), data["known"].astype(bool)
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"teacher.classes: {path} is no .npz with embeddings and known: {error}") from error
+    if vectors.ndim != 2 or known.shape != (len(vectors),) or not math.isfinite(float(vectors[known].sum())):
+        raise InputError(f"teacher.classes: {path}: expected embeddings [C, D] and known [C], finite where known")
+    return np.where(known[:, None], vectors, np.nan).astype(np.float32)

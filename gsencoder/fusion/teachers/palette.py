@@ -1,0 +1,105 @@
+"""The `palette` teacher: photographs as shares of eleven colour names. Works offline on anything that has a picture."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from gsencoder.errors import InputError
+from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+# The eleven basic colour terms of English (Berlin & Kay 1969) and typical sRGB values, several where a name is wide.
+_PROTOTYPES: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "black": ((12, 12, 12), (35, 35, 38)),
+    "grey": ((80, 80, 80), (128, 128, 128), (170, 170, 172)),
+    "white": ((230, 230, 230), (255, 255, 255)),
+    "red": ((200, 20, 30), (150, 15, 25), (230, 60, 60)),
+    "orange": ((245, 130, 30), (220, 100, 20)),
+    "yellow": ((245, 220, 40), (220, 190, 30), (250, 240, 120)),
+    "green": ((40, 160, 60), (20, 90, 40), (140, 200, 90)),
+    "blue": ((30, 80, 200), (20, 40, 110), (110, 170, 230)),
+    "purple": ((120, 50, 160), (80, 30, 100), (170, 120, 210)),
+    "pink": ((250, 150, 180), (230, 90, 150)),
+    "brown": ((120, 75, 40), (85, 50, 30), (160, 110, 70)),
+}
+
+COLOUR_NAMES = tuple(_PROTOTYPES)
+
+
+def lab_from_rgb(rgb: UInt8[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
+    """CIE L*a*b* (D65) of 8-bit sRGB; distances in it roughly match what people see (L* from 0 to 100)."""
+    c = np.arange(256, dtype=np.float64) / 255
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)[rgb]
+    to_xyz = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]])
+    xyz = linear @ to_xyz.T / to_xyz.sum(axis=1)
+    f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
+    lab = np.stack((116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])), axis=-1)
+    return lab.astype(np.float32)
+
+
+class PaletteTeacher:
+    """Soft assignment of each cell's mean colour to colour names, softmax(−distance² / 2·softness²) in L*a*b*.
+
+    Its text side is one channel a word, so `query=red` is the first unit vector that a reader would expect.
+    """
+
+    table = None
+    mean = None
+    needs_images = True
+    cheap = True
+
+    def __init__(self, *, cell: int = 2, softness: float = 12.0) -> None:
+        """Chooses the grid.
+
+        Args:
+            cell: pixels along the side of a cell, averaged before naming.
+            softness: L*a*b* distance over which one name gives way to another.
+
+        Raises:
+            InputError: knobs out of range.
+        """
+        if cell < 1 or not softness > 0:
+            raise InputError(f"teacher palette: expected cell ≥ 1 and softness > 0, got {cell} and {softness}")
+        self.cell, self.softness = cell, softness
+        self.space = FeatureSpace(
+            name="palette-11",
+            channels=len(COLOUR_NAMES),
+            teacher="palette",
+            preprocessing=f"mean of {cell}×{cell} pixels, softness {softness:g} in L*a*b*",
+            text_encoder="palette-11",
+        )
+        lab = [lab_from_rgb(np.array(colours, np.uint8)) for colours in _PROTOTYPES.values()]
+        self._centers = np.concatenate(lab)
+        self._owner = np.repeat(np.arange(len(lab)), [len(part) for part in lab])
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """Colour-name shares on a grid of cells; pixels over the last whole cell are left out.
+
+        Raises:
+            InputError: the scene has no pictures, or one smaller than a cell.
+        """
+        if views.images is None:
+            raise InputError("teacher palette: the scene has no pictures")
+        image, cell = views.images[view], self.cell
+        h, w = image.shape[0] // cell, image.shape[1] // cell
+        if h == 0 or w == 0:
+            raise InputError(f"teacher palette: view {views.names[view]} is smaller than a cell of {cell} pixels")
+        blocks = image[: h * cell, : w * cell].reshape(h, cell, w, cell, 3)
+        mean = blocks.mean(axis=(1, 3), dtype=np.float32).round().astype(np.uint8)
+        return FeatureMap(
+            features=self.name_shares(mean.reshape(-1, 3)).reshape(h, w, -1),
+            grid_from_image=np.array([[1 / cell, 0, 0], [0, 1 / cell, 0]]),
+            space=self.space,
+        )
+
+    def name_shares(self, rgb: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 11"]:
+        """Share of each colour name, summing to 1."""
+        lab = lab_from_rgb(rgb)
+        distance = ((lab[:, None] - self._centers) ** 2).sum(axis=-1)
+        nearest = np.stack([distance[:, self._owner == k].min(axis=1) for k in range(len(COLOUR_NAMES))], axis=1)
+        score = -nearest / (2 * self.softness**2)
+        score = np.exp(score - score.max(axis=1, keepdims=True))
+        return (score / score.sum(axis=1, keepdims=True)).astype(np.float32)
+
+    def settings(self) -> dict[str, Any]:
+        return {"teacher": "palette", "cell": self.cell, "softness": self.softness}

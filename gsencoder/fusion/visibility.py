@@ -1,0 +1,77 @@
+"""Occlusion tests: is a Gaussian at the depth that a depth map says, or behind what is there?"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int32, Int64
+
+from gsencoder.errors import InputError
+from gsencoder.render import Blend
+from gsencoder.render.lattice import Lattice
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VisibilityConfig:
+    """Which depth maps a Gaussian is held against, and how near it must be; all chosen tests must pass."""
+
+    against: tuple[Literal["sensor", "rendered"], ...] = field(
+        default=(), metadata={"help": "depth maps to test against: sensor, rendered, both, or none"}
+    )
+    relative: float = field(default=0.05, metadata={"help": "largest |d − z| as a share of d; 0 = not tested"})
+    absolute: float = field(default=0.0, metadata={"help": "largest |d − z| in world units; 0 = not tested"})
+
+    def __post_init__(self) -> None:
+        if self.relative < 0 or self.absolute < 0:
+            raise InputError(f"visibility: expected tolerances ≥ 0, got {self.relative} and {self.absolute}")
+        if self.against and not (self.relative or self.absolute):
+            raise InputError("visibility: a test against a depth map needs relative or absolute above 0")
+
+
+def _near(z: np.ndarray, low: np.ndarray, high: np.ndarray, config: VisibilityConfig) -> Bool[np.ndarray, " n"]:
+    """Depth 0 means none: such rays say nothing was measured there, and nothing passes (as in OpenScene)."""
+    passed = high > 0
+    if config.relative:
+        passed &= (z >= low * (1 - config.relative)) & (z <= high * (1 + config.relative))
+    if config.absolute:
+        passed &= (z >= low - config.absolute) & (z <= high + config.absolute)
+    return passed
+
+
+def visible_points(
+    z: Float32[np.ndarray, " n"], pixels: Int64[np.ndarray, "n 2"], depth: Float32[np.ndarray, "H W"], config: VisibilityConfig
+) -> Bool[np.ndarray, " n"]:
+    """Tests Gaussians' centres at their own pixel (x, y), which must lie inside the map."""
+    d = depth[pixels[:, 1], pixels[:, 0]]
+    return _near(z, d, d, config)
+
+
+def visible_entries(b: Blend, depth: Float32[np.ndarray, "H W"], config: VisibilityConfig) -> Bool[torch.Tensor, " nnz"]:
+    """Tests each entry of B against the depths that its row's rays meet, from the nearest to the farthest of them."""
+    low, high = _row_range(depth, b.lattice)
+    row = torch.repeat_interleave(torch.arange(b.rows), b.crow.diff()).numpy()
+    z = b.depths[b.col.long()].numpy()
+    return torch.from_numpy(_near(z, low[row], high[row], config))
+
+
+def ray_pixels(lattice: Lattice, width: int, height: int) -> tuple[Int32[np.ndarray, " j"], Int32[np.ndarray, " i"]]:
+    """Pixel row and column that each line of rays falls into, clipped to the image."""
+    y = np.floor(lattice.y0 + lattice.dy * np.arange(lattice.height * lattice.side)).clip(0, height - 1)
+    x = np.floor(lattice.x0 + lattice.dx * np.arange(lattice.width * lattice.side)).clip(0, width - 1)
+    return y.astype(np.int32), x.astype(np.int32)
+
+
+def _row_range(depth: np.ndarray, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    y, x = ray_pixels(lattice, depth.shape[1], depth.shape[0])
+    rays = depth[np.ix_(y, x)].reshape(lattice.height, lattice.side, lattice.width, lattice.side)
+    high = rays.max(axis=(1, 3)).ravel()
+    low = np.where(rays > 0, rays, np.inf).min(axis=(1, 3)).ravel()
+    return np.where(high > 0, low, 0), high
+
+
+def row_mask(mask: Bool[np.ndarray, "H W"], lattice: Lattice) -> Float32[np.ndarray, " P"]:
+    """Share of each row's rays that a pixel mask lets through."""
+    y, x = ray_pixels(lattice, mask.shape[1], mask.shape[0])
+    rays = mask[np.ix_(y, x)].reshape(lattice.height, lattice.side, lattice.width, lattice.side)
+    return rays.mean(axis=(1, 3), dtype=np.float32).ravel()

@@ -1,0 +1,79 @@
+"""Products with compressed sparse rows on a CPU: what rendering and lifting come down to once B is known."""
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int32, Int64
+
+from gsencoder.render.threads import PIECES, even_cuts, kernel, parallel
+
+
+@kernel
+@no_type_check
+def _transpose(crow, cols, weights, where, out_rows, out_weights):
+    for row in range(len(crow) - 1):
+        for e in range(crow[row], crow[row + 1]):
+            at = where[cols[e]]
+            where[cols[e]] = at + 1
+            out_rows[at] = row
+            out_weights[at] = weights[e]
+
+
+def transpose(
+    crow: np.ndarray, cols: np.ndarray, weights: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The columns that occur, and Bᵀ restricted to them as CSR: (columns, crow, row, weight)."""
+    uses = np.bincount(cols, minlength=count)
+    ends = np.cumsum(uses)
+    out_rows, out_weights = np.empty(len(cols), np.int32), np.empty(len(cols), weights.dtype)
+    _transpose(crow, cols, weights, ends - uses, out_rows, out_weights)
+    columns = np.flatnonzero(uses)
+    return columns, np.concatenate(([0], ends[columns])), out_rows, out_weights
+
+
+@kernel
+@no_type_check
+def _product(first, last, crow, cols, weights, values, targets, out):
+    for row in range(first, last):
+        line = out[targets[row]]
+        for e in range(crow[row], crow[row + 1]):
+            weight = weights[e]
+            source = values[cols[e]]
+            for d in range(len(line)):
+                line[d] += weight * source[d]
+
+
+def product(
+    crow: np.ndarray, cols: np.ndarray, weights: np.ndarray, values: np.ndarray, targets: np.ndarray, out: np.ndarray
+) -> None:
+    """Adds row i of CSR @ values to out[targets[i]]; targets are distinct, so that threads never meet."""
+    cuts = even_cuts(crow)
+    if values.shape[1] * crow[-1] < 1 << 16:
+        _product(0, len(crow) - 1, crow, cols, weights, values, targets, out)
+        return
+    parallel(
+        lambda piece: _product(cuts[piece], cuts[piece + 1], crow, cols, weights, values, targets, out),
+        range(PIECES),
+    )
+
+
+@kernel
+@no_type_check
+def _count_codes(first, last, crow, cols, weights, codes, targets, out):
+    for row in range(first, last):
+        line = out[targets[row]]
+        for e in range(crow[row], crow[row + 1]):
+            code = codes[cols[e]]
+            if code >= 0:
+                line[code] += weights[e]
+
+
+def count_codes(
+    crow: np.ndarray, cols: np.ndarray, weights: np.ndarray, codes: np.ndarray, targets: np.ndarray, out: np.ndarray
+) -> None:
+    """CSR @ one_hot(codes), added to out[targets]: the product above without the channels that are zero."""
+    cuts = even_cuts(crow)
+    parallel(
+        lambda piece: _count_codes(cuts[piece], cuts[piece + 1], crow, cols, weights, codes, targets, out),
+        range(PIECES),
+    )

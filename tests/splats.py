@@ -1,0 +1,51 @@
+"""Small random splats and cameras that several test files stand on."""
+
+import numpy as np
+
+from gsencoder.types import Cameras, Gaussians
+
+
+def random_gaussians(
+    n: int = 300, seed: int = 0, *, center: tuple[float, float, float] = (0, 0, 3), log_scale: float = -2.5, degree: int = 0
+) -> Gaussians:
+    """A ball of Gaussians in front of `front_camera`."""
+    rng = np.random.default_rng(seed)
+    quats = rng.normal(size=(n, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return Gaussians(
+        means=(rng.normal(size=(n, 3)) * (1, 1, 0.7) + center).astype(np.float32),
+        quats=quats.astype(np.float32),
+        scales=np.exp(rng.normal(size=(n, 3)) * 0.7 + log_scale).astype(np.float32),
+        opacities=rng.uniform(size=n).astype(np.float32),
+        sh=rng.normal(size=(n, (degree + 1) ** 2, 3)).astype(np.float32),
+    )
+
+
+def one_gaussian(
+    mean: tuple[float, float, float] = (0, 0, 2), scale: float | tuple[float, float, float] = 0.1, opacity: float = 0.8
+) -> Gaussians:
+    scales = np.broadcast_to(np.asarray(scale, np.float32), (1, 3)).copy()
+    return Gaussians(
+        means=np.array([mean], np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        scales=scales,
+        opacities=np.array([opacity], np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+    )
+
+
+def front_camera(width: int = 61, height: int = 43, focal: float = 50.0) -> Cameras:
+    """One camera at the world's origin that looks along +z."""
+    return Cameras(
+        cam_from_world=np.eye(4, dtype=np.float32)[None],
+        Ks=np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], np.float32),
+        widths=np.array([width], np.int32),
+        heights=np.array([height], np.int32),
+    )
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """A rotation matrix, uniform."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
