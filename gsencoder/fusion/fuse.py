@@ -151,11 +151,15 @@ class _Maps:
 
     def get(self, view: int) -> FeatureMap:
         with self.clock("teacher"):
-            found = self.kept.load_map(view, self.teacher.space) if self.kept is not None else None
-            if found is None:
-                found = self.teacher.feature_map(self.views, view)
-                if self.kept is not None:
-                    self.kept.save_map(view, found)
+            if self.kept is None:
+                return self.teacher.feature_map(self.views, view)
+            found = self.kept.load_map(view, self.teacher.space)
+            if found is not None:
+                return found
+            self.kept.save_map(view, self.teacher.feature_map(self.views, view))
+            # What was written is what is used: a resumed run meets the same float16 values, and so the same basis.
+            found = self.kept.load_map(view, self.teacher.space)
+            assert found is not None
             return found
 
 

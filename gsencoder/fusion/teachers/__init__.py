@@ -1,6 +1,6 @@
 """Teachers: what gives each view a map of features. One file each; all share the contract below."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -8,6 +8,7 @@ from jaxtyping import Float32
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 
+@runtime_checkable
 class Teacher(Protocol):
     """Turns one view into a feature map.
 

@@ -1,0 +1,109 @@
+"""The basis keeps what it promises, and commutes with rendering."""
+
+import numpy as np
+import pytest
+import torch
+from splats import front_camera, random_gaussians
+
+from gsencoder.errors import InputError
+from gsencoder.fusion.basis import Moments, decode_map, encode, fit_basis, table_basis
+from gsencoder.render import blend
+from gsencoder.types import FeatureSpace
+
+SPACE = FeatureSpace(name="s", channels=24)
+
+
+def low_rank(rng: np.random.Generator, n: int = 500, rank: int = 5, noise: float = 0.0, mean: float = 0.0) -> np.ndarray:
+    x = rng.normal(size=(n, rank)) @ rng.normal(size=(rank, 24)) + noise * rng.normal(size=(n, 24)) + mean
+    return x.astype(np.float32)
+
+
+def moments_of(vectors: np.ndarray, chunks: int = 1) -> Moments:
+    moments = Moments(vectors.shape[1])
+    for part in np.array_split(vectors, chunks):
+        moments.add(part)
+    return moments
+
+
+def test_streaming_moments_equal_those_of_all_vectors_at_once(rng: np.random.Generator) -> None:
+    x = low_rank(rng, noise=0.3, mean=2.0)
+    moments = moments_of(x, chunks=7)
+    np.testing.assert_allclose(moments.mean, x.mean(axis=0, dtype=np.float64), atol=1e-5)
+    np.testing.assert_allclose(moments.covariance(), np.cov(x.T.astype(np.float64), bias=True), atol=1e-3)
+
+
+def test_a_mean_a_million_times_the_spread_does_not_swallow_it(rng: np.random.Generator) -> None:
+    x = (rng.normal(size=(400, 24)) * 1e-2 + 1e4).astype(np.float32)
+    np.testing.assert_allclose(np.diag(moments_of(x, 3).covariance()), x.astype(np.float64).var(axis=0), rtol=1e-2)
+
+
+def test_the_rank_is_the_smallest_that_keeps_the_energy(rng: np.random.Generator) -> None:
+    x = low_rank(rng, noise=0.1)
+    moments = moments_of(x)
+    values = np.sort(np.linalg.eigvalsh(moments.covariance()))[::-1]
+    for energy in (0.3, 0.8, 0.95, 0.999):
+        basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=energy)
+        share = values.cumsum() / values.sum()
+        assert share[basis.rank - 1] >= energy
+        assert basis.rank == 1 or share[basis.rank - 2] < energy
+        assert basis.energy_kept == pytest.approx(share[basis.rank - 1], abs=1e-6)
+
+
+def test_all_the_energy_of_exactly_low_rank_vectors_needs_only_that_rank(rng: np.random.Generator) -> None:
+    x = low_rank(rng, rank=5, mean=3.0)
+    moments = moments_of(x)
+    basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=1.0)
+    assert basis.rank == 5
+    np.testing.assert_allclose(encode(basis, x) @ basis.components + basis.mean, x, atol=1e-4)
+
+
+def test_components_are_orthonormal_and_the_same_on_a_rerun(rng: np.random.Generator) -> None:
+    moments = moments_of(low_rank(rng, noise=0.2))
+    basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=0.99)
+    np.testing.assert_allclose(basis.components @ basis.components.T, np.eye(basis.rank), atol=1e-6)
+    again = fit_basis(moments.mean, moments.covariance(), SPACE, energy=0.99)
+    assert (basis.components == again.components).all()
+
+
+@pytest.mark.parametrize("magnitude", [1e-8, 1.0, 1e6])
+def test_the_rank_does_not_depend_on_the_unit(rng: np.random.Generator, magnitude: float) -> None:
+    moments = moments_of(low_rank(rng, noise=0.1) * np.float32(magnitude))
+    assert fit_basis(moments.mean, moments.covariance(), SPACE, energy=0.9).rank in (3, 4, 5)
+
+
+def test_a_constant_feature_has_a_basis_of_rank_one_that_reproduces_it() -> None:
+    x = np.full((10, 24), 2.5, np.float32)
+    moments = moments_of(x)
+    basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=0.9)
+    assert basis.rank == 1
+    np.testing.assert_allclose(encode(basis, x) @ basis.components + basis.mean, x)
+
+
+def test_rendering_coordinates_then_decoding_equals_rendering_features(rng: np.random.Generator) -> None:
+    """decode(B @ z) = (B @ z) @ components + alpha · mean, because rows of B sum to alpha."""
+    x = low_rank(rng, n=200, mean=4.0)
+    moments = moments_of(x)
+    basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=1.0)
+    b = blend(random_gaussians(200), front_camera(), patch=7)
+    rendered = b.render(torch.from_numpy(encode(basis, x))).numpy()
+    np.testing.assert_allclose(
+        decode_map(basis, rendered, b.alpha.numpy()), b.render(torch.from_numpy(x)).numpy(), atol=1e-3
+    )
+
+
+def test_a_table_basis_serves_every_row_alike(rng: np.random.Generator) -> None:
+    table = rng.normal(size=(6, 24)).astype(np.float32)
+    basis = table_basis(table, table.mean(axis=0), SPACE, energy=1.0)
+    assert basis.rank == 5
+    np.testing.assert_allclose(encode(basis, table) @ basis.components + basis.mean, table, atol=1e-5)
+
+
+def test_bad_knobs_and_bad_vectors_are_refused() -> None:
+    with pytest.raises(InputError, match="energy: expected a share"):
+        fit_basis(np.zeros(24), np.eye(24), SPACE, energy=1.5)
+    with pytest.raises(InputError, match="max_rank"):
+        fit_basis(np.zeros(24), np.eye(24), SPACE, energy=0.5, max_rank=-1)
+    with pytest.raises(InputError, match="1 bad rows of 2"):
+        Moments(2).add(np.array([[0, 1], [np.nan, 1]], np.float32))
+    with pytest.raises(InputError, match="no view has any cell"):
+        _ = Moments(2).mean

@@ -1,0 +1,286 @@
+"""Fusion against its definition, and what happens when it is interrupted."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from splats import front_camera, one_gaussian, random_gaussians
+
+from gsencoder.errors import InputError
+from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
+from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.render import BlendConfig, blend
+from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
+
+SPACE = FeatureSpace(name="s", channels=6)
+EXACT = FuseConfig(energy=1.0)
+
+
+class FixedTeacher:
+    """Gives back the maps that it was made with."""
+
+    table = None
+    mean = None
+    needs_images = False
+    cheap = False
+
+    def __init__(self, maps: list[np.ndarray], stride: int = 4) -> None:
+        self.maps, self.stride, self.space, self.calls = maps, stride, SPACE, 0
+        self.fail_at: int | None = None
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        self.calls += 1
+        if view == self.fail_at:
+            raise KeyboardInterrupt
+        return FeatureMap(
+            features=self.maps[view], grid_from_image=np.array([[1 / self.stride, 0, 0], [0, 1 / self.stride, 0]]), space=SPACE
+        )
+
+    def settings(self) -> dict[str, Any]:
+        return {"teacher": "fixed"}
+
+
+class CodedTeacher(FixedTeacher):
+    cheap = True
+
+    def __init__(self, codes: list[np.ndarray], table: np.ndarray) -> None:
+        super().__init__(codes, stride=1)
+        self.table = table  # type: ignore[assignment]
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        return FeatureMap(
+            codes=self.maps[view], table=self.table, grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]), space=SPACE
+        )
+
+
+def ring(count: int = 5, width: int = 32, height: int = 24) -> Cameras:
+    """Cameras in a row, all looking along +z."""
+    one = front_camera(width, height, 30.0)
+    poses = np.repeat(one.cam_from_world, count, axis=0)
+    poses[:, 0, 3] = np.linspace(-0.5, 0.5, count)
+    return Cameras(
+        cam_from_world=poses,
+        Ks=np.repeat(one.Ks, count, axis=0),
+        widths=np.repeat(one.widths, count),
+        heights=np.repeat(one.heights, count),
+    )
+
+
+def make_scene(n: int = 150, count: int = 5, gaussians: Gaussians | None = None, **views: Any) -> Scene:
+    cameras = ring(count)
+    return Scene(
+        name="test",
+        gaussians=random_gaussians(n) if gaussians is None else gaussians,
+        views=Views(cameras=cameras, names=tuple(f"v{i}" for i in range(count)), **views),
+    )
+
+
+def random_maps(rng: np.random.Generator, count: int = 5) -> list[np.ndarray]:
+    return [rng.normal(size=(6, 8, 6)).astype(np.float32) for _ in range(count)]
+
+
+def by_definition(scene: Scene, maps: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    n = len(scene.gaussians)
+    sums, weights = np.zeros((n, 6)), np.zeros(n)
+    for view, features in enumerate(maps):
+        b = blend(scene.gaussians, scene.views.cameras, view, patch=4)
+        row = np.repeat(np.arange(b.rows), b.crow.diff().numpy())
+        np.add.at(sums, b.col.numpy(), b.weight.numpy()[:, None] * features.reshape(-1, 6)[row])
+        np.add.at(weights, b.col.numpy(), b.weight.numpy())
+    return np.divide(sums, weights[:, None], where=weights[:, None] > 0, out=sums), weights
+
+
+def decoded(fusion: Fusion) -> np.ndarray:
+    return np.where(fusion.features.seen[:, None], fusion.features.decode(), 0)
+
+
+def test_fused_features_are_the_weighted_mean_of_what_each_gaussian_shows(rng: np.random.Generator) -> None:
+    scene, maps = make_scene(), random_maps(rng)
+    expected, weights = by_definition(scene, maps)
+    for config in (EXACT, replace(EXACT, basis=False)):
+        fusion = fuse(scene, FixedTeacher(maps), config)
+        np.testing.assert_allclose(fusion.features.weights, weights, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(decoded(fusion), expected, atol=1e-4)
+
+
+def test_a_constant_map_gives_a_constant_feature() -> None:
+    maps = [np.full((6, 8, 6), 3.5, np.float32)] * 5
+    fusion = fuse(make_scene(), FixedTeacher(maps))
+    np.testing.assert_allclose(decoded(fusion)[fusion.features.seen], 3.5, rtol=1e-5)
+
+
+def test_the_order_of_views_does_not_matter(rng: np.random.Generator) -> None:
+    scene, maps = make_scene(), random_maps(rng)
+    assert scene.views is not None
+    order = [3, 0, 4, 1, 2]
+    shuffled = replace(
+        scene, views=Views(cameras=scene.views.cameras.select(order), names=tuple(f"w{i}" for i in range(5)))
+    )
+    one, other = fuse(scene, FixedTeacher(maps), EXACT), fuse(shuffled, FixedTeacher([maps[i] for i in order]), EXACT)
+    np.testing.assert_allclose(decoded(one), decoded(other), atol=1e-4)
+
+
+def test_coded_maps_are_the_same_as_their_vectors(rng: np.random.Generator) -> None:
+    scene = make_scene()
+    table = rng.normal(size=(4, 6)).astype(np.float32)
+    codes = [rng.integers(0, 4, size=(24, 32)).astype(np.int32) for _ in range(5)]
+    coded = fuse(scene, CodedTeacher(codes, table), FuseConfig(table_energy=1.0))
+    dense = fuse(scene, FixedTeacher([table[c] for c in codes], stride=1), EXACT)
+    np.testing.assert_allclose(decoded(coded), decoded(dense), atol=1e-4)
+    np.testing.assert_allclose(coded.features.weights, dense.features.weights, rtol=1e-4)
+
+
+def test_cells_without_a_code_give_no_weight(rng: np.random.Generator) -> None:
+    scene = make_scene(count=1)
+    table = rng.normal(size=(4, 6)).astype(np.float32)
+    codes = np.ones((24, 32), np.int32)
+    codes[:, 16:] = -1
+    fusion = fuse(scene, CodedTeacher([codes], table), FuseConfig(table_energy=1.0))
+    np.testing.assert_allclose(decoded(fusion)[fusion.features.seen], np.broadcast_to(table[1], (fusion.features.seen.sum(), 6)), atol=1e-5)
+    whole = fuse(scene, CodedTeacher([np.ones((24, 32), np.int32)], table))
+    assert fusion.features.weights.sum() < 0.8 * whole.features.weights.sum()
+
+
+def test_masked_pixels_give_no_weight(rng: np.random.Generator) -> None:
+    mask = np.ones((24, 32), bool)
+    mask[:, 16:] = False
+    maps = random_maps(rng, 1)
+    plain = fuse(make_scene(count=1), FixedTeacher(maps), EXACT).features.weights
+    masked = fuse(make_scene(count=1, masks=[mask]), FixedTeacher(maps), EXACT).features.weights
+    nothing = [np.zeros((24, 32), bool)]
+    assert 0.2 * plain.sum() < masked.sum() < 0.8 * plain.sum()
+    with pytest.raises(InputError, match="none of 1 views"):
+        fuse(make_scene(count=1, masks=nothing), FixedTeacher(maps), EXACT)
+
+
+def two_walls() -> Gaussians:
+    near, far = one_gaussian((0, 0, 2), (3.0, 3.0, 0.01), 1.0), one_gaussian((0, 0, 4), (6.0, 6.0, 0.01), 1.0)
+    return Gaussians(
+        **{name: np.concatenate((getattr(near, name), getattr(far, name))) for name in Gaussians.__dataclass_fields__}
+    )
+
+
+@pytest.mark.parametrize("against", ["rendered", "sensor"])
+def test_the_center_lift_sees_a_hidden_wall_unless_an_occlusion_test_hides_it(against: str) -> None:
+    maps = [np.ones((6, 8, 6), np.float32)]
+    depth = np.full((24, 32), 2.0, np.float32)
+    scene = make_scene(count=1, gaussians=two_walls(), depths=[depth])
+    seen = fuse(scene, FixedTeacher(maps), replace(EXACT, lift="center")).features.weights
+    assert seen.tolist() == [1, 1]
+    tested = replace(EXACT, lift="center", visibility=VisibilityConfig(against=(against,)))  # type: ignore[arg-type]
+    assert fuse(scene, FixedTeacher(maps), tested).features.weights.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize(("relative", "absolute", "passes"), [(0.1, 0.0, True), (0.01, 0.0, False), (0.0, 0.2, True), (0.1, 0.05, False)])
+def test_tolerances_combine(relative: float, absolute: float, passes: bool) -> None:
+    """The wall is at 2, the sensor says 2.1."""
+    depth = np.full((24, 32), 2.1, np.float32)
+    scene = make_scene(count=1, gaussians=one_gaussian((0, 0, 2), (3.0, 3.0, 0.01), 1.0), depths=[depth])
+    visibility = VisibilityConfig(against=("sensor",), relative=relative, absolute=absolute)
+    teacher = FixedTeacher([np.ones((6, 8, 6), np.float32)])
+    for lift in ("center", "blend"):
+        config = replace(EXACT, lift=lift, visibility=visibility)  # type: ignore[arg-type]
+        if passes:
+            assert fuse(scene, teacher, config).features.weights[0] > 0
+        else:
+            with pytest.raises(InputError, match="none of 1 views"):
+                fuse(scene, teacher, config)
+
+
+def test_a_hole_in_the_sensor_depth_passes_nothing() -> None:
+    scene = make_scene(count=1, depths=[np.zeros((24, 32), np.float32)])
+    config = replace(EXACT, visibility=VisibilityConfig(against=("sensor",)))
+    with pytest.raises(InputError, match="none of 1 views"):
+        fuse(scene, FixedTeacher([np.ones((6, 8, 6), np.float32)]), config)
+
+
+def test_an_interrupted_run_goes_on_and_ends_with_the_same_bits(tmp_path: Path, rng: np.random.Generator) -> None:
+    scene, maps = make_scene(), random_maps(rng)
+    whole = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "whole")
+    teacher = FixedTeacher(maps)
+    teacher.fail_at = 3
+    with pytest.raises(KeyboardInterrupt):
+        fuse(scene, teacher, EXACT, work=tmp_path / "cut")
+    teacher.fail_at, teacher.calls = None, 0
+    resumed = fuse(scene, teacher, EXACT, work=tmp_path / "cut")
+    assert teacher.calls == 2
+    assert (resumed.features.features == whole.features.features).all()
+    assert (resumed.features.weights == whole.features.weights).all()
+
+
+def test_sums_of_an_interrupted_lift_are_taken_up(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sys
+
+    scene, maps = make_scene(), random_maps(rng)
+    module = sys.modules["gsencoder.fusion.fuse"]
+    monkeypatch.setattr("gsencoder.fusion.store.PartialFusion.due", lambda self: True)
+    whole = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "whole")
+    lifted: list[int] = []
+    lift_view = module._lift_view  # type: ignore[attr-defined]
+
+    def stop_after_two(*arguments: Any) -> None:
+        if len(lifted) == 2:
+            raise KeyboardInterrupt
+        lifted.append(arguments[2])
+        lift_view(*arguments)
+
+    monkeypatch.setattr(module, "_lift_view", stop_after_two)
+    with pytest.raises(KeyboardInterrupt):
+        fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "cut")
+    lifted.clear()
+
+    def record(*arguments: Any) -> None:
+        lifted.append(arguments[2])
+        lift_view(*arguments)
+
+    monkeypatch.setattr(module, "_lift_view", record)
+    resumed = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "cut")
+    assert lifted == [2, 3, 4]
+    np.testing.assert_allclose(decoded(resumed), decoded(whole), atol=1e-6)
+
+
+def test_a_folder_of_another_run_is_refused_with_both_settings_named(tmp_path: Path, rng: np.random.Generator) -> None:
+    scene, maps = make_scene(), random_maps(rng)
+    fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path)
+    with pytest.raises(InputError, match=r"fuse\.lift=blend, and this run asks fuse\.lift=center"):
+        fuse(scene, FixedTeacher(maps), replace(EXACT, lift="center"), work=tmp_path)
+
+
+def test_fewer_views_are_spread_evenly(rng: np.random.Generator) -> None:
+    fusion = fuse(make_scene(), FixedTeacher(random_maps(rng)), replace(EXACT, views=3))
+    assert fusion.views == (0, 2, 4)
+
+
+def test_no_more_rays_than_pixels_are_spent(rng: np.random.Generator) -> None:
+    codes = [rng.integers(0, 4, size=(24, 32)).astype(np.int32)]
+    teacher = CodedTeacher(codes, rng.normal(size=(4, 6)).astype(np.float32))
+    few = fuse(make_scene(count=1), teacher, FuseConfig(blend=BlendConfig(rays_per_patch=1)))
+    many = fuse(make_scene(count=1), teacher, FuseConfig(blend=BlendConfig(rays_per_patch=16)))
+    assert (few.features.features == many.features.features).all()
+
+
+def test_scenes_that_cannot_be_fused_say_why(rng: np.random.Generator) -> None:
+    scene, teacher = make_scene(), FixedTeacher(random_maps(rng))
+    with pytest.raises(InputError, match="no Gaussians"):
+        fuse(replace(scene, gaussians=None), teacher)
+    with pytest.raises(InputError, match="no views"):
+        fuse(replace(scene, views=None), teacher)
+    away = make_scene(gaussians=random_gaussians(20, center=(0, 0, -50)))
+    with pytest.raises(InputError, match="none of 5 views of test sees any Gaussian"):
+        fuse(away, teacher)
+    with pytest.raises(InputError, match="no sensor depth"):
+        fuse(scene, teacher, replace(EXACT, visibility=VisibilityConfig(against=("sensor",))))
+
+
+@pytest.mark.parametrize("magnitude", [1e-8, 1e6])
+def test_tiny_and_huge_features_stay_finite_and_in_scale(rng: np.random.Generator, magnitude: float) -> None:
+    scene, maps = make_scene(), random_maps(rng)
+    plain = decoded(fuse(scene, FixedTeacher(maps), EXACT))
+    scaled = decoded(fuse(scene, FixedTeacher([m * np.float32(magnitude) for m in maps]), EXACT))
+    np.testing.assert_allclose(scaled / magnitude, plain, atol=1e-3)

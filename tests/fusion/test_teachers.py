@@ -1,0 +1,168 @@
+"""What each teacher gives for pictures whose answer is known."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splats import front_camera
+
+from gsencoder.errors import InputError
+from gsencoder.fusion.teachers.labels import LabelsTeacher
+from gsencoder.fusion.teachers.onnx import OnnxTeacher, OnnxTeacherConfig
+from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteTeacher, lab_from_rgb
+from gsencoder.types import FeatureSpace, SceneObject, Views
+
+
+def views_of(image: np.ndarray | None = None, instances: np.ndarray | None = None) -> Views:
+    array = image if image is not None else instances
+    assert array is not None
+    cameras = front_camera(array.shape[1], array.shape[0])
+    return Views(
+        cameras=cameras,
+        names=("a",),
+        images=None if image is None else [image],
+        instances=None if instances is None else [instances],
+    )
+
+
+@pytest.mark.parametrize(
+    ("rgb", "name"),
+    [
+        ((255, 0, 0), "red"), ((0, 0, 255), "blue"), ((0, 128, 0), "green"), ((255, 255, 0), "yellow"),
+        ((255, 255, 255), "white"), ((0, 0, 0), "black"), ((128, 128, 128), "grey"), ((255, 165, 0), "orange"),
+        ((255, 192, 203), "pink"), ((128, 0, 128), "purple"), ((139, 69, 19), "brown"),
+    ],
+)  # fmt: skip
+def test_the_palette_calls_css_colours_by_their_names(rgb: tuple[int, int, int], name: str) -> None:
+    image = np.broadcast_to(np.array(rgb, np.uint8), (6, 8, 3)).copy()
+    teacher = PaletteTeacher(cell=2)
+    features = teacher.feature_map(views_of(image), 0).features
+    assert features is not None
+    assert features.shape == (3, 4, 11)
+    assert COLOUR_NAMES[int(features[0, 0].argmax())] == name
+    np.testing.assert_allclose(features.sum(axis=-1), 1, rtol=1e-5)
+
+
+def test_lab_of_white_black_and_grey_is_neutral() -> None:
+    lab = lab_from_rgb(np.array([[255, 255, 255], [0, 0, 0], [119, 119, 119]], np.uint8))
+    np.testing.assert_allclose(lab[:, 0], [100, 0, 50], atol=0.1)
+    np.testing.assert_allclose(lab[:, 1:], 0, atol=1e-2)
+
+
+def label_objects() -> tuple[SceneObject, ...]:
+    corner = np.zeros(3)
+    return tuple(
+        SceneObject(id=i, name=name, aabb_min=corner, aabb_max=corner + 1) for i, name in ((3, "mug"), (5, None), (9, "ball"))
+    )
+
+
+def test_labels_give_each_pixel_its_name_and_the_rest_the_mean_direction() -> None:
+    embeddings = np.eye(4, 8, dtype=np.float32)
+    space = FeatureSpace(name="words", channels=8)
+    teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, space)
+    instances = np.array([[0, 3, 5], [9, 9, 77]], np.int32)
+    found = teacher.feature_map(views_of(instances=instances), 0)
+    assert found.codes is not None
+    vectors = teacher.table[found.codes]
+    np.testing.assert_allclose(vectors[0, 1], embeddings[2])
+    np.testing.assert_allclose(vectors[1, 0], embeddings[0])
+    other = embeddings.mean(axis=0) / np.linalg.norm(embeddings.mean(axis=0))
+    for at in ((0, 0), (0, 2), (1, 2)):
+        np.testing.assert_allclose(vectors[at], other, rtol=1e-6)
+
+
+def test_labels_without_objects_names_or_maps_say_so() -> None:
+    space = FeatureSpace(name="words", channels=8)
+    embeddings = np.eye(4, 8, dtype=np.float32)
+    with pytest.raises(InputError, match="lists no objects"):
+        LabelsTeacher((), ("a",), embeddings[:1], space)
+    with pytest.raises(InputError, match="not in the table, first 'mug'"):
+        LabelsTeacher(label_objects(), ("ball", "cup"), embeddings[:2], space)
+    teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, space)
+    with pytest.raises(InputError, match="no instance maps"):
+        teacher.feature_map(views_of(np.zeros((4, 4, 3), np.uint8)), 0)
+
+
+def write_mean_model(path: Path, patch: int = 4) -> None:
+    """A backbone whose features are each patch's mean colour, as tokens after one CLS token of zeros."""
+    onnx = pytest.importorskip("onnx")
+    helper, numpy_helper = onnx.helper, onnx.numpy_helper
+    F = onnx.TensorProto.FLOAT
+    nodes = [
+        helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[patch, patch], strides=[patch, patch]),
+        helper.make_node("Reshape", ["pooled", "flat"], ["grid"]),
+        helper.make_node("Transpose", ["grid"], ["tokens"], perm=[0, 2, 1]),
+        helper.make_node("Concat", ["cls", "tokens"], ["out"], axis=1),
+    ]
+    constants = [
+        numpy_helper.from_array(np.array([1, 3, -1], np.int64), "flat"),
+        numpy_helper.from_array(np.zeros((1, 1, 3), np.float32), "cls"),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "mean",
+        [helper.make_tensor_value_info("image", F, [1, 3, "H", "W"])],
+        [helper.make_tensor_value_info("out", F, [1, "T", 3])],
+        constants,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    onnx.save(model, path)
+
+
+def onnx_config(path: Path, **options: object) -> OnnxTeacherConfig:
+    values = {"model": str(path), "patch": 4, "size": 32, "skip_tokens": 1, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
+    return OnnxTeacherConfig(**{**values, **options})  # type: ignore[arg-type]
+
+
+def test_an_onnx_backbone_sees_each_patch_where_it_is(tmp_path: Path) -> None:
+    write_mean_model(tmp_path / "m.onnx")
+    teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx"))
+    image = np.zeros((24, 32, 3), np.uint8)
+    image[8:12, 20:24, 1] = 255
+    found = teacher.feature_map(views_of(image), 0)
+    assert found.features is not None
+    assert found.features.shape == (6, 8, 3)
+    assert teacher.space.channels == 3
+    row, column = np.unravel_index(found.features[..., 1].argmax(), (6, 8))
+    assert (int(row), int(column)) == (2, 5)
+    assert found.features[2, 5, 1] == pytest.approx(1)
+    np.testing.assert_allclose(found.grid_from_image, [[0.25, 0, 0], [0, 0.25, 0]])
+
+
+def test_a_classifier_becomes_a_mixture_of_the_known_classes_words(tmp_path: Path) -> None:
+    write_mean_model(tmp_path / "m.onnx")
+    vectors = np.eye(3, 5, dtype=np.float16)
+    np.savez(tmp_path / "classes.npz", embeddings=vectors, known=np.array([True, True, False]))
+    teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx", classes=str(tmp_path / "classes.npz"), top_k=1))
+    image = np.zeros((24, 32, 3), np.uint8)
+    image[..., 1] = 200
+    image[..., 2] = 255
+    features = teacher.feature_map(views_of(image), 0).features
+    assert features is not None
+    np.testing.assert_allclose(features[0, 0], [0, 1, 0, 0, 0], atol=1e-6)
+
+
+def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no model at"):
+        OnnxTeacher(onnx_config(tmp_path / "none.onnx"))
+    (tmp_path / "bad.onnx").write_bytes(b"not a model")
+    with pytest.raises(InputError, match="no model that onnxruntime reads"):
+        OnnxTeacher(onnx_config(tmp_path / "bad.onnx"))
+    write_mean_model(tmp_path / "m.onnx")
+    with pytest.raises(InputError, match="has inputs"):
+        OnnxTeacher(onnx_config(tmp_path / "m.onnx", output="nope"))
+    teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx", skip_tokens=0))
+    with pytest.raises(InputError, match="expected 48 patch tokens, the model gave 49"):
+        teacher.feature_map(views_of(np.zeros((24, 32, 3), np.uint8)), 0)
+
+
+@pytest.mark.shared
+def test_real_backbones_give_finite_features_of_their_stated_width(shared: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (112, 112, 3)).astype(np.uint8)
+    dino = OnnxTeacher(
+        OnnxTeacherConfig(model=str(shared / "models/dinov2_s14_dense_int8.onnx"), patch=14, size=112, skip_tokens=1)
+    )
+    features = dino.feature_map(views_of(image), 0).features
+    assert features is not None
+    assert features.shape == (8, 8, 384)
+    assert np.isfinite(features).all()
