@@ -7,7 +7,7 @@ and its options are written `section.name=value`. A field whose type is a union 
 member has a field `name: Literal["…"]`, and a folder of YAML files, one a member, makes it `section=member`.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
@@ -15,13 +15,13 @@ from typing import Any, TypeVar, get_origin
 from gsencoder.errors import InputError
 from gsencoder.options import (
     allows_none,
-    hints,
+    field_types,
     kind_of,
-    name_of,
+    member_name,
     near,
     options_by_key,
     options_of,
-    sections,
+    section_classes,
     split_list,
     union_members,
     wrong_value,
@@ -44,7 +44,7 @@ def _strict(wanted: type, accepted: tuple[type, ...]) -> Any:
     from dacite.exceptions import WrongTypeError
 
     def convert(value: Any) -> Any:
-        if not isinstance(value, accepted) or (isinstance(value, bool) and wanted is not bool) or value != value:
+        if not isinstance(value, accepted) or isinstance(value, bool) or value != value:
             raise WrongTypeError(field_type=wanted, value=value)
         return wanted(value)
 
@@ -64,14 +64,14 @@ def _prepare(value: Any, annotation: Any) -> Any:
 
 
 def _section(annotation: Any, value: Any, key: str) -> Any:
-    sections = sections(annotation)
-    if not sections or (value is None and allows_none(annotation)):
+    classes = section_classes(annotation)
+    if not classes or (value is None and allows_none(annotation)):
         return value
     if not isinstance(value, Mapping):
         raise InputError(f"{key}: is a section with options of its own ({key}.NAME=…), got {value!r}")
-    if len(sections) == 1:
-        return typed(sections[0], value, key + ".")
-    by_name = {name_of(section): section for section in sections}
+    if len(classes) == 1:
+        return typed(classes[0], value, key + ".")
+    by_name = {member_name(section): section for section in classes}
     name = str(value.get("name"))
     if name not in by_name:
         raise InputError(f"{key}.name: expected one of {', '.join(by_name)}, got {name!r}{near(name, by_name)}")
@@ -89,27 +89,25 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
     import dacite
     from dacite.exceptions import DaciteFieldError
 
-    hints = hints(cls)
+    types = field_types(cls)
     values: dict[str, Any] = {}
     for name, value in data.items():
-        if name not in hints:
-            known = [prefix + known for known in hints]
+        if name not in types:
+            known = [prefix + known for known in types]
             raise InputError(f"{prefix}{name}: no such option{near(f'{prefix}{name}', known)}")
-        values[name] = _prepare(_section(hints[name], value, prefix + name), hints[name])
+        values[name] = _prepare(_section(types[name], value, prefix + name), types[name])
     hooks: dict[Any, Any] = {
-        bool: _strict(bool, (bool,)),
         int: _strict(int, (int,)),
         float: _strict(float, (int, float)),
-        str: _strict(str, (str,)),
         Path: lambda value: Path(value) if isinstance(value, str) and value else value,
     }
     try:
-        return dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))  # type: ignore[type-var]
+        return dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
     except DaciteFieldError as error:
         name = str(error.field_path).partition(".")[0]
         raise InputError(wrong_value(options_by_key(cls, prefix)[prefix + name], data.get(name))) from error
     except InputError as error:
-        raise InputError(_named(str(error), prefix, hints)) from error
+        raise InputError(_named(str(error), prefix, types)) from error
 
 
 def _named(message: str, prefix: str, names: Iterable[str]) -> str:
@@ -144,4 +142,4 @@ def settings(config: object) -> dict[str, Any]:
             return {str(key): plain(item) for key, item in value.items()}
         return str(value) if isinstance(value, Path) else value
 
-    return plain(config)  # type: ignore[no-any-return]
+    return plain(config)

@@ -5,7 +5,6 @@ import types
 import typing
 from collections.abc import Iterable
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -38,11 +37,14 @@ class Option:
 
 
 def near(word: str, known: Iterable[str]) -> str:
-    """`; did you mean …?` where some known name is close to `word`, else nothing."""
-    names = sorted(set(known))
-    close = difflib.get_close_matches(word, names, n=3, cutoff=0.6)
-    close += [name for name in names if name not in close and name.rpartition(".")[2] == word.rpartition(".")[2]]
-    return f"; did you mean {' or '.join(close[:3])}?" if close else ""
+    """`; did you mean …?` where the last part of some known name is close to that of `word`, else nothing."""
+
+    def distance(name: str) -> float:
+        return -difflib.SequenceMatcher(None, word.rpartition(".")[2], name.rpartition(".")[2]).ratio()
+
+    close = sorted((distance(name), name) for name in set(known) if distance(name) <= -0.6)
+    best = [name for score, name in close if score <= close[0][0] + 0.15][:3]
+    return f"; did you mean {' or '.join(best)}?" if best else ""
 
 
 def union_members(annotation: Any) -> tuple[Any, ...]:
@@ -131,18 +133,19 @@ def join_list(items: Iterable[str]) -> str:
     return ",".join(written)
 
 
-@cache
-def hints(cls: type) -> dict[str, Any]:
-    return typing.get_typehints(cls)
+def field_types(cls: type) -> dict[str, Any]:
+    """The resolved types of a dataclass's fields."""
+    return typing.get_type_hints(cls)
 
 
-def sections(annotation: Any) -> tuple[type, ...]:
+def section_classes(annotation: Any) -> tuple[type, ...]:
     """The dataclasses that a section's value may have; empty for a plain option."""
     return tuple(member for member in union_members(annotation) if is_dataclass(member) and isinstance(member, type))
 
 
-def name_of(member: type) -> str:
-    return str(get_args(hints(member)["name"])[0])
+def member_name(member: type) -> str:
+    """What a member of a choice is called: the literal of its field `name`."""
+    return str(get_args(field_types(member)["name"])[0])
 
 
 def _default(item: Any) -> Any:
@@ -155,13 +158,13 @@ def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
     """Every option of a settings class, sections included, in order of declaration."""
     found = []
     for item in fields(cls):
-        key, annotation = prefix + item.name, hints(cls)[item.name]
-        sections = sections(annotation)
-        if sections:
-            for section in sections:
-                owner = f"{key}={name_of(section)}" if len(sections) > 1 else member
+        key, annotation = prefix + item.name, field_types(cls)[item.name]
+        classes = section_classes(annotation)
+        if classes:
+            for section in classes:
+                owner = f"{key}={member_name(section)}" if len(classes) > 1 else member
                 found += options_of(section, key + ".", owner)
-        elif not (item.name == "name" and member and get_origin(annotation) is Literal):
+        elif not (item.name == "name" and get_origin(annotation) is Literal and len(get_args(annotation)) == 1):
             found.append(
                 Option(
                     key=key,
@@ -179,7 +182,10 @@ def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
 
 def options_by_key(cls: type, prefix: str = "") -> dict[str, Option]:
     """The options of a class by full key; where members of a choice share a key, the first one's."""
-    return {option.key: option for option in reversed(options_of(cls, prefix))}
+    found: dict[str, Option] = {}
+    for option in options_of(cls, prefix):
+        found.setdefault(option.key, option)
+    return found
 
 
 def wrong_value(option: Option, value: Any) -> str:

@@ -36,11 +36,19 @@ def transpose(
 def _product(first, last, crow, cols, weights, values, targets, out):
     for row in range(first, last):
         line = out[targets[row]]
-        for e in range(crow[row], crow[row + 1]):
-            weight = weights[e]
-            source = values[cols[e]]
+        e, end = crow[row], crow[row + 1]
+        # Four entries at a time: the line is read and written once for four sources, which is what limits the speed.
+        while e + 4 <= end:
+            w0, w1, w2, w3 = weights[e], weights[e + 1], weights[e + 2], weights[e + 3]
+            s0, s1, s2, s3 = values[cols[e]], values[cols[e + 1]], values[cols[e + 2]], values[cols[e + 3]]
+            for d in range(len(line)):
+                line[d] = (((line[d] + w0 * s0[d]) + w1 * s1[d]) + w2 * s2[d]) + w3 * s3[d]
+            e += 4
+        while e < end:
+            weight, source = weights[e], values[cols[e]]
             for d in range(len(line)):
                 line[d] += weight * source[d]
+            e += 1
 
 
 def product(

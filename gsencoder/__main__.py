@@ -1,0 +1,8 @@
+"""`python -m gsencoder`, which is what `torchrun -m gsencoder` starts."""
+
+import sys
+
+from gsencoder.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,37 @@
+"""The commands, one small file each. Nothing is imported before it is asked for, so that `--help` is quick."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from gsencoder.config import CommonConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """One entry of the command line.
+
+    Attributes:
+        name: what the user types; `gsencoder.commands.NAME` is its module, `conf/NAME.yaml` its settings.
+        config: the name of the settings class in the module.
+        help: what it does, in one line.
+    """
+
+    name: str
+    config: str
+    help: str
+
+    def load(self) -> tuple[type[CommonConfig], Callable[[Any, Any], None]]:
+        """The settings class and `run(config, summary)`."""
+        module = importlib.import_module(f"gsencoder.commands.{self.name}")
+        return getattr(module, self.config), module.run
+
+
+COMMANDS = {
+    command.name: command
+    for command in (
+        Command(name="inspect", config="InspectConfig", help="what is in a splat file, and what is wrong with it"),
+        Command(name="repair", config="RepairConfig", help="mend a splat file, and say what was changed"),
+    )
+}

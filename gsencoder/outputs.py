@@ -1,0 +1,258 @@
+"""Folders and files that appear whole or not at all, and the summary that every run leaves in its folder."""
+
+import ctypes
+import errno
+import os
+import re
+import secrets
+import shutil
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from hashlib import sha1
+from pathlib import Path
+from typing import Any
+
+from gsencoder.data.atomic import atomic_file
+from gsencoder.errors import InputError, SceneWarning
+from gsencoder.summary import SUMMARY_NAME, Summary, json_bytes
+
+try:
+    import fcntl
+except ImportError:  # A system without it never removes what a killed run left behind.
+    fcntl = None  # type: ignore[assignment]
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Writes a file that appears whole or not at all, in place of what had its name.
+
+    Raises:
+        InputError: the folder is missing, the disk is full, or the system refuses.
+    """
+    with atomic_file(path) as stream:
+        stream.write(data)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Writes JSON, atomically. numpy values, paths and dataclasses become what JSON has for them.
+
+    Numbers that are not finite become null, with one counted `SceneWarning` that names them.
+
+    Raises:
+        InputError: as `write_bytes`.
+    """
+    data, lost = json_bytes(value)
+    if lost:
+        warnings.warn(
+            f"{path}: {len(lost)} numbers are not finite and were written as null: {', '.join(lost[:5])}",
+            SceneWarning,
+            stacklevel=2,
+        )
+    write_bytes(path, data)
+
+
+@contextmanager
+def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary | None = None) -> Iterator[Path]:
+    """A folder to write into, which takes the name `path` when the block ends without an error.
+
+    Until then it is a hidden folder beside it, `.NAME.partial-XXXXXXXX`. Whatever ends the block early, an interrupt
+    included, removes it; what a killed run left is removed by the next run that writes to the same path. Everything
+    is synced to disk before the folder gets its name.
+
+    Args:
+        path: the folder to make; its parents are made too. It may exist if it is empty.
+        overwrite: replace the output of an earlier run, recognised by its summary.json. Where the system can (Linux),
+            old and new change places in one step.
+        summary: written into the folder at the end, as summary.json.
+
+    Raises:
+        InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
+            or the disk is full.
+    """
+    # Through a symbolic link the folder that it points to is replaced, not the link.
+    target = Path(os.path.realpath(path))
+    _check_target(path, target, overwrite)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if _remove_stale(target):
+            raise InputError(f"{path}: another run is writing this folder now; wait for it or give another out=")
+        partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
+        partial.mkdir()
+    except FileExistsError as error:
+        raise InputError(f"{path}: {error.filename} is a file, so no folder can be made in it") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
+    lock = _lock(partial)
+    try:
+        yield partial
+        if summary is not None:
+            write_bytes(partial / SUMMARY_NAME, json_bytes(summary.to_dict())[0])
+        _sync(partial)
+        _check_target(path, target, overwrite)
+        _take_place(partial, target)
+    except Exception as error:
+        message = _refusal(error, partial, path)
+        if message is None:
+            raise
+        raise InputError(message) from error
+    finally:
+        # After a swap this is the old output.
+        shutil.rmtree(partial, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
+    if not os.path.lexists(target):
+        return
+    if not target.is_dir():
+        raise InputError(f"{path}: is a file, and the results are a folder; give another out=")
+    with suppress(OSError):
+        if not any(target.iterdir()):
+            return
+    if not (target / SUMMARY_NAME).is_file():
+        raise InputError(
+            f"{path}: is a folder with other contents (no {SUMMARY_NAME}), which is never replaced; give another out="
+        )
+    if not overwrite:
+        raise InputError(f"{path}: holds the results of an earlier run; give another out= or overwrite=true")
+
+
+def refuse_existing(path: str | Path, overwrite: bool) -> None:
+    """For commands whose result is one file: complains if it exists and may not be replaced.
+
+    Raises:
+        InputError: it exists.
+    """
+    if os.path.isdir(path):
+        raise InputError(f"{path}: is a folder; give the name of a file to write")
+    if os.path.lexists(path) and not overwrite:
+        raise InputError(f"{path}: exists; give another out= or overwrite=true")
+
+
+def refuse_to_replace_inputs(out: Path | None, inputs: Sequence[str]) -> None:
+    """Complains if a folder that is about to be replaced holds one of the inputs.
+
+    Raises:
+        InputError: it does.
+    """
+    if out is None or not out.is_dir():
+        return
+    folder = os.path.realpath(out)
+    for name in inputs:
+        if os.path.commonpath([folder, os.path.realpath(name)]) == folder:
+            raise InputError(f"{out}: holds the input {name}, so it cannot be replaced; give another out=")
+
+
+def _short(name: str) -> str:
+    """The name, or a digest of it where the temporary name would grow longer than file systems allow."""
+    raw = os.fsencode(name)
+    return name if len(raw) <= 200 else sha1(raw).hexdigest()
+
+
+def _lock(folder: Path) -> int | None:
+    """Marks a folder as being written: held until the descriptor closes, which the system does for a killed run."""
+    if fcntl is None:
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _remove_stale(target: Path) -> bool:
+    """Removes what killed runs left beside `target`; whether a living run is writing it now.
+
+    Where folders cannot be locked (some network file systems) nothing is removed and nobody is seen.
+    """
+    if fcntl is None:
+        return False
+    pattern = re.compile(re.escape(f".{_short(target.name)}.partial-") + "[0-9a-f]{8}")
+    for entry in list(os.scandir(target.parent)):
+        if not pattern.fullmatch(entry.name) or not entry.is_dir(follow_symlinks=False):
+            continue
+        with suppress(OSError):
+            descriptor = os.open(entry.path, os.O_RDONLY)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(entry.path, ignore_errors=True)
+            except BlockingIOError:
+                return True
+            finally:
+                os.close(descriptor)
+    return False
+
+
+def _sync(folder: Path) -> None:
+    for root, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            path = os.path.join(root, name)
+            if not os.path.islink(path):
+                _sync_one(path)
+        _sync_one(root)
+
+
+def _sync_one(path: str | Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        # Some file systems cannot sync a folder; a file that cannot be synced is an error.
+        if os.path.isfile(path) or error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _take_place(partial: Path, target: Path) -> None:
+    """Gives `partial` the name `target`; what had it before, if anything, is then called `partial`."""
+    old = target.is_dir() and any(target.iterdir())
+    if not old:
+        os.rename(partial, target)
+    elif not _exchange(partial, target):
+        aside = partial.with_name(f"{partial.name[:-8]}{secrets.token_hex(4)}")
+        os.rename(target, aside)
+        try:
+            os.rename(partial, target)
+        except BaseException:
+            os.rename(aside, target)
+            raise
+        os.rename(aside, partial)
+    _sync_one(target.parent)
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Lets two names change places in one step, where the system knows how."""
+    try:
+        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError, TypeError):
+        return False
+    return bool(renameat2(AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(second), RENAME_EXCHANGE) == 0)
+
+
+def is_full_disk(error: BaseException) -> bool:
+    """Whether an error, of the system or of a library that wrote, means that the disk or the quota is full."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return True
+    # numpy says "4096 requested and 100 written", and safetensors puts the system's words in its own error.
+    short = (
+        isinstance(error, OSError) and error.errno is None and re.search(r"\d+ requested and \d+ written", str(error))
+    )
+    return bool(short) or os.strerror(errno.ENOSPC) in str(error)
+
+
+def _refusal(error: Exception, partial: Path, path: str | Path) -> str | None:
+    """What to tell the user if it was the system that refused to write, or None."""
+    if is_full_disk(error):
+        return f"{path}: no space left on the device; nothing was kept"
+    if isinstance(error, InputError):
+        return str(error).replace(str(partial), str(path))
+    named = str(getattr(error, "filename", None) or "")
+    if isinstance(error, OSError) and named.startswith(str(partial)):
+        return f"{named.replace(str(partial), str(path))}: cannot write: {error.strerror or error}"
+    return None

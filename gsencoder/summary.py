@@ -1,0 +1,168 @@
+"""What a run did, as summary.json records it."""
+
+import json
+import math
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gsencoder
+
+SUMMARY_NAME = "summary.json"
+
+LIBRARIES = {
+    "numpy": "numpy",
+    "torch": "torch",
+    "numba": "numba",
+    "scipy": "scipy",
+    "sklearn": "scikit-learn",
+    "open3d": "open3d",
+    "trimesh": "trimesh",
+    "pycolmap": "pycolmap",
+    "onnxruntime": "onnxruntime",
+    "gsply": "gsply",
+    "safetensors": "safetensors",
+    "transformers": "transformers",
+    "gsplat": "gsplat",
+    "triton": "triton",
+}
+"""Module and distribution of the libraries whose versions are recorded, if the run imported them."""
+
+
+def plain(value: Any, where: str = "", lost: list[str] | None = None) -> Any:
+    """`value` in what JSON has: numpy values, paths, tuples and dataclasses are turned, non-finite numbers are null.
+
+    Args:
+        value: anything made of those.
+        where: the dotted name of `value`, for `lost`.
+        lost: collects the dotted names of the numbers that were not finite.
+
+    Raises:
+        TypeError: something that JSON has nothing for; it is named.
+    """
+
+    def inside(name: object, item: Any) -> Any:
+        return plain(item, f"{where}.{name}" if where else str(name), lost)
+
+    if value is None or isinstance(value, (bool, str)):
+        return value
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        if math.isfinite(value):
+            return float(value)
+        if lost is not None:
+            lost.append(where or "value")
+        return None
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist(), where, lost)
+    if isinstance(value, Mapping):
+        return {str(name): inside(name, item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [inside(index, item) for index, item in enumerate(value)]
+    if is_dataclass(value) and not isinstance(value, type):
+        return {item.name: inside(item.name, getattr(value, item.name)) for item in fields(value)}
+    raise TypeError(f"{where or 'value'}: {type(value).__name__} has no place in JSON")
+
+
+def json_bytes(value: Any) -> tuple[bytes, list[str]]:
+    """`value` as JSON, and the dotted names of the numbers that were not finite."""
+    lost: list[str] = []
+    text = json.dumps(plain(value, "", lost), indent=2, ensure_ascii=False, allow_nan=False)
+    # A lone surrogate stands for a byte of a file name that is not UTF-8; it is escaped, as JSON can.
+    return text.encode("utf-8", "backslashreplace") + b"\n", lost
+
+
+def peak_memory_mb() -> float:
+    """The most memory this process ever held, in MiB."""
+    # Linux counts ru_maxrss from the parent's size at the fork; VmHWM is the process's own.
+    try:
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    except OSError:
+        pass
+    try:
+        import resource
+    except ImportError:
+        return math.nan
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+class Summary:
+    """Collects what one run did: its settings, the seconds of each step, warnings and results.
+
+    Attributes:
+        results: what the command found or made; the command fills it.
+        warnings: one line each, in order; the command line adds every `SceneWarning` of the run.
+        timings: seconds by step, in order of first start.
+    """
+
+    def __init__(self, command: str, settings: Mapping[str, Any]) -> None:
+        self.command = command
+        self.settings = dict(settings)
+        self.results: dict[str, Any] = {}
+        self.warnings: list[str] = []
+        self.timings: dict[str, float] = {}
+        self._start = time.perf_counter()
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Adds the seconds that the block takes to the step's, also when it fails."""
+        start = time.perf_counter()
+        self.timings.setdefault(name, 0.0)
+        try:
+            yield
+        finally:
+            self.timings[name] += time.perf_counter() - start
+
+    def to_dict(self) -> dict[str, Any]:
+        """The record in JSON's terms. `non_finite` lists the results that were not finite and are null."""
+        lost: list[str] = []
+        results = plain(self.results, "results", lost)
+        total = time.perf_counter() - self._start
+        record = {
+            "command": self.command,
+            "version": gsencoder.__version__,
+            "settings": plain(self.settings, "settings", lost),
+            "timings": {name: round(seconds, 4) for name, seconds in (*self.timings.items(), ("total", total))},
+            "peak_memory_mb": plain(round(peak_memory_mb(), 1)),
+            "warnings": list(self.warnings),
+            "results": results,
+            "versions": _versions(),
+            "platform": {
+                "system": platform.system(),
+                "machine": platform.machine(),
+                "processors": _processors(),
+            },
+        }
+        return record | ({"non_finite": lost} if lost else {})
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for module, distribution in LIBRARIES.items():
+        if module in sys.modules:
+            try:
+                found[module] = version(distribution)
+            except PackageNotFoundError:
+                found[module] = "unknown"
+    return found
