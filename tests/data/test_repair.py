@@ -1,0 +1,203 @@
+"""Inspecting and repairing: every defect is found where it was planted, and only what was asked changes."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import splat_samples as samples
+
+from gsencoder.data.repair import FIXES, inspect_splat, repair_splat
+from gsencoder.data.splats import RawSplat, gaussians_from_raw, read_raw
+from gsencoder.errors import InputError
+
+Plant = Callable[[RawSplat], RawSplat]
+
+
+def put(field: str, rows: list[int], value: float, column: int | None = None) -> Plant:
+    def plant(raw: RawSplat) -> RawSplat:
+        array = getattr(raw, field).copy()
+        array[rows if column is None else (rows, column)] = value
+        return replace(raw, **{field: array})
+
+    return plant
+
+
+def copy_rows(raw: RawSplat) -> RawSplat:
+    order = np.arange(len(raw))
+    order[[7, 90]] = [3, 3]
+    return raw.select(order)
+
+
+PLANTED: dict[str, tuple[str, tuple[int, ...], Plant]] = {
+    "nan mean": ("nonfinite", (4, 9), put("means", [4, 9], np.nan, 1)),
+    "mean beyond float32": ("nonfinite", (4,), put("means", [4], 1e39, 1)),
+    "inf quaternion": ("nonfinite", (4,), put("quats", [4], -np.inf, 3)),
+    "nan sh": ("nonfinite", (4,), put("sh", [4], np.nan)),
+    "nan scale": ("nonfinite", (4,), put("log_scales", [4], np.nan, 0)),
+    "nan opacity": ("nonfinite", (4,), put("logit_opacities", [4], np.nan)),
+    "zero quaternion": ("quats", (0, 299), put("quats", [0, 299], 0)),
+    "tiny quaternion": ("quats", (5,), put("quats", [5], 1e-13)),
+    "zero scale": ("scales", (5,), put("log_scales", [5], -np.inf, 2)),
+    "subnormal scale": ("scales", (5,), put("log_scales", [5], -88.5, 2)),
+    "endless scale": ("scales", (5, 6), put("log_scales", [5, 6], 89, 2)),
+    "infinite logits": ("opacities", (2,), put("logit_opacities", [2], -np.inf)),
+    "huge scale": ("huge", (2,), put("log_scales", [2], 6, 1)),
+    "duplicates": ("duplicates", (7, 90), copy_rows),
+    "floaters": ("floaters", (1, 2), put("means", [1, 2], -500, 0)),
+}
+
+
+@pytest.mark.parametrize("case", PLANTED)
+def test_a_planted_defect_is_reported_with_its_rows_and_nothing_else_is(case: str) -> None:
+    name, rows, plant = PLANTED[case]
+    report = inspect_splat(plant(samples.make_raw()))
+    assert [(defect.name, defect.count, defect.first_rows) for defect in report.defects] == [(name, len(rows), rows)]
+    stops = name in ("nonfinite", "quats", "scales", "opacities")
+    assert report.defects[0].stops_loading == stops
+    assert report.loadable != stops
+
+
+@pytest.mark.parametrize("case", PLANTED)
+def test_the_fix_of_a_defect_leaves_none_and_touches_no_other_row(case: str) -> None:
+    name, rows, plant = PLANTED[case]
+    raw = plant(samples.make_raw())
+    fixed, report = repair_splat(raw, [name])
+    assert inspect_splat(fixed).defects == ()
+    assert len(gaussians_from_raw(fixed)) == len(fixed) == report.rows_after
+    assert sum(change.count for change in report.changes) == len(rows)
+    others = np.setdiff1d(np.arange(len(raw)), rows)
+    kept = others if len(fixed) < len(raw) else np.arange(len(raw))
+    touched = np.isin(kept, rows)
+    for field in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        assert np.array_equal(getattr(fixed, field)[~touched], getattr(raw, field)[others]), field
+
+
+@pytest.mark.parametrize("fix", FIXES)
+def test_a_fix_without_its_defect_changes_nothing(fix: str) -> None:
+    raw = samples.make_raw()
+    fixed, report = repair_splat(raw, [fix])
+    assert all(change.count == 0 for change in report.changes)
+    for field in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        assert np.array_equal(getattr(fixed, field), getattr(raw, field))
+
+
+def test_only_the_fixes_asked_for_are_made() -> None:
+    raw = put("quats", [3], 0)(put("logit_opacities", [8], np.inf)(samples.make_raw()))
+    fixed, report = repair_splat(raw, ["opacities"])
+    assert [defect.name for defect in inspect_splat(fixed).defects] == ["quats"]
+    assert [(change.fix, change.count) for change in report.changes] == [("opacities", 1)]
+    assert fixed.logit_opacities[8] == 20
+    assert np.isinf(raw.logit_opacities[8])
+
+
+def test_all_mends_everything_at_once_and_a_second_run_finds_nothing() -> None:
+    raw = samples.make_raw()
+    for _, _, plant in PLANTED.values():
+        raw = plant(raw)
+    fixed, report = repair_splat(raw, ["all"])
+    assert inspect_splat(fixed).defects == ()
+    assert (report.rows_before, report.rows_after) == (300, len(fixed))
+    dropped = sum(change.count for change in report.changes if change.action.startswith("dropped"))
+    assert dropped == 300 - len(fixed)
+    again, second = repair_splat(fixed, ["all"])
+    assert len(again) == len(fixed)
+    assert all(change.count == 0 for change in second.changes)
+
+
+def test_what_fixes_set_is_what_they_say() -> None:
+    raw = put("log_scales", [5], -np.inf, 2)(put("quats", [3], 0)(samples.make_raw()))
+    fixed, _ = repair_splat(raw, ["quats", "scales"])
+    assert fixed.quats[3].tolist() == [1, 0, 0, 0]
+    assert np.exp(fixed.log_scales[5, 2]) == pytest.approx(1e-9, rel=1e-5)
+    assert np.array_equal(fixed.log_scales[5, :2], raw.log_scales[5, :2])
+
+
+def test_an_unknown_fix_lists_the_names() -> None:
+    for wrong in (["quat"], [], ["all", "x"], "quats"):
+        with pytest.raises(InputError, match="nonfinite, quats, scales, opacities, huge, duplicates, floaters, or all"):
+            repair_splat(samples.make_raw(9), wrong)
+
+
+def test_a_repair_that_leaves_nothing_is_an_error() -> None:
+    raw = put("means", list(range(9)), np.nan)(samples.make_raw(9))
+    with pytest.raises(InputError, match="drop all 9"):
+        repair_splat(raw, ["nonfinite"])
+
+
+def test_rows_that_differ_in_one_bit_of_one_column_are_not_duplicates() -> None:
+    raw = samples.make_raw()
+    raw = raw.select(np.repeat(np.arange(150), 2))
+    sh = raw.sh.copy()
+    sh[1::2, 3, 2] = np.nextafter(sh[1::2, 3, 2], np.float32(9))
+    sh[101, 3, 2] = sh[100, 3, 2]
+    defects = inspect_splat(replace(raw, sh=sh)).defects
+    assert [(defect.name, defect.first_rows) for defect in defects] == [("duplicates", (101,))]
+
+
+def test_thousands_of_coincident_rows_keep_the_first() -> None:
+    raw = samples.make_raw(1, 0).select(np.zeros(5000, np.int64))
+    fixed, report = repair_splat(raw, ["duplicates"])
+    assert len(fixed) == 1
+    assert report.changes[0].count == 4999
+    assert {defect.name for defect in inspect_splat(raw).defects} == {"duplicates"}
+
+
+def test_defects_are_found_in_rows_that_are_permuted() -> None:
+    raw = samples.make_raw()
+    for _, _, plant in PLANTED.values():
+        raw = plant(raw)
+    counts = {defect.name: defect.count for defect in inspect_splat(raw).defects}
+    order = np.random.default_rng(3).permutation(300)
+    assert {defect.name: defect.count for defect in inspect_splat(raw.select(order)).defects} == counts
+
+
+def test_the_statistics_are_those_of_the_finite_rows() -> None:
+    raw = put("means", [4], np.inf)(samples.make_raw())
+    report = inspect_splat(raw)
+    good = np.delete(np.arange(300), 4)
+    assert report.extent_min == tuple(raw.means[good].min(axis=0))
+    assert report.extent_max == tuple(raw.means[good].max(axis=0))
+    assert report.robust_min is not None
+    assert (np.array(report.robust_min) >= report.extent_min).all()
+    assert report.median_scale == pytest.approx(np.exp(np.median(raw.log_scales[good])), rel=1e-6)
+    assert list(report.opacity_quantiles.values()) == sorted(report.opacity_quantiles.values())
+    assert (report.count, report.sh_degree, report.format) == (300, 1, "made for a test")
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_very_small_splats_are_inspected(count: int) -> None:
+    report = inspect_splat(samples.make_raw().select(np.arange(count)))
+    assert report.count == count
+    assert report.defects == ()
+    assert report.loadable == (count > 0)
+
+
+def test_a_file_of_nothing_but_nan_is_inspected(tmp_path: Path) -> None:
+    raw = samples.make_raw(5, 0)
+    columns = {name: np.full(5, np.nan) for name in samples.ply_columns(raw)}
+    (tmp_path / "nan.ply").write_bytes(samples.ply_bytes(columns))
+    report = inspect_splat(read_raw(tmp_path / "nan.ply"))
+    assert [(defect.name, defect.count) for defect in report.defects if defect.stops_loading] == [("nonfinite", 5)]
+    assert report.extent_min is None
+    assert report.median_scale is None
+
+
+def test_reports_are_json(tmp_path: Path) -> None:
+    raw = put("quats", [3], 0)(samples.make_raw())
+    inspected = json.loads(json.dumps(inspect_splat(raw).to_dict(), allow_nan=False))
+    assert inspected["loadable"] is False
+    assert inspected["defects"] == [{"name": "quats", "count": 1, "first_rows": [3], "stops_loading": True}]
+    _, report = repair_splat(raw, ["quats"])
+    repaired = json.loads(json.dumps(report.to_dict(), allow_nan=False))
+    assert repaired["changes"] == [{"fix": "quats", "count": 1, "action": "set to the identity rotation"}]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["guitar.compressed.ply", "biker.spz", "playbot_sog"])
+def test_the_real_files_have_no_defect(shared: Path, name: str) -> None:
+    report = inspect_splat(read_raw(shared / "fixtures" / name))
+    assert report.defects == ()
+    assert report.loadable

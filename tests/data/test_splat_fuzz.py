@@ -1,0 +1,205 @@
+"""Readers against damaged files: a splat, or an InputError of one line, and nothing else."""
+
+import gzip
+import json
+import struct
+import warnings
+from itertools import pairwise
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+import splat_samples as samples
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from gsencoder.data.repair import inspect_splat, repair_splat
+from gsencoder.data.splats import RawSplat, gaussians_from_raw, load_splat, read_raw
+from gsencoder.errors import InputError, SceneWarning
+
+NAMES = ("a.ply", "a.compressed.ply", "a.spz", "v3.spz", "ascii.ply", "a.splat", "a.sog")
+FUZZ = settings(
+    max_examples=100,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+Edit = tuple[float, int]
+EDITS = st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=6)
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return samples.valid_files(tmp_path_factory.mktemp("valid"))
+
+
+def edited(data: bytes, edits: list[Edit], length: float = 1.0) -> bytes:
+    """`data` with bytes replaced at shares of its length, cut to a share of it."""
+    changed = bytearray(data)
+    for place, value in edits:
+        if changed:
+            changed[int(place * len(changed))] = value
+    return bytes(changed[: round(length * len(changed))])
+
+
+def read_or_message(path: Path) -> RawSplat | str:
+    try:
+        return read_raw(path)
+    except InputError as error:
+        return str(error)
+
+
+def assert_holds(path: Path) -> None:
+    """Whatever the file is: reading, inspecting, repairing and loading it end well or in an InputError."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)
+        raw = read_or_message(path)
+        if isinstance(raw, str):
+            assert "\n" not in raw
+            assert len(raw) < 1000
+            return
+        report = inspect_splat(raw)
+        json.dumps(report.to_dict(), allow_nan=False)
+        assert len(raw) == report.count <= 100_000
+        try:
+            gaussians = load_splat(path)
+        except InputError:
+            assert not report.loadable
+        else:
+            assert report.loadable
+            assert len(gaussians) == len(raw)
+        try:
+            fixed, _ = repair_splat(raw, ["all"])
+        except InputError:
+            return
+        assert len(gaussians_from_raw(fixed)) == len(fixed)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@FUZZ
+@given(edits=EDITS, length=st.one_of(st.just(1.0), st.floats(0, 1)))
+def test_changed_and_cut_bytes(
+    valid: dict[str, bytes], tmp_path: Path, name: str, edits: list[Edit], length: float
+) -> None:
+    (tmp_path / name).write_bytes(edited(valid[name], edits, length))
+    assert_holds(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "ascii.ply"])
+@FUZZ
+@given(edits=EDITS)
+def test_changed_ply_headers(valid: dict[str, bytes], tmp_path: Path, name: str, edits: list[Edit]) -> None:
+    head, body = valid[name].split(b"end_header\n", 1)
+    (tmp_path / name).write_bytes(edited(head, edits) + b"end_header\n" + body)
+    assert_holds(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply"])
+@FUZZ
+@given(edits=EDITS)
+def test_changed_ply_bodies(valid: dict[str, bytes], tmp_path: Path, name: str, edits: list[Edit]) -> None:
+    head, body = valid[name].split(b"end_header\n", 1)
+    (tmp_path / name).write_bytes(head + b"end_header\n" + edited(body, edits))
+    assert_holds(tmp_path / name)
+
+
+@FUZZ
+@given(edits=EDITS, length=st.floats(0, 1))
+def test_changed_bytes_inside_the_gzip_of_an_spz(
+    valid: dict[str, bytes], tmp_path: Path, edits: list[Edit], length: float
+) -> None:
+    data = gzip.decompress(valid["v3.spz"])
+    # Half of the edits go to the 16 bytes of the header.
+    data = edited(data[:16], edits[::2]) + edited(data[16:], edits[1::2], length)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(data, 1))
+    assert_holds(tmp_path / "a.spz")
+
+
+@FUZZ
+@given(edits=EDITS)
+def test_changed_headers_and_tables_of_an_spz(valid: dict[str, bytes], tmp_path: Path, edits: list[Edit]) -> None:
+    data = valid["a.spz"]
+    (tmp_path / "a.spz").write_bytes(edited(data[:128], edits) + data[128:])
+    assert_holds(tmp_path / "a.spz")
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.just("quats.webp"),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=6,
+)
+META_KEYS = ("version", "count", "means", "scales", "quats", "sh0", "shN")
+FIELDS = ("", "mins", "maxs", "files", "codebook", "count", "bands")
+
+
+@FUZZ
+@example(key="count", field="", value=2**31)
+@example(key="means", field="maxs", value=[1e308, -1e308, 1e308])
+@example(key="scales", field="codebook", value=[10**400] * 256)
+@example(key="shN", field="count", value=2**16)
+@given(key=st.sampled_from(META_KEYS), field=st.sampled_from(FIELDS), value=JSON)
+def test_any_json_in_the_place_of_a_sog_field(tmp_path: Path, key: str, field: str, value: object) -> None:
+    files = samples.sog_files(9)
+    meta = json.loads(files["meta.json"])
+    if field and isinstance(meta[key], dict):
+        meta[key][field] = value
+    else:
+        meta[key] = value
+    (tmp_path / "a.sog").write_bytes(samples.zipped({**files, "meta.json": json.dumps(meta).encode()}))
+    assert_holds(tmp_path / "a.sog")
+
+
+@FUZZ
+@given(
+    name=st.sampled_from(["means_l", "quats", "scales", "sh0", "shN_centroids", "shN_labels"]),
+    edits=EDITS,
+    length=st.one_of(st.just(1.0), st.floats(0, 1)),
+)
+def test_changed_bytes_inside_the_images_of_a_sog(tmp_path: Path, name: str, edits: list[Edit], length: float) -> None:
+    files = samples.sog_files(9)
+    files[f"{name}.webp"] = edited(files[f"{name}.webp"], edits, length)
+    (tmp_path / "a.sog").write_bytes(samples.zipped(files))
+    assert_holds(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat", ".sog", ""])
+@FUZZ
+@given(
+    start=st.sampled_from([b"", b"ply\n", b"NGSP\4\0\0\0", b"\x1f\x8b\x08\0", b"PK\3\4"]), rest=st.binary(max_size=200)
+)
+def test_bytes_without_any_sense(tmp_path: Path, suffix: str, start: bytes, rest: bytes) -> None:
+    (tmp_path / f"x{suffix}").write_bytes(start + rest)
+    assert_holds(tmp_path / f"x{suffix}")
+
+
+@FUZZ
+@given(values=st.lists(st.floats(width=32), min_size=14, max_size=14), far=st.floats(allow_nan=False))
+def test_any_numbers_in_the_columns_of_a_ply(tmp_path: Path, values: list[float], far: float) -> None:
+    columns = samples.ply_columns(samples.make_raw(4, 0))
+    columns = {
+        name: np.r_[column.astype(np.float64), value]
+        for (name, column), value in zip(columns.items(), values, strict=True)
+    }
+    columns["x"][0] = far
+    (tmp_path / "a.ply").write_bytes(samples.ply_bytes(columns, kinds="double"))
+    assert_holds(tmp_path / "a.ply")
+
+
+def zstd_frames(parts: list[bytes]) -> bytes:
+    frames = [bytes(imagecodecs.zstd_encode(part, level=1)) for part in parts]
+    table = b"".join(struct.pack("<QQ", len(f), len(p)) for f, p in zip(frames, parts, strict=True))
+    return table + b"".join(frames)
+
+
+@FUZZ
+@given(body=st.binary(min_size=20 * 3, max_size=20 * 3), bits=st.integers(0, 30))
+def test_any_bytes_in_the_sections_of_an_spz_make_a_splat(tmp_path: Path, body: bytes, bits: int) -> None:
+    ends = [0, 27, 30, 39, 48, 60]
+    parts = [body[a:b] for a, b in pairwise(ends)]
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 3, 0, bits, 0, 5, 32)
+    (tmp_path / "a.spz").write_bytes(header + zstd_frames(parts))
+    assert_holds(tmp_path / "a.spz")
+    if 1 <= bits <= 24:
+        assert len(read_raw(tmp_path / "a.spz")) == 3

@@ -1,0 +1,286 @@
+"""Reading and writing splat files: round trips, conventions, other libraries as oracles, bad input."""
+
+import gzip
+import os
+import struct
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import splat_samples as samples
+
+from gsencoder.data import splats
+from gsencoder.data.splats import fingerprint, load_splat, read_raw, save_splat
+from gsencoder.errors import InputError, SceneWarning
+
+C0 = 0.28209479177387814
+
+
+SPZ = {"quats": 2e-3, "log_scales": 0.03126, "opacities": 0.00197, "dc": 0.01308, "rest": 0.00391}
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_an_inria_ply_comes_back_exactly_but_for_logarithms(tmp_path: Path, degree: int) -> None:
+    gaussians = samples.make_gaussians(5000, degree)
+    save_splat(tmp_path / "a.ply", gaussians)
+    loaded = load_splat(tmp_path / "a.ply")
+    assert np.array_equal(loaded.means, gaussians.means)
+    assert np.array_equal(loaded.sh, gaussians.sh)
+    samples.assert_close(loaded, gaussians, means=0, quats=1e-6, log_scales=1e-5, opacities=1e-6, dc=0, rest=0)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_an_spz_comes_back_within_its_steps(tmp_path: Path, version: int, degree: int) -> None:
+    gaussians = samples.make_gaussians(2000, degree)
+    save_splat(tmp_path / "a.spz", gaussians, spz_version=version)
+    loaded = load_splat(tmp_path / "a.spz")
+    assert read_raw(tmp_path / "a.spz").format == f".spz version {version}"
+    samples.assert_close(loaded, gaussians, means=2.0**-13 * 1.001, **SPZ)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_compressed_ply_in_order_comes_back_within_the_steps_of_each_chunk(tmp_path: Path, degree: int) -> None:
+    gaussians = samples.make_gaussians(1000, degree)
+    save_splat(tmp_path / "a.compressed.ply", gaussians, keep_order=True)
+    loaded = load_splat(tmp_path / "a.compressed.ply")
+
+    def half_steps(values: np.ndarray, levels: int) -> np.ndarray:
+        chunks = [values[start : start + 256] for start in range(0, len(values), 256)]
+        spans = [np.broadcast_to(np.ptp(chunk, axis=0), chunk.shape) for chunk in chunks]
+        return np.concatenate(spans) / levels * 0.51 + 1e-6
+
+    samples.assert_close(
+        loaded,
+        gaussians,
+        means=half_steps(gaussians.means, 1023),
+        quats=2e-3,
+        log_scales=half_steps(np.log(gaussians.scales), 1023),
+        opacities=0.00197,
+        dc=half_steps(gaussians.sh[:, 0], 255),
+        rest=1 / 64 + 1e-6,
+    )
+
+
+def test_a_compressed_ply_is_reordered_into_compact_chunks_which_is_more_precise(tmp_path: Path) -> None:
+    gaussians = samples.make_gaussians(30_000, 0)
+    errors = {}
+    for keep_order in (True, False):
+        save_splat(tmp_path / "a.compressed.ply", gaussians, keep_order=keep_order)
+        loaded = load_splat(tmp_path / "a.compressed.ply")
+        order = splats.morton_order(gaussians.means.astype(np.float64))
+        want = gaussians.means if keep_order else gaussians.means[order]
+        errors[keep_order] = np.median(np.abs(loaded.means - want))
+    assert sorted(order) == list(range(30_000))
+    assert errors[False] < errors[True] / 3
+
+
+def test_opacities_0_and_1_are_written_as_finite_logits_and_come_back(tmp_path: Path) -> None:
+    gaussians = replace(samples.make_gaussians(6, 0), opacities=np.array([0, 1, 0.5, 1e-12, 1 - 6e-8, 1], np.float32))
+    for name, tolerance in (("a.ply", 1e-8), ("a.spz", 0.00197), ("a.compressed.ply", 0.00197)):
+        save_splat(tmp_path / name, gaussians, keep_order=True)
+        assert np.isfinite(read_raw(tmp_path / name).logit_opacities).all()
+        assert np.abs(load_splat(tmp_path / name).opacities - gaussians.opacities).max() <= tolerance
+
+
+def test_scales_from_1e_minus_9_to_1e4_survive_a_ply(tmp_path: Path) -> None:
+    scales = np.array([[1e-9, 1e4, 1], [1e-37, 1e37, 3]], np.float32)
+    save_splat(tmp_path / "a.ply", replace(samples.make_gaussians(2, 0), scales=scales))
+    assert np.abs(load_splat(tmp_path / "a.ply").scales / scales - 1).max() < 1e-5
+
+
+def test_one_gaussian_goes_through_every_format(tmp_path: Path) -> None:
+    one = samples.make_gaussians(1, 0)
+    for name in ("a.ply", "a.compressed.ply", "a.spz", "A.PLY"):
+        save_splat(tmp_path / name, one)
+        assert np.abs(load_splat(tmp_path / name).means - one.means).max() < 1e-3
+
+
+def test_a_scene_a_million_metres_away_is_the_scene_at_zero_when_its_ply_has_doubles(tmp_path: Path) -> None:
+    gaussians = samples.make_gaussians(100, 0)
+    origin = np.array([1e6, -2e6, 3e5])
+    save_splat(tmp_path / "far.ply", gaussians, origin=origin)
+    assert b"property double x" in (tmp_path / "far.ply").read_bytes()
+    loaded = load_splat(tmp_path / "far.ply", origin=origin)
+    assert np.abs(loaded.means - gaussians.means).max() < 1e-6
+    with pytest.warns(SceneWarning, match="origin"):
+        load_splat(tmp_path / "far.ply")
+
+
+def test_float_columns_far_away_stay_rounded_and_an_origin_does_not_warn(tmp_path: Path) -> None:
+    raw = samples.make_raw(50, 0)
+    far = replace(raw, means=(raw.means + 1e6).astype(np.float32).astype(np.float64))
+    (tmp_path / "far.ply").write_bytes(samples.ply_bytes(samples.ply_columns(far)))
+    loaded = load_splat(tmp_path / "far.ply", origin=np.full(3, 1e6))
+    assert 1e-3 < np.abs(loaded.means - raw.means).max() <= 0.0626
+
+
+def test_packed_formats_refuse_or_announce_a_far_origin(tmp_path: Path) -> None:
+    gaussians, origin = samples.make_gaussians(50, 0), np.full(3, 1e6)
+    with pytest.raises(InputError, match=r"save as \.ply"):
+        save_splat(tmp_path / "a.compressed.ply", gaussians, origin=origin)
+    with pytest.warns(SceneWarning, match="leave steps of 0.125"):
+        save_splat(tmp_path / "a.spz", gaussians, origin=origin)
+    assert np.abs(load_splat(tmp_path / "a.spz", origin=origin).means - gaussians.means).max() <= 0.0626
+    with pytest.raises(InputError, match=r"beyond what \.spz can hold"):
+        save_splat(tmp_path / "b.spz", gaussians, origin=origin * 100)
+    assert sorted(os.listdir(tmp_path)) == ["a.spz"]
+
+
+def test_spz_spends_more_bits_on_a_tiny_scene(tmp_path: Path) -> None:
+    tiny = samples.make_gaussians(100, 0)
+    tiny = replace(tiny, means=tiny.means * np.float32(0.1))
+    save_splat(tmp_path / "a.spz", tiny)
+    largest = np.abs(tiny.means).max()
+    assert np.abs(load_splat(tmp_path / "a.spz").means - tiny.means).max() <= largest * 2.0**-17
+
+
+def test_values_beyond_a_packed_range_are_clipped_with_one_counted_warning(tmp_path: Path) -> None:
+    gaussians = samples.make_gaussians(100, 1)
+    sh = gaussians.sh.copy()
+    sh[:7, 1:] = 5
+    for name, count in (("a.spz", 63), ("a.compressed.ply", 63)):
+        with pytest.warns(SceneWarning, match=f"{count} values were clipped") as caught:
+            save_splat(tmp_path / name, replace(gaussians, sh=sh))
+        assert len(caught) == 1
+
+
+@pytest.mark.parametrize("kinds", ["float", "double"])
+@pytest.mark.parametrize("encoding", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_any_byte_order_number_type_and_property_order_reads_the_same(
+    tmp_path: Path, encoding: str, kinds: str
+) -> None:
+    raw = samples.make_raw(20, 2)
+    columns = samples.ply_columns(raw)
+    columns["nx"] = columns["confidence"] = np.zeros(20)
+    shuffled = {name: columns[name] for name in np.random.default_rng(1).permutation(sorted(columns))}
+    (tmp_path / "a.ply").write_bytes(samples.ply_bytes(shuffled, encoding, kinds))
+    got = read_raw(tmp_path / "a.ply")
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        # An ascii file keeps the digits of its text, whatever its columns are declared to be.
+        assert np.array_equal(getattr(got, name).astype(np.float32), getattr(raw, name).astype(np.float32)), name
+
+
+def test_doubles_keep_positions_that_float_cannot_hold(tmp_path: Path) -> None:
+    raw = samples.make_raw(20, 0)
+    raw = replace(raw, means=raw.means + 1e7 + 1 / 3)
+    for encoding in ("binary_little_endian", "ascii"):
+        (tmp_path / "a.ply").write_bytes(samples.ply_bytes(samples.ply_columns(raw), encoding, "double"))
+        assert np.array_equal(read_raw(tmp_path / "a.ply").means, raw.means)
+
+
+def test_crlf_headers_and_elements_around_the_vertices_are_skipped(tmp_path: Path) -> None:
+    raw = samples.make_raw(9, 0)
+    data = samples.ply_bytes(samples.ply_columns(raw))
+    head, body = data.split(b"end_header\n")
+    camera = b"element camera 2\nproperty double a\nproperty uchar b\nelement vertex"
+    face = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    head = (head.replace(b"element vertex", camera) + face).replace(b"\n", b"\r\n")
+    (tmp_path / "a.ply").write_bytes(head + bytes(18) + body + bytes(13))
+    assert np.array_equal(read_raw(tmp_path / "a.ply").means, raw.means)
+
+
+def test_quaternions_of_any_length_are_normalised_without_a_word(tmp_path: Path) -> None:
+    raw = samples.make_raw(30, 0)
+    lengths = np.geomspace(1e-6, 1e6, 30, dtype=np.float32)[:, None]
+    (tmp_path / "a.ply").write_bytes(samples.ply_bytes(samples.ply_columns(replace(raw, quats=raw.quats * lengths))))
+    assert np.abs(load_splat(tmp_path / "a.ply").quats - raw.quats).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("means", np.nan, "3 with NaN or Inf"),
+        ("sh", np.inf, "3 with NaN or Inf"),
+        ("quats", 0, "3 with a zero quaternion"),
+        ("log_scales", -200, "3 with scales that are 0 or overflow"),
+        ("log_scales", 100, "3 with scales that are 0 or overflow"),
+        ("logit_opacities", np.inf, "3 with infinite opacity logits"),
+        ("logit_opacities", np.nan, "3 with NaN or Inf"),
+    ],
+)
+def test_a_defect_is_a_counted_error_that_points_to_repair(
+    tmp_path: Path, field: str, value: float, words: str
+) -> None:
+    raw = samples.make_raw(10, 1)
+    array = getattr(raw, field).copy()
+    array[[2, 5, 7]] = value
+    (tmp_path / "a.ply").write_bytes(samples.ply_bytes(samples.ply_columns(replace(raw, **{field: array}))))
+    with pytest.raises(InputError, match=f"of 10 rows {words}.*gsencoder repair"):
+        load_splat(tmp_path / "a.ply")
+    assert len(read_raw(tmp_path / "a.ply")) == 10
+
+
+def test_the_content_decides_and_the_suffix_only_where_there_is_no_magic(tmp_path: Path) -> None:
+    files = samples.valid_files(tmp_path)
+    for name, data in files.items():
+        disguise = tmp_path / ("x.splat" if name.endswith(".splat") else "x.sog")
+        disguise.write_bytes(data)
+        (tmp_path / name).write_bytes(data)
+        assert fingerprint(load_splat(disguise)) == fingerprint(load_splat(tmp_path / name))
+
+
+def test_dotsplat_rows_mean_what_their_bytes_say(tmp_path: Path) -> None:
+    row = struct.pack("<6f8B", 1, 2, 3, 0.5, 0.25, 2, 255, 0, 51, 102, 128 + 64, 128 - 64, 128, 128)
+    (tmp_path / "a.splat").write_bytes(row)
+    got = load_splat(tmp_path / "a.splat")
+    assert got.means.tolist() == [[1, 2, 3]]
+    assert np.allclose(got.scales, [[0.5, 0.25, 2]], rtol=1e-6)
+    assert np.allclose(got.opacities, [102 / 255], rtol=1e-6)
+    assert np.allclose(0.5 + C0 * got.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+    assert np.allclose(got.quats, [[np.sqrt(0.5), -np.sqrt(0.5), 0, 0]], atol=1e-6)
+
+
+def test_a_dotsplat_scale_of_zero_is_a_defect(tmp_path: Path) -> None:
+    (tmp_path / "a.splat").write_bytes(struct.pack("<6f8B", 1, 2, 3, 0.5, 0, -2, *range(8)))
+    assert read_raw(tmp_path / "a.splat").log_scales[0, 1:].tolist() == [-np.inf, -np.inf]
+    with pytest.raises(InputError, match="1 with scales"):
+        load_splat(tmp_path / "a.splat")
+
+
+def test_spz_version_2_stores_three_bytes_of_a_quaternion(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(samples.spz2_bytes(np.tile([255, 127, 128], (5, 1))))
+    raw = read_raw(tmp_path / "a.spz")
+    assert raw.format == ".spz version 2"
+    assert np.allclose(raw.quats, [[0, 1, -1 / 255, 1 / 255]], atol=1e-6)
+    assert (raw.log_scales == -10).all()
+    assert (raw.logit_opacities == -20).all()
+
+
+def test_spz_extensions_and_sh_degree_4_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    header = struct.pack("<4sIIBBBB", b"NGSP", 3, 4, 4, 12, 2, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(header + bytes((20 + 72) * 4) + b"extension"))
+    with pytest.warns(SceneWarning) as caught:
+        raw = read_raw(tmp_path / "a.spz")
+    assert raw.sh_degree == 3
+    assert sorted("extensions of other" in str(warning.message) for warning in caught) == [False, True]
+
+
+def test_a_fingerprint_changes_with_one_bit_and_with_the_order_of_rows() -> None:
+    gaussians = samples.make_gaussians(10, 1)
+    assert fingerprint(gaussians) == fingerprint(samples.make_gaussians(10, 1))
+    sh = gaussians.sh.copy()
+    sh[9, 3, 2] = np.nextafter(sh[9, 3, 2], np.float32(9))
+    others = [replace(gaussians, sh=sh), gaussians.select(np.arange(10)[::-1]), gaussians.select(np.arange(9))]
+    assert len({fingerprint(gaussians), *map(fingerprint, others)}) == 4
+
+
+def test_loading_needs_neither_torch_nor_numba(tmp_path: Path) -> None:
+    save_splat(tmp_path / "a.ply", samples.make_gaussians(3, 0))
+    code = f"import sys; from gsencoder.data.splats import load_splat; load_splat({str(tmp_path / 'a.ply')!r})"
+    code += "; print([m for m in ('torch', 'numba', 'gsply', 'open3d', 'scipy') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert result.stdout.strip() == "[]"
+
+
+def test_a_good_file_gives_no_warning(tmp_path: Path) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for name in ("a.ply", "a.compressed.ply", "a.spz"):
+            save_splat(tmp_path / name, samples.make_gaussians(300, 3))
+            load_splat(tmp_path / name)
+    assert [str(warning.message) for warning in caught if warning.category is SceneWarning] == []
