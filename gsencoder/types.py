@@ -177,10 +177,10 @@ class Views:
 
     cameras: Cameras
     names: tuple[str, ...]
-    images: Sequence[UInt8[np.ndarray, "H W 3"]] | None = None
-    depths: Sequence[Float32[np.ndarray, "H W"]] | None = None
-    masks: Sequence[Bool[np.ndarray, "H W"]] | None = None
-    instances: Sequence[Int32[np.ndarray, "H W"]] | None = None
+    images: Sequence[UInt8[np.ndarray, "_ _ 3"]] | None = None
+    depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None
+    masks: Sequence[Bool[np.ndarray, "_ _"]] | None = None
+    instances: Sequence[Int32[np.ndarray, "_ _"]] | None = None
 
     def __post_init__(self) -> None:
         if len(self.names) != len(self.cameras):

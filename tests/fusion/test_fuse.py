@@ -39,7 +39,7 @@ class FixedTeacher:
         )
 
     def settings(self) -> dict[str, Any]:
-        return {"teacher": "fixed"}
+        return {"name": "fixed"}
 
 
 class CodedTeacher(FixedTeacher):

@@ -8,9 +8,9 @@ from splats import front_camera
 
 from gsencoder.errors import InputError
 from gsencoder.fusion.teachers.labels import LabelsTeacher
-from gsencoder.fusion.teachers.onnx import OnnxTeacher, OnnxTeacherConfig
+from gsencoder.fusion.teachers.onnx import OnnxTeacher, OnnxConfig
 from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteTeacher, lab_from_rgb
-from gsencoder.types import FeatureSpace, SceneObject, Views
+from gsencoder.types import SceneObject, Views
 
 
 def views_of(image: np.ndarray | None = None, instances: np.ndarray | None = None) -> Views:
@@ -35,7 +35,7 @@ def views_of(image: np.ndarray | None = None, instances: np.ndarray | None = Non
 )  # fmt: skip
 def test_the_palette_calls_css_colours_by_their_names(rgb: tuple[int, int, int], name: str) -> None:
     image = np.broadcast_to(np.array(rgb, np.uint8), (6, 8, 3)).copy()
-    teacher = PaletteTeacher(cell=2)
+    teacher = PaletteTeacher()
     features = teacher.feature_map(views_of(image), 0).features
     assert features is not None
     assert features.shape == (3, 4, 11)
@@ -58,8 +58,7 @@ def label_objects() -> tuple[SceneObject, ...]:
 
 def test_labels_give_each_pixel_its_name_and_the_rest_the_mean_direction() -> None:
     embeddings = np.eye(4, 8, dtype=np.float32)
-    space = FeatureSpace(name="words", channels=8)
-    teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, space)
+    teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, text_encoder="t")
     instances = np.array([[0, 3, 5], [9, 9, 77]], np.int32)
     found = teacher.feature_map(views_of(instances=instances), 0)
     assert found.codes is not None
@@ -72,13 +71,12 @@ def test_labels_give_each_pixel_its_name_and_the_rest_the_mean_direction() -> No
 
 
 def test_labels_without_objects_names_or_maps_say_so() -> None:
-    space = FeatureSpace(name="words", channels=8)
     embeddings = np.eye(4, 8, dtype=np.float32)
     with pytest.raises(InputError, match="lists no objects"):
-        LabelsTeacher((), ("a",), embeddings[:1], space)
+        LabelsTeacher((), ("a",), embeddings[:1], text_encoder="t")
     with pytest.raises(InputError, match="not in the table, first 'mug'"):
-        LabelsTeacher(label_objects(), ("ball", "cup"), embeddings[:2], space)
-    teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, space)
+        LabelsTeacher(label_objects(), ("ball", "cup"), embeddings[:2], text_encoder="t")
+    teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, text_encoder="t")
     with pytest.raises(InputError, match="no instance maps"):
         teacher.feature_map(views_of(np.zeros((4, 4, 3), np.uint8)), 0)
 
@@ -109,9 +107,9 @@ def write_mean_model(path: Path, patch: int = 4) -> None:
     onnx.save(model, path)
 
 
-def onnx_config(path: Path, **options: object) -> OnnxTeacherConfig:
+def onnx_config(path: Path, **options: object) -> OnnxConfig:
     values = {"model": str(path), "patch": 4, "size": 32, "skip_tokens": 1, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
-    return OnnxTeacherConfig(**{**values, **options})  # type: ignore[arg-type]
+    return OnnxConfig(**{**values, **options})  # type: ignore[arg-type]
 
 
 def test_an_onnx_backbone_sees_each_patch_where_it_is(tmp_path: Path) -> None:
@@ -143,7 +141,7 @@ def test_a_classifier_becomes_a_mixture_of_the_known_classes_words(tmp_path: Pat
 
 
 def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no model at"):
+    with pytest.raises(InputError, match="no file at"):
         OnnxTeacher(onnx_config(tmp_path / "none.onnx"))
     (tmp_path / "bad.onnx").write_bytes(b"not a model")
     with pytest.raises(InputError, match="no model that onnxruntime reads"):
@@ -160,7 +158,7 @@ def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 def test_real_backbones_give_finite_features_of_their_stated_width(shared: Path) -> None:
     image = np.random.default_rng(0).integers(0, 255, (112, 112, 3)).astype(np.uint8)
     dino = OnnxTeacher(
-        OnnxTeacherConfig(model=str(shared / "models/dinov2_s14_dense_int8.onnx"), patch=14, size=112, skip_tokens=1)
+        OnnxConfig(model=str(shared / "models/dinov2_s14_dense_int8.onnx"), patch=14, size=112, skip_tokens=1)
     )
     features = dino.feature_map(views_of(image), 0).features
     assert features is not None

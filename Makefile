@@ -1,0 +1,33 @@
+# `make demo` and `make test` set up everything they need in .venv; both start from python3 (3.10 or newer), pip and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: help setup demo test lint check clean
+help:            ## what can be made
+	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
+
+setup: $(VENV)/.ready ## the virtual environment alone
+
+# The stamp is made last, so that an interrupted installation is done again.
+$(VENV)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@$(BIN)/python -c "import open3d" 2>/dev/null || echo "note: open3d cannot be loaded here (it needs Debian's libusb-1.0-0 and libgl1, or their like); only seeds.source=tsdf and a few tests use it, and the tests are skipped"
+	@touch $@
+
+demo: setup      ## a built-in scene through the whole pipeline; ends in outputs/demo/report.html
+	$(BIN)/gsencoder demo out=outputs/demo overwrite=true
+
+lint: setup      ## ruff and mypy
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+test: setup      ## all tests; those that need real data look for it in GSENCODER_SHARED (default ../shared)
+	$(BIN)/python -m pytest -q
+
+check: lint test ## what continuous integration runs
+
+clean:           ## remove the environment and every output
+	rm -rf $(VENV) outputs build dist

@@ -1,0 +1,108 @@
+"""Cameras around a bare splat, for splats that come without views."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.errors import InputError
+from gsencoder.types import Cameras, Gaussians
+
+COVERED = 0.95
+"""The opacity-weighted share of the Gaussians that must fit into the picture, …"""
+FARTHEST_COVERED = 3.0
+"""… but none further than this many opacity-weighted median distances from the centre: those are floaters."""
+MARGIN = 1.1
+NEAREST = 0.05
+"""Cameras are never closer than this to the centre: renderers cut everything nearer than 0.01 off."""
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
+def orbit_cameras(
+    gaussians: Gaussians,
+    *,
+    count: int = 24,
+    width: int = 640,
+    height: int = 480,
+    fov_degrees: float = 60.0,
+    up: Float64[np.ndarray, "3"] | None = None,
+) -> Cameras:
+    """Cameras on a sphere around a splat, looking at its centre.
+
+    The centre is the opacity-weighted median of the means, coordinate by coordinate, and the radius 1.1 times the
+    opacity-weighted 95 % quantile of the distance from it, at most 3.3 times its median, so that floaters move neither
+    far (and at least 3 median standard deviations, for a single Gaussian). The distance is the one at which a ball of
+    that radius fits into the smaller field of view. Directions follow a golden-angle spiral.
+
+    Args:
+        gaussians: at least one.
+        count: cameras.
+        width: of the pictures, pixels.
+        height: of the pictures, pixels.
+        fov_degrees: horizontal field of view.
+        up: where known, cameras keep between 15° below and 60° above the horizon. Where not (None), nothing says which
+            way is down: they surround the splat on all sides, and -y is upward in the pictures, as in COLMAP's worlds.
+
+    Returns:
+        `count` cameras, relative to the origin of the Gaussians.
+
+    Raises:
+        InputError: no Gaussian, or an option out of its range.
+    """
+    if not len(gaussians):
+        raise InputError("orbit cameras need at least one Gaussian, got none")
+    if count < 1 or width < 1 or height < 1 or not 1 <= fov_degrees <= 170:
+        raise InputError(
+            f"orbit cameras: expected count, width, height of at least 1 and fov_degrees in [1, 170], "
+            f"got {count}, {width}, {height}, {fov_degrees}"
+        )
+    centre, radius = robust_ball(gaussians)
+    focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
+    half_field = math.atan(min(width, height) / 2 / focal)
+    distance = max(radius / math.sin(half_field), NEAREST)
+    vertical = np.array([0.0, -1.0, 0.0]) if up is None else np.asarray(up, np.float64)
+    length = float(np.linalg.norm(vertical))
+    if not 1e-6 < length < 1e6:
+        raise InputError(f"orbit cameras: up must be a direction, got {vertical.tolist()}")
+    vertical = vertical / length
+    # Equal steps of the sine of the elevation share the sphere out evenly.
+    low, high = (-0.9, 0.9) if up is None else (math.sin(math.radians(-15)), math.sin(math.radians(60)))
+    steps = (np.arange(count) + 0.5) / count
+    sines, turns = low + (high - low) * steps, GOLDEN_ANGLE * np.arange(count)
+    east = np.cross(vertical, np.eye(3)[np.abs(vertical).argmin()])
+    east /= np.linalg.norm(east)
+    north = np.cross(vertical, east)
+    level = np.sqrt(1 - sines**2)[:, None] * (np.cos(turns)[:, None] * east + np.sin(turns)[:, None] * north)
+    outward = level + sines[:, None] * vertical
+    forward = -outward
+    right = np.cross(forward, vertical)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    poses[:, :3, 3] = -np.einsum("vij,vj->vi", poses[:, :3, :3], centre + distance * outward)
+    k = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
+    return Cameras(
+        cam_from_world=poses.astype(np.float32),
+        Ks=np.tile(k, (count, 1, 1)),
+        widths=np.full(count, width, np.int32),
+        heights=np.full(count, height, np.int32),
+    )
+
+
+def robust_ball(gaussians: Gaussians) -> tuple[Float64[np.ndarray, "3"], float]:
+    """The opacity-weighted median centre, and the radius that `orbit_cameras` fits into its pictures."""
+    means = gaussians.means.astype(np.float64)
+    weights = gaussians.opacities.astype(np.float64)
+    if not weights.sum() > 0:
+        weights = np.ones(len(means))
+    centre = np.array([_weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
+    distances = np.linalg.norm(means - centre, axis=1)
+    middle, far = (_weighted_quantile(distances, weights, share) for share in (0.5, COVERED))
+    size = _weighted_quantile(gaussians.scales.max(axis=1).astype(np.float64), weights, 0.5)
+    return centre, max(MARGIN * min(far, FARTHEST_COVERED * middle), 3 * size)
+
+
+def _weighted_quantile(values: Float64[np.ndarray, " N"], weights: Float64[np.ndarray, " N"], share: float) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(total, total[-1] * share)]])

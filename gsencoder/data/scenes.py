@@ -1,0 +1,313 @@
+"""A scene from whatever folder or file it comes in: transforms.json, COLMAP, ScanNet, or a splat alone."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.data.colmap import is_colmap_model, read_colmap
+from gsencoder.data.images import (
+    DepthFiles,
+    ImageFiles,
+    InstanceFiles,
+    MaskFiles,
+    PixelGrid,
+    picture_info,
+    picture_size,
+)
+from gsencoder.data.objects_json import read_objects
+from gsencoder.data.posed import PosedImage, PosedImages, choose_origin, inverse_rigid
+from gsencoder.data.scannet import is_scannet_export, read_scannet
+from gsencoder.data.transforms_json import read_transforms
+from gsencoder.data.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
+from gsencoder.errors import InputError, SceneWarning
+from gsencoder.types import Cameras, Gaussians, Scene, Views
+
+SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog")
+TRANSFORMS = ("transforms.json", "transforms_train.json")
+COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
+SPLAT_NAMES = ("splat.ply", "point_cloud.ply")
+FEW_CAMERAS = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneConfig:
+    """How a scene is read.
+
+    Attributes:
+        allow_outside: let paths in a scene's files lead out of its folder.
+        max_views: 0 = all, else at most this many, evenly spaced in the order of the files.
+        depth_scale: world units for each step of a depth file; None = what the format says (mostly millimetres).
+        image_scale: in (0, 1]; pictures, depth, masks and intrinsics are made smaller by it.
+        metres_per_unit: None = what the files say.
+        images: folder of the photographs of a COLMAP model; empty = `images` beside it.
+    """
+
+    allow_outside: bool = False
+    max_views: int = 0
+    depth_scale: float | None = None
+    image_scale: float = 1.0
+    metres_per_unit: float | None = None
+    images: str = ""
+
+    def __post_init__(self) -> None:
+        if self.max_views < 0:
+            raise InputError(f"max_views: expected 0 (all) or more, got {self.max_views}")
+        if not 0 < self.image_scale <= 1:
+            raise InputError(f"image_scale: expected a number above 0 and at most 1, got {self.image_scale}")
+        for name in ("depth_scale", "metres_per_unit"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{name}: expected a positive number, got {value}")
+
+
+def load_scene(path: str | Path, *, splat: str | Path | None = None, options: SceneConfig = SceneConfig()) -> Scene:
+    """Reads a scene; pictures are opened for their size now and decoded when they are asked for.
+
+    Recognised, in this order: a transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender), a COLMAP
+    model (sparse/0, sparse, or its files themselves, with images/ beside), a ScanNet export (color/, pose/, …), a
+    splat file, or a folder with one splat file or an unpacked .sog.
+
+    Cameras and Gaussians are relative to `Scene.origin`: the mean of the camera centres (for a bare splat the median
+    of its means), each coordinate rounded to a multiple of 1000 units. It is taken off in float64.
+
+    Args:
+        path: a folder or file.
+        splat: the Gaussians of a scene that has views; relative to the current folder or else to the scene. They must
+            be in the world of the cameras. Without it a splat that lies beside the views is not used.
+        options: see SceneConfig.
+
+    Returns:
+        A scene with views, or with Gaussians only, or both. `views.masks` exists where there are mask files,
+        transparency, or pinhole pixels that the distorted picture does not cover.
+
+    Raises:
+        InputError: nothing recognised, no view left, or anything in the files that cannot be used.
+    """
+    given = Path(path)
+    try:
+        root = given.absolute()
+        exists = root.exists()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{str(given)[:200]!r} is not a path ({type(error).__name__})") from error
+    if not exists:
+        raise InputError(f"{given}: no such file or folder")
+    posed, folder = _read_views(root, options)
+    if posed is None:
+        if splat is not None:
+            raise InputError(f"{given}: splat= is for scenes with views, and here there are none; give one splat only")
+        return _bare_splat(_find_splat(root), root.name if root.is_dir() else root.stem, options)
+    views, origin = make_views(posed, max_views=options.max_views, image_scale=options.image_scale)
+    gaussians = None
+    if splat is not None:
+        gaussians = _load_splat(_existing(splat, folder), origin)
+    else:
+        _warn_unused_splat(folder)
+    objects = folder / "objects.json"
+    beside_transforms = root.suffix.lower() == ".json" or any((folder / file).is_file() for file in TRANSFORMS)
+    points = posed.points
+    return Scene(
+        name=folder.name,
+        gaussians=gaussians,
+        views=views,
+        origin=origin,
+        metres_per_unit=options.metres_per_unit or posed.metres_per_unit,
+        up=posed.up,
+        objects=read_objects(objects) if beside_transforms and objects.is_file() else (),
+        sfm_points=(points - origin).astype(np.float32) if len(points) else None,
+        sfm_colors=posed.colors if len(points) else None,
+    )
+
+
+def _read_views(root: Path, options: SceneConfig) -> tuple[PosedImages | None, Path]:
+    """The posed pictures, and the scene folder; None for a bare splat."""
+    outside, scale = options.allow_outside, options.depth_scale
+    if root.is_file():
+        if root.suffix.lower() == ".json" and root.name != "meta.json":
+            return read_transforms(root, allow_outside=outside, depth_scale=scale), root.parent
+        return None, root.parent
+    transforms = next((root / file for file in TRANSFORMS if (root / file).is_file()), None)
+    model = next((root / file for file in COLMAP_FOLDERS if is_colmap_model(root / file)), None)
+    if transforms is not None:
+        if model is not None and not str(model.relative_to(root)).startswith("colmap"):
+            _warn(
+                f"{root}: holds {transforms.name} and a COLMAP model; {transforms.name} is used (give {model} instead)"
+            )
+        return read_transforms(transforms, allow_outside=outside, depth_scale=scale), root
+    if model is not None:
+        return _read_colmap(root, model, options)
+    if is_scannet_export(root):
+        return read_scannet(root, allow_outside=outside, depth_scale=scale), root
+    return None, root
+
+
+def _read_colmap(root: Path, model: Path, options: SceneConfig) -> tuple[PosedImages, Path]:
+    if model.name == "0" and model != root:
+        others = sorted(path.name for path in model.parent.iterdir() if path != model and is_colmap_model(path))
+        if others:
+            _warn(
+                f"{model.parent}: holds {1 + len(others)} models; 0 is used (or give the folder of {', '.join(others)})"
+            )
+    if options.images:
+        images = Path(options.images)
+        images = images if images.is_absolute() or images.is_dir() else root / images
+        if not images.is_dir():
+            raise InputError(f"images={options.images}: no such folder (looked from here and in {root})")
+        # Naming the folder is leave to read it.
+        return read_colmap(model, images, images, allow_outside=options.allow_outside), root
+    # A model may be given itself, as scene/sparse/0; its photographs then lie up to two folders above.
+    homes = [root, root.parent, root.parent.parent] if model == root else [root]
+    home = next((home for home in homes if (home / "images").is_dir()), None)
+    if home is None:
+        looked = ", ".join(str(home / "images") for home in homes)
+        raise InputError(f"{model}: a COLMAP model without photographs; looked for {looked}; say images=FOLDER")
+    return read_colmap(model, home / "images", home, allow_outside=options.allow_outside), home
+
+
+def make_views(
+    posed: PosedImages, *, max_views: int = 0, image_scale: float = 1.0
+) -> tuple[Views, Float64[np.ndarray, "3"]]:
+    """Cameras without distortion and lazy pictures, and the origin that was taken off them.
+
+    Raises:
+        InputError: no picture, a picture or depth of the wrong size, a camera that cannot be undistorted.
+    """
+    chosen = posed.images
+    if not chosen:
+        raise InputError(f"{posed.source}: no view")
+    if 0 < max_views < len(chosen):
+        rows = np.round(np.linspace(0, len(chosen) - 1, max_views)).astype(int)
+        chosen = tuple(chosen[row] for row in rows)
+    centers = np.array([inverse_rigid(image.cam_from_world)[:3, 3] for image in chosen])
+    origin = choose_origin(centers)
+    pinholes: dict[CameraModel, Pinhole] = {}
+    poses, grids, depth_grids = [], [], []
+    transparent: list[Path | None] = []
+    for image in chosen:
+        where = f"{posed.source}: view {image.name[:120]!r}"
+        if image.camera not in pinholes:
+            pinholes[image.camera] = pinhole_for(image.camera, where)
+        pinhole = pinholes[image.camera]
+        width = max(1, round(pinhole.width * image_scale))
+        height = max(1, round(pinhole.height * image_scale))
+        grids.append(PixelGrid(source=image.camera, pinhole=pinhole, width=width, height=height))
+        depth_camera = image.depth_camera or image.camera
+        depth_grids.append(PixelGrid(source=depth_camera, pinhole=pinhole, width=width, height=height))
+        transparent.append(image.image if _check_sizes(image, depth_camera, where) else None)
+        # With t = −R (c − origin) the large numbers cancel in float64, before the cast.
+        pose = image.cam_from_world.copy()
+        pose[:3, 3] += pose[:3, :3] @ origin
+        poses.append(pose)
+    remaps = RemapCache()
+    cameras = Cameras(
+        cam_from_world=np.array(poses).astype(np.float32),
+        Ks=np.array([grid.pinhole.matrix(grid.width, grid.height) for grid in grids]).astype(np.float32),
+        widths=np.array([grid.width for grid in grids], np.int32),
+        heights=np.array([grid.height for grid in grids], np.int32),
+    )
+    depths = [image.depth for image in chosen]
+    masks = [image.mask for image in chosen]
+    instances = [image.instance for image in chosen]
+    partial = _have_empty_pixels(list({(grid.pinhole, grid.source): grid for grid in grids}), remaps)
+    views = Views(
+        cameras=cameras,
+        names=tuple(image.name for image in chosen),
+        images=ImageFiles([image.image for image in chosen], grids, remaps),
+        depths=DepthFiles(depths, depth_grids, remaps, [image.depth_scale for image in chosen])
+        if _any(depths)
+        else None,
+        masks=MaskFiles(masks, grids, remaps, transparent) if _any(masks) or _any(transparent) or partial else None,
+        instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
+    )
+    return views, origin
+
+
+def _any(paths: Sequence[Path | None]) -> bool:
+    return any(path is not None for path in paths)
+
+
+def _check_sizes(image: PosedImage, depth_camera: CameraModel, where: str) -> bool:
+    """Compares the sizes in the files' headers; True where the photograph has transparency."""
+    camera = image.camera
+    size, transparent = picture_info(image.image)
+    if size != (camera.width, camera.height):
+        raise InputError(
+            f"{where}: {image.image} has {size[0]}×{size[1]} pixels but its camera {camera.width}×{camera.height}; "
+            "give the images at the size of the intrinsics (image_scale makes them smaller on load)"
+        )
+    for file, wanted in ((image.depth, depth_camera), (image.mask, camera), (image.instance, camera)):
+        if file is not None:
+            found = picture_size(file)
+            if found != (wanted.width, wanted.height):
+                raise InputError(
+                    f"{where}: {file} has {found[0]}×{found[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
+                    "both must have the same size"
+                )
+    return transparent
+
+
+def _have_empty_pixels(cameras: list[tuple[Pinhole, CameraModel]], remaps: RemapCache) -> bool:
+    """Whether some pinhole pixel has no content. With a camera for every picture looking costs more than masks do."""
+    distorted = [camera for camera in cameras if not camera[1].is_pinhole]
+    if len(distorted) > FEW_CAMERAS:
+        return True
+    found = [remaps.get(*camera) for camera in distorted]
+    return any(remap is not None and not remap.valid.all() for remap in found)
+
+
+def _find_splat(root: Path) -> Path:
+    """The splat that `root` is or holds."""
+    if root.is_file():
+        if root.suffix.lower() in SPLAT_SUFFIXES or root.name == "meta.json":
+            return root
+        raise InputError(f"{root}: expected a transforms.json or a splat ({', '.join(SPLAT_SUFFIXES)})")
+    if (root / "meta.json").is_file():
+        return root
+    found = sorted(path for path in root.iterdir() if path.is_file() and path.suffix.lower() in SPLAT_SUFFIXES)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        names = ", ".join(path.name for path in found[:5])
+        raise InputError(f"{root}: holds {len(found)} splats ({names}) and no views; give one of them")
+    raise InputError(
+        f"{root}: not a scene; looked for {' or '.join(TRANSFORMS)}, a COLMAP model (sparse/0, sparse, cameras.bin or "
+        f"cameras.txt), a ScanNet export (color/, pose/) and a splat ({', '.join(SPLAT_SUFFIXES)}, meta.json)"
+    )
+
+
+def _existing(splat: str | Path, folder: Path) -> Path:
+    for path in (Path(splat), folder / splat):
+        if path.exists():
+            return path
+    raise InputError(f"splat={splat}: no such file (looked from here and in {folder})")
+
+
+def _load_splat(path: Path, origin: Float64[np.ndarray, "3"] | None) -> Gaussians:
+    from gsencoder.data.splats import load_splat
+
+    return load_splat(path, origin=origin)
+
+
+def _bare_splat(path: Path, name: str, options: SceneConfig) -> Scene:
+    gaussians = _load_splat(path, None)
+    origin = choose_origin(np.median(gaussians.means.astype(np.float64), axis=0, keepdims=True)[: len(gaussians)])
+    if origin.any():
+        # The file's float32 coordinates are exact in float64; what they had lost before stays lost.
+        gaussians = replace(gaussians, means=(gaussians.means.astype(np.float64) - origin).astype(np.float32))
+    return Scene(name=name, gaussians=gaussians, origin=origin, metres_per_unit=options.metres_per_unit)
+
+
+def _warn_unused_splat(folder: Path) -> None:
+    beside = [name for name in SPLAT_NAMES if (folder / name).is_file()]
+    if beside:
+        _warn(
+            f"{folder}: {beside[0]} lies beside the views and is not used; say splat={beside[0]} if it belongs to them"
+        )
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, SceneWarning, stacklevel=3)

@@ -1,0 +1,203 @@
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from scene_files import photograph, save
+
+from gsencoder.data.images import (
+    DepthFiles,
+    ImageFiles,
+    InstanceFiles,
+    MaskFiles,
+    PixelGrid,
+    picture_info,
+    picture_size,
+    read_integers,
+    read_rgba,
+)
+from gsencoder.data.undistort import CameraModel, RemapCache, pinhole_for
+from gsencoder.errors import InputError
+
+PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))
+
+
+def grid(camera: CameraModel = PINHOLE, width: int = 32, height: int = 24) -> PixelGrid:
+    return PixelGrid(source=camera, pinhole=pinhole_for(camera, "test"), width=width, height=height)
+
+
+def test_colour_of_every_mode_becomes_rgb(tmp_path: Path) -> None:
+    rgb = photograph(0)
+    assert (read_rgba(save(tmp_path / "rgb.png", rgb))[0] == rgb).all()
+    grey = rgb[..., 0].copy()
+    assert (read_rgba(save(tmp_path / "grey.png", grey))[0] == grey[..., None]).all()
+    wide = grey.astype(np.uint16) * 256 + 7
+    assert (read_rgba(save(tmp_path / "wide.png", wide))[0] == grey[..., None]).all()
+    Image.fromarray(rgb).quantize(256).save(tmp_path / "palette.png")
+    colour, alpha = read_rgba(tmp_path / "palette.png")
+    assert colour.shape == rgb.shape
+    assert alpha is None
+    Image.fromarray(rgb).convert("CMYK").save(tmp_path / "cmyk.jpg")
+    assert read_rgba(tmp_path / "cmyk.jpg")[0].shape == rgb.shape
+
+
+def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path: Path) -> None:
+    rgba = np.dstack([photograph(0), np.full((24, 32), 255, np.uint8)])
+    rgba[:, :8, 3], rgba[:, 8:16, 3], rgba[:, 16:20, 3] = 0, 127, 128
+    path = save(tmp_path / "a.png", rgba)
+    assert picture_info(path) == ((32, 24), True)
+    colour = ImageFiles([path], [grid()], RemapCache())[0]
+    assert np.abs(colour - rgba[..., :3] * (rgba[..., 3:] / 255.0)).max() <= 0.5
+    mask = MaskFiles([None], [grid()], RemapCache(), [path])[0]
+    assert not mask[:, :16].any()
+    assert mask[:, 16:].all()
+
+
+def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(photograph(0)).save(tmp_path / "turned.jpg", exif=exif)
+    assert picture_size(tmp_path / "turned.jpg") == (32, 24)
+    assert read_rgba(tmp_path / "turned.jpg")[0].shape == (24, 32, 3)
+
+
+def test_files_that_are_no_pictures_are_errors_that_name_them(tmp_path: Path) -> None:
+    (tmp_path / "text.png").write_text("not a picture")
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    (tmp_path / "ps.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n")
+    (tmp_path / "folder.png").mkdir()
+    for name in ("text.png", "empty.jpg", "ps.png", "folder.png"):
+        with pytest.raises(InputError, match=name):
+            picture_size(tmp_path / name)
+    with pytest.raises(InputError, match="no such file"):
+        picture_size(tmp_path / "nowhere.png")
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tiff", "bmp"])
+def test_a_truncated_picture_is_an_error_that_names_it(tmp_path: Path, suffix: str) -> None:
+    path = save(tmp_path / f"cut.{suffix}", photograph(0, 64, 64))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match=f"cut.{suffix}"):
+        ImageFiles([path], [grid()], RemapCache())[0]
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A PNG of a few hundred bytes whose header claims width × height."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+
+    header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([8, 2, 0, 0, 0])
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
+    )
+
+
+@pytest.mark.parametrize("size", [(9000, 9000), (9500, 9500), (60000, 60000), (2**31 - 1, 2**31 - 1)])
+def test_a_decompression_bomb_is_refused_by_its_header(tmp_path: Path, size: tuple[int, int]) -> None:
+    (tmp_path / "bomb.png").write_bytes(bomb(*size))
+    for read in (picture_size, picture_info, read_rgba, lambda path: read_integers(path, "depth", wide=True)):
+        with pytest.raises(InputError, match=r"bomb\.png"):
+            read(tmp_path / "bomb.png")
+
+
+def test_depth_comes_from_png_and_npy_in_world_units(tmp_path: Path) -> None:
+    values = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 80
+    png = save(tmp_path / "d.png", values)
+    metres = values * 1e-3
+    metres[0, :4] = [np.nan, np.inf, -np.inf, 0]
+    np.save(tmp_path / "d.npy", metres)
+    files = DepthFiles([png, tmp_path / "d.npy", None], [grid()] * 3, RemapCache(), [1e-3, 1.0, 1.0])
+    assert (files[0] == (values * 1e-3).astype(np.float32)).all()
+    assert not files[1][0, :4].any()
+    assert (files[1][1:] == files[0][1:]).all()
+    assert not files[2].any()
+    assert files[2].dtype == np.float32
+
+
+def test_depth_of_a_wrong_kind_is_an_error(tmp_path: Path) -> None:
+    cases = {
+        "eight.png": photograph(0)[..., 0].copy(),
+        "rgb.png": photograph(0),
+    }
+    for name, values in cases.items():
+        with pytest.raises(InputError, match=f"{name}: depth must be a 16-bit"):
+            DepthFiles([save(tmp_path / name, values)], [grid()], RemapCache(), [1.0])[0]
+    np.save(tmp_path / "negative.npy", np.full((24, 32), -1.0))
+    np.save(tmp_path / "cube.npy", np.zeros((24, 32, 2)))
+    np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object), allow_pickle=True)
+    np.save(tmp_path / "huge.npy", np.full((24, 32), 1e300))
+    for name, said in (
+        ("negative", "negative"),
+        ("cube", r"\[H, W\]"),
+        ("pickle", "readable"),
+        ("huge", "depth scale"),
+    ):
+        with pytest.raises(InputError, match=f"{name}.npy.*{said}"):
+            DepthFiles([tmp_path / f"{name}.npy"], [grid()], RemapCache(), [1.0])[0]
+    # A header that promises more than the file holds.
+    data = (tmp_path / "negative.npy").read_bytes()
+    (tmp_path / "cut.npy").write_bytes(data[:-8])
+    with pytest.raises(InputError, match=r"cut\.npy"):
+        picture_size(tmp_path / "cut.npy")
+
+
+def test_instances_keep_their_numbers(tmp_path: Path) -> None:
+    wide = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 80
+    narrow = (wide % 256).astype(np.uint8)
+    paths = [save(tmp_path / "wide.png", wide), save(tmp_path / "narrow.png", narrow), None]
+    files = InstanceFiles(paths, [grid()] * 3, RemapCache())
+    assert (files[0] == wide).all()
+    assert (files[1] == narrow).all()
+    assert files[0].dtype == np.int32
+    with pytest.raises(InputError, match="one channel"):
+        InstanceFiles([save(tmp_path / "rgb.png", photograph(0))], [grid()], RemapCache())[0]
+
+
+def test_sequences_index_like_lists(tmp_path: Path) -> None:
+    paths = [save(tmp_path / f"{i}.png", photograph(i)) for i in range(4)]
+    files = ImageFiles(paths, [grid()] * 4, RemapCache())
+    assert len(files) == 4
+    assert (files[-1] == photograph(3)).all()
+    assert (files[np.int64(2)] == photograph(2)).all()
+    assert [(a == photograph(i)).all() for i, a in zip((3, 2, 1, 0), files[::-1], strict=True)] == [True] * 4
+    depths = DepthFiles([None] * 4, [grid()] * 4, RemapCache(), [1.0, 2.0, 3.0, 4.0])[1:3]
+    assert len(depths) == 2
+    for bad in (4, -5):
+        with pytest.raises(IndexError):
+            files[bad]
+    with pytest.raises(TypeError):
+        files["0"]  # type: ignore[call-overload]
+
+
+def test_a_file_that_changed_its_size_after_loading_is_an_error(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.png", photograph(0, 31, 24))
+    with pytest.raises(InputError, match=r"a\.png: 31×24 pixels, expected 32×24"):
+        ImageFiles([path], [grid()], RemapCache())[0]
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_mutated_pictures_give_a_picture_or_an_input_error(tmp_path: Path, data: st.DataObject) -> None:
+    suffix = data.draw(st.sampled_from(["png", "jpg", "tiff", "webp"]))
+    original = save(tmp_path / f"whole.{suffix}", photograph(0)).read_bytes()
+    mutated = bytearray(original[: data.draw(st.integers(0, len(original)))])
+    for _ in range(data.draw(st.integers(0, 3))):
+        if mutated:
+            mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / f"mutated.{suffix}"
+    path.write_bytes(bytes(mutated))
+    try:
+        colour, _ = read_rgba(path)
+    except InputError as error:
+        said = str(error)
+    else:
+        said = "mutated"
+        assert colour.dtype == np.uint8
+        assert colour.shape[2] == 3
+    assert "mutated" in said
+    assert "\n" not in said

@@ -1,0 +1,123 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scene_files import photograph, save, write_scannet
+
+from gsencoder.data.scannet import read_scannet
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.errors import InputError, SceneWarning
+
+
+def test_depth_is_metres_and_the_world_is_upright(tmp_path: Path) -> None:
+    write_scannet(tmp_path)
+    scene = load_scene(tmp_path)
+    assert scene.metres_per_unit == 1.0
+    assert scene.up is not None
+    assert scene.up.tolist() == [0, 0, 1]
+    assert scene.views is not None
+    assert scene.views.names == ("color/0.png", "color/1.png", "color/2.png")
+    assert scene.views.depths is not None
+    assert np.abs(scene.views.depths[1][3] - (1 + np.arange(32) * 1e-3)).max() < 1e-6
+    scaled = load_scene(tmp_path, options=SceneConfig(depth_scale=0.5)).views
+    assert scaled is not None
+    assert scaled.depths is not None
+    assert scaled.depths[0][0, 0] == 500
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_depth_of_another_size_is_resampled_by_its_own_intrinsics(tmp_path: Path, factor: int) -> None:
+    write_scannet(tmp_path, depth_size=(32 * factor, 24 * factor))
+    views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.depths is not None
+    depth = views.depths[0]
+    assert depth.shape == (24, 32)
+    # The centre of colour pixel c is the edge between depth pixels at factor·(c + ½), up to float rounding.
+    wanted = 1 + (np.arange(32) + 0.5) * factor * 1e-3
+    assert np.abs(depth - wanted).max() <= 1.01e-3
+
+
+def test_frames_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    write_scannet(tmp_path, 12)
+    views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.names[9:] == ("color/9.png", "color/10.png", "color/11.png")
+
+
+def test_lost_and_unposed_frames_are_counted(tmp_path: Path) -> None:
+    write_scannet(tmp_path, 5)
+    np.savetxt(tmp_path / "pose/1.txt", np.full((4, 4), -np.inf))
+    with pytest.warns(SceneWarning, match="1 of 5 frames lost tracking"):
+        assert len(load_scene(tmp_path).views or ()) == 4
+    np.savetxt(tmp_path / "pose/1.txt", np.eye(4))
+    (tmp_path / "pose/2.txt").unlink()
+    with pytest.warns(SceneWarning, match=r"1 of 5 pose files are missing \(first: 'pose/2.txt'\)"):
+        assert len(load_scene(tmp_path).views or ()) == 4
+    np.savetxt(tmp_path / "pose/2.txt", np.eye(4))
+    (tmp_path / "depth/4.png").unlink()
+    with pytest.warns(SceneWarning, match="1 of 5 depth files are missing"):
+        views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.depths is not None
+    assert not views.depths[4].any()
+    for i in range(5):
+        np.savetxt(tmp_path / f"pose/{i}.txt", np.full((4, 4), -np.inf))
+    with pytest.raises(InputError, match="no view"):
+        load_scene(tmp_path)
+
+
+def test_instances_are_read_where_they_are(tmp_path: Path) -> None:
+    write_scannet(tmp_path)
+    save(tmp_path / "instance-filt/1.png", np.full((24, 32), 9, np.uint8))
+    views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.instances is not None
+    assert (views.instances[1] == 9).all()
+    assert not views.instances[0].any()
+
+
+def test_bad_exports_are_errors_that_name_the_file(tmp_path: Path) -> None:
+    write_scannet(tmp_path)
+    pose, k = tmp_path / "pose/1.txt", tmp_path / "intrinsic/intrinsic_color.txt"
+    good_pose, good_k = pose.read_text(), k.read_text()
+    for text, said in (
+        ("1 2 3", "expected 4×4"),
+        ("a b\nc d", "table of numbers"),
+        ("", "expected 4×4"),
+        (good_pose.replace("1", "7", 1), "pose"),
+    ):
+        pose.write_text(text)
+        with pytest.raises(InputError, match=rf"1\.txt.*{said}|{said}.*1\.txt"):
+            read_scannet(tmp_path)
+    pose.write_text(good_pose)
+    for matrix, said in (
+        (np.diag([0.0, 31, 1, 1]), "focal length"),
+        (np.array([[1170.0, 0, 648], [0, 1170, 484], [0, 0, 1]]), "principal point"),
+        (np.array([[30.0, 5, 16], [0, 31, 12], [0, 0, 1]]), "expected"),
+        (np.full((3, 3), np.nan), "finite"),
+        (np.eye(2), "3×3 or 4×4"),
+    ):
+        np.savetxt(k, matrix)
+        with pytest.raises(InputError, match=rf"intrinsic_color\.txt.*{said}"):
+            read_scannet(tmp_path)
+    k.write_text(good_k)
+    assert len(read_scannet(tmp_path).images) == 3
+    save(tmp_path / "color/1.jpg", photograph(0))
+    with pytest.raises(InputError, match="frame 1 is there twice"):
+        read_scannet(tmp_path)
+    (tmp_path / "color/1.jpg").unlink()
+    for path in (tmp_path / "intrinsic").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match="no intrinsics"):
+        read_scannet(tmp_path)
+
+
+def test_links_out_of_the_export_are_refused(tmp_path: Path) -> None:
+    write_scannet(tmp_path / "scene")
+    outside = save(tmp_path / "x.png", photograph(0))
+    (tmp_path / "scene/color/1.png").unlink()
+    (tmp_path / "scene/color/1.png").symlink_to(outside)
+    with pytest.raises(InputError, match="leads out of the scene folder"):
+        load_scene(tmp_path / "scene")
+    assert len(load_scene(tmp_path / "scene", options=SceneConfig(allow_outside=True)).views or ()) == 3

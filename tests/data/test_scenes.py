@@ -1,0 +1,247 @@
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scene_files import (
+    photograph,
+    rewrite,
+    save,
+    some_gaussians,
+    world_from_cams,
+    write_colmap,
+    write_scannet,
+    write_transforms,
+)
+
+from gsencoder.data.posed import choose_origin
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.errors import InputError, SceneWarning
+from gsencoder.types import Gaussians, Scene
+
+
+def world_centers(scene: Scene) -> np.ndarray:
+    assert scene.views is not None
+    return scene.views.cameras.centers + scene.origin
+
+
+@pytest.mark.parametrize("layout", ["transforms", "colmap", "scannet"])
+def test_every_layout_gives_the_same_cameras(tmp_path: Path, layout: str) -> None:
+    {"transforms": write_transforms, "colmap": write_colmap, "scannet": write_scannet}[layout](tmp_path)
+    scene = load_scene(tmp_path)
+    assert scene.views is not None
+    wanted = np.linalg.inv(world_from_cams(3))
+    assert np.abs(scene.views.cameras.cam_from_world - wanted).max() < 1e-6
+    assert scene.views.images is not None
+    first = 1 if layout == "colmap" else 0
+    for i, image in enumerate(scene.views.images):
+        assert (image == photograph(first + i)).all()
+
+
+@pytest.mark.parametrize("offset", [(1e6, -2e6, 3e6), (1e6 + 0.25, 0.125, -7e5)])
+def test_a_scene_far_from_zero_equals_the_scene_at_zero(tmp_path: Path, offset: tuple[float, float, float]) -> None:
+    for name, shift in (("near", (0.0, 0.0, 0.0)), ("far", offset)):
+        write_transforms(tmp_path / name, offset=shift)
+        write_colmap(tmp_path / f"{name}_colmap", offset=shift)
+    for kind in ("", "_colmap"):
+        near, far = load_scene(tmp_path / f"near{kind}"), load_scene(tmp_path / f"far{kind}")
+        assert near.views is not None
+        assert far.views is not None
+        assert not near.origin.any()
+        assert np.abs(far.origin - offset).max() <= 500
+        assert np.abs(world_centers(far) - world_centers(near) - offset).max() < 1e-6
+        if all(part % 1000 == 0 for part in offset):
+            difference = far.views.cameras.cam_from_world - near.views.cameras.cam_from_world
+            assert np.abs(difference).max() < 2e-6
+        if kind:
+            assert near.sfm_points is not None
+            assert far.sfm_points is not None
+            moved = far.sfm_points.astype(float) + far.origin - near.sfm_points
+            assert np.abs(moved - offset).max() < 1e-6
+
+
+def test_the_origin_follows_shifts_by_whole_steps_exactly(rng: np.random.Generator) -> None:
+    points = rng.normal(size=(20, 3)) * 100
+    shift = np.array([3000.0, -1_000_000.0, 0.0])
+    assert (choose_origin(points + shift) - choose_origin(points) == shift).all()
+    assert (choose_origin(np.zeros((0, 3))) == 0).all()
+
+
+def test_fewer_views_are_evenly_spaced_and_keep_both_ends(tmp_path: Path) -> None:
+    write_transforms(tmp_path, 9)
+    scene = load_scene(tmp_path, options=SceneConfig(max_views=3))
+    assert scene.views is not None
+    assert scene.views.names == ("images/000.png", "images/004.png", "images/008.png")
+
+
+def test_scaling_keeps_rays_and_sizes_in_step(tmp_path: Path) -> None:
+    write_transforms(tmp_path, depth=True, instances=True)
+    full, half = (load_scene(tmp_path, options=SceneConfig(image_scale=scale)).views for scale in (1.0, 0.5))
+    assert full is not None
+    assert half is not None
+    assert half.images is not None
+    assert half.depths is not None
+    assert half.instances is not None
+    assert half.images[1].shape == (12, 16, 3)
+    assert (half.depths[1] == np.float32(1.001)).all()
+    assert (half.instances[2] == 302).all()
+    corner = np.linalg.inv(full.cameras.Ks[0].astype(float)) @ [32, 24, 1]
+    assert np.abs(half.cameras.Ks[0] @ corner - [16, 12, 1]).max() < 1e-5
+    averages = photograph(1).reshape(12, 2, 16, 2, 3).mean(axis=(1, 3))
+    assert np.abs(half.images[1] - averages).max() <= 1
+
+
+def test_nothing_recognised_says_what_was_looked_for(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"looked for transforms\.json.*COLMAP.*ScanNet.*splat"):
+        load_scene(tmp_path)
+    with pytest.raises(InputError, match="no such file or folder"):
+        load_scene(tmp_path / "nowhere")
+    for name in ("a\0b", "n" * 5000):
+        with pytest.raises(InputError, match=r"no such file or folder|is not a path"):
+            load_scene(name)
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(InputError, match=r"expected a transforms\.json or a splat"):
+        load_scene(tmp_path / "notes.txt")
+
+
+def test_a_splat_beside_the_views_is_not_taken_silently(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    (tmp_path / "splat.ply").write_bytes(b"not read")
+    with pytest.warns(SceneWarning, match=r"splat\.ply lies beside the views and is not used; say splat="):
+        scene = load_scene(tmp_path)
+    assert scene.gaussians is None
+    with pytest.raises(InputError, match="no such file"):
+        load_scene(tmp_path, splat="other.ply")
+
+
+def test_a_given_splat_shares_the_origin_of_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_transforms(tmp_path, offset=(5000.0, 0.0, 0.0))
+    (tmp_path / "mine.ply").write_bytes(b"")
+    asked = []
+
+    def loader(path: Path, origin: np.ndarray | None) -> Gaussians:
+        asked.append((path, origin))
+        return some_gaussians(np.zeros((2, 3), np.float32))
+
+    monkeypatch.setattr("gsencoder.data.scenes._load_splat", loader)
+    scene = load_scene(tmp_path, splat="mine.ply")
+    assert asked[0][0] == tmp_path / "mine.ply"
+    assert asked[0][1].tolist() == scene.origin.tolist() == [5000.0, 0.0, 0.0]
+    assert scene.gaussians is not None
+    with pytest.raises(InputError, match="splat= is for scenes with views"):
+        load_scene(tmp_path / "mine.ply", splat="mine.ply")
+
+
+def test_a_bare_splat_has_no_views_and_a_far_one_gets_an_origin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    means = np.array([[1e6, 0, 0], [1e6 + 4, 8, 0], [1e6 + 8, 4, 1]], np.float32)
+    monkeypatch.setattr("gsencoder.data.scenes._load_splat", lambda *_: some_gaussians(means))
+    (tmp_path / "only.ply").write_bytes(b"")
+    for path in (tmp_path, tmp_path / "only.ply"):
+        scene = load_scene(path)
+        assert scene.views is None
+        assert scene.gaussians is not None
+        assert scene.origin.tolist() == [1e6, 0, 0]
+        assert (scene.gaussians.means + scene.origin == means).all()
+    (tmp_path / "second.spz").write_bytes(b"")
+    with pytest.raises(InputError, match=r"holds 2 splats \(only\.ply, second\.spz\)"):
+        load_scene(tmp_path)
+
+
+def test_two_sources_of_views_are_named(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    write_colmap(tmp_path)
+    with pytest.warns(SceneWarning, match=r"transforms\.json is used"):
+        load_scene(tmp_path)
+    direct = load_scene(tmp_path / "sparse/0")
+    assert direct.sfm_points is not None
+
+
+def test_objects_come_with_the_scene(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    row = {"id": 3, "name": None, "aabb_min": [0, 0, 0], "aabb_max": [1, 2, 3], "placed": False, "views": 2}
+    (tmp_path / "objects.json").write_text(json.dumps([row]))
+    (found,) = load_scene(tmp_path).objects
+    assert (found.id, found.name, found.placed, found.views, found.max_pixels) == (3, None, False, 2, 0)
+    assert found.aabb_max.tolist() == [1, 2, 3]
+    for change, message in (
+        ({"id": -1}, "id must be"),
+        ({"aabb_min": [2, 0, 0]}, "is not below"),
+        ({"aabb_max": [0, float("nan"), 1]}, "three finite numbers"),
+        ({"name": 3}, "name must be"),
+        ({"placed": 1}, "placed must be"),
+    ):
+        (tmp_path / "objects.json").write_text(json.dumps([row | change]))
+        with pytest.raises(InputError, match=message):
+            load_scene(tmp_path)
+    (tmp_path / "objects.json").write_text(json.dumps([row, row]))
+    with pytest.raises(InputError, match="id 3 belongs to several"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"max_views": -1}, {"image_scale": 0.0}, {"image_scale": 1.5}, {"depth_scale": 0.0}, {"metres_per_unit": -1.0}],
+)
+def test_options_out_of_range_are_errors(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        SceneConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_views_can_be_sent_to_another_process(tmp_path: Path) -> None:
+    write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30, 16, 12, 0.1))
+    views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.images is not None
+    copy = pickle.loads(pickle.dumps(views.images))
+    assert (copy[2] == views.images[2]).all()
+
+
+@pytest.mark.shared
+def test_depth_of_one_house_view_lands_on_the_depth_of_the_others(shared: Path) -> None:
+    scene = load_scene(shared / "scenes/house/train_000")
+    views = scene.views
+    assert views is not None
+    assert views.depths is not None
+    assert scene.metres_per_unit == 1.0
+    assert len(views) == 24
+    assert len(scene.objects) == 45
+    cameras, depths = views.cameras, [views.depths[i] for i in range(len(views))]
+    errors, seen = [], 0
+    row, column = np.mgrid[:240, :320] + 0.5
+    for a in range(0, 24, 8):
+        depth, k, pose = depths[a], cameras.Ks[a].astype(float), cameras.cam_from_world[a].astype(float)
+        rays = np.stack([(column - k[0, 2]) / k[0, 0], (row - k[1, 2]) / k[1, 1], np.ones_like(row)], axis=-1)
+        points = ((rays * depth[..., None])[depth > 0][::2] - pose[:3, 3]) @ pose[:3, :3]
+        for b in range(24):
+            if a == b:
+                continue
+            pose = cameras.cam_from_world[b].astype(float)
+            local = points @ pose[:3, :3].T + pose[:3, 3]
+            local = local[local[:, 2] > 0.05]
+            pixel = (local @ cameras.Ks[b].T)[:, :2] / local[:, 2:]
+            inside = ((pixel >= 0) & (pixel < (320, 240))).all(axis=1)
+            there = depths[b][pixel[inside, 1].astype(int), pixel[inside, 0].astype(int)]
+            z = local[inside, 2]
+            # A point in front of the surface that B sees, or hidden behind it, is not co-visible.
+            covisible = (there > 0) & (np.abs(there - z) < 0.1)
+            errors.append(np.abs(there - z)[covisible])
+            seen += covisible.sum()
+    assert seen > 300_000
+    assert np.median(np.concatenate(errors)) < 0.01
+
+
+def test_images_of_two_sizes_live_in_one_scene(tmp_path: Path, no_jaxtyping: None) -> None:
+    # jaxtyping would bind H and W of a random image and a random depth to each other.
+    data = write_transforms(tmp_path, depth=True)
+    save(tmp_path / "images/001.png", photograph(1, 16, 12))
+    save(tmp_path / "depth/001.png", np.full((12, 16), 500, np.uint16))
+    data["frames"][1] |= {"w": 16, "h": 12, "fl_x": 15.0}
+    rewrite(tmp_path, data)
+    views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.images is not None
+    assert [image.shape[:2] for image in views.images] == [(24, 32), (12, 16), (24, 32)]
+    assert views.cameras.widths.tolist() == [32, 16, 32]

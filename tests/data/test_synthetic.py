@@ -1,0 +1,255 @@
+import json
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.synthetic import color_words, make_room, plan_room, write_room
+from gsencoder.data.synthetic_plan import _CATALOGUE, COLORS, FIRST_ID, HALF_ROOM, SHELF, TABLE
+from gsencoder.data.synthetic_shapes import Solid
+from gsencoder.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def room():
+    return make_room(3)
+
+
+def _arrays(scene):
+    views, g = scene.views, scene.gaussians
+    yield from (g.means, g.quats, g.scales, g.opacities, g.sh, views.cameras.cam_from_world, views.cameras.Ks)
+    for kind in (views.images, views.depths, views.instances):
+        yield from kind
+
+
+def _world_points(views, view):
+    depth = views.depths[view].astype(np.float64)
+    K, pose = views.cameras.Ks[view].astype(np.float64), views.cameras.cam_from_world[view].astype(np.float64)
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+    local = np.stack([(u - K[0, 2]) / K[0, 0] * depth, (v - K[1, 2]) / K[1, 1] * depth, depth], axis=-1)
+    return (local - pose[:3, 3]) @ pose[:3, :3]
+
+
+def test_a_room_is_made_in_under_a_second():
+    took = []
+    for seed in range(3):
+        start = time.process_time()
+        make_room(seed)
+        took.append(time.process_time() - start)
+    assert min(took) < 1
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_another_room(room):
+    again, other = make_room(3), make_room(4)
+    assert all(np.array_equal(a, b) for a, b in zip(_arrays(room), _arrays(again), strict=True))
+    assert [o.name for o in room.objects] != [o.name for o in other.objects]
+
+
+def test_every_pixel_lies_on_its_own_object_and_inside_its_box(room):
+    things = {thing.id: thing for thing in plan_room(3)}
+    boxes = {found.id: (found.aabb_min, found.aabb_max) for found in room.objects}
+    for view in range(0, len(room.views), 5):
+        points, labels = _world_points(room.views, view), room.views.instances[view]
+        assert ((labels > 0) == (room.views.depths[view] > 0)).all()
+        for label in np.unique(labels[labels > 0]):
+            mine = points[labels == label]
+            lower, upper = boxes[int(label)]
+            assert (mine > lower - 1e-5).all()
+            assert (mine < upper + 1e-5).all()
+            parts = things[int(label)].parts
+            assert np.any([part.contains(mine, 1e-5) for part in parts], axis=0).all()
+            assert not np.any([part.contains(mine, -1e-5) for part in parts], axis=0).any()
+
+
+def test_no_surface_lies_in_front_of_the_depth_that_was_cast(room):
+    """An independent look at the rays: points along them before the hit are in no solid."""
+    solids = [part for thing in plan_room(3) for part in thing.parts]
+    points = _world_points(room.views, 2)[room.views.depths[2] > 0]
+    center = room.views.cameras.centers[2]
+    for share in np.linspace(0.05, 0.999, 25):
+        on_the_way = center + share * (points - center)
+        assert not np.any([solid.contains(on_the_way, -1e-6) for solid in solids], axis=0).any()
+
+
+def test_the_boxes_are_as_tight_as_what_all_views_see_of_free_standing_things():
+    scene = make_room(0, views=20, width=200, height=150)
+    seen: dict[int, list[np.ndarray]] = {}
+    for view in range(20):
+        points, labels = _world_points(scene.views, view), scene.views.instances[view]
+        for label in np.unique(labels[labels >= FIRST_ID]):
+            seen.setdefault(int(label), []).append(points[labels == label])
+    for found in scene.objects:
+        if found.placed and found.views >= 16:
+            points = np.concatenate(seen[found.id])
+            # The lower face is hidden, and the sides show to about a pixel.
+            assert np.abs(points.max(axis=0) - found.aabb_max).max() < 0.02
+            assert np.abs(points.min(axis=0) - found.aabb_min)[:2].max() < 0.02
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_objects_rest_on_something_keep_apart_and_show_in_several_views(seed):
+    scene = make_room(seed, width=80, height=60)
+    placed = [found for found in scene.objects if found.placed]
+    assert len(placed) == 8
+    assert len({found.name for found in placed}) == 8
+    for row, found in enumerate(placed):
+        assert np.abs(found.aabb_min[2] - np.array([0, TABLE[2], SHELF[2]])).min() < 1e-9
+        assert (np.abs([found.aabb_min[:2], found.aabb_max[:2]]) < HALF_ROOM).all()
+        assert found.views >= 3, f"{found.name} shows in {found.views} views"
+        for other in placed[:row]:
+            apart = (found.aabb_min >= other.aabb_max) | (other.aabb_min >= found.aabb_max)
+            parts = [plan for plan in plan_room(seed) if plan.id in (found.id, other.id)]
+            points = np.concatenate([part.lattice(0.01) for part in parts[0].parts])
+            touching = np.any([part.contains(points, 0.005) for part in parts[1].parts], axis=0)
+            assert apart.any() or not touching.any()
+
+
+def test_views_and_pixels_are_counted_from_the_instance_maps(room):
+    for found in room.objects:
+        counts = [int((labels == found.id).sum()) for labels in room.views.instances]
+        assert found.views == sum(count > 0 for count in counts)
+        assert found.max_pixels == max(counts)
+
+
+def test_gaussians_lie_on_the_surfaces_with_the_colours_of_the_pictures(room):
+    g = room.gaussians
+    assert 5_000 < len(g) < 40_000
+    assert (np.abs(g.means[:, 2]) < 3).all()
+    colors = 0.5 + 0.28209479177387814 * g.sh[:, 0]
+    checked, wrong = 0, 0
+    for view in range(0, 16, 4):
+        pose, K = room.views.cameras.cam_from_world[view], room.views.cameras.Ks[view]
+        local = g.means @ pose[:3, :3].T + pose[:3, 3]
+        ahead = local[:, 2] > 0.1
+        pixel = np.floor(local[ahead, :2] / local[ahead, 2:] * np.diag(K)[:2] + K[:2, 2]).astype(int)
+        inside = (pixel >= 0).all(axis=1) & (pixel < [160, 120]).all(axis=1)
+        rows, (x, y) = np.flatnonzero(ahead)[inside], pixel[inside].T
+        visible = np.abs(room.views.depths[view][y, x] - local[rows, 2]) < 0.004
+        apart = np.abs(colors[rows] * 255 - room.views.images[view][y, x]).max(axis=1)[visible]
+        checked, wrong = checked + apart.size, wrong + int((apart > 20).sum())
+    assert checked > 5_000
+    assert wrong < 0.03 * checked  # A pixel on the border of a check or of an object shows the other side.
+
+
+def test_every_pixel_has_a_gaussian_of_its_surface_beside_it(room):
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(room.gaussians.means)
+    for view in (0, 7):
+        labels = room.views.instances[view]
+        distance, _ = tree.query(_world_points(room.views, view)[labels > 0])
+        on_walls = labels[labels > 0] == 2
+        assert distance[~on_walls].max() < 0.04
+        assert distance.max() < 0.08
+
+
+def test_colour_words_are_the_hues_of_the_pictures():
+    words = color_words(3)
+    scene = make_room(3)
+    assert len({words[found.id] for found in scene.objects if found.placed}) == 8
+    for found in scene.objects:
+        if found.placed:
+            pixels = np.concatenate(
+                [
+                    image[labels == found.id]
+                    for image, labels in zip(scene.views.images, scene.views.instances, strict=True)
+                ]
+            )
+            mean = pixels.mean(axis=0)
+            wanted = np.array(COLORS[words[found.id]], float)
+            assert mean @ wanted / np.linalg.norm(mean) / np.linalg.norm(wanted) > 0.995
+            assert 0.5 < np.linalg.norm(mean) / np.linalg.norm(wanted) <= 1.01
+
+
+@pytest.mark.shared
+def test_all_names_are_in_the_table_of_clip_names(shared):
+    known = set(np.load(shared / "models/clip_vitb32_names.npz", allow_pickle=False)["names"].tolist())
+    assert {*_CATALOGUE, "table", "shelf"} <= known
+
+
+def test_a_written_room_loads_as_the_same_scene(room, tmp_path):
+    write_room(room, tmp_path / "room")
+    loaded = load_scene(tmp_path / "room")
+    assert loaded.metres_per_unit == 1
+    assert loaded.up is not None
+    assert loaded.up.tolist() == [0, 0, 1]
+    assert loaded.views.names == room.views.names
+    assert np.abs(loaded.views.cameras.centers + loaded.origin - room.views.cameras.centers).max() < 1e-6
+    assert (
+        np.abs(loaded.views.cameras.cam_from_world[:, :3, :3] - room.views.cameras.cam_from_world[:, :3, :3]).max()
+        < 1e-6
+    )
+    assert np.array_equal(loaded.views.cameras.Ks, room.views.cameras.Ks)
+    for view in (0, 9):
+        assert np.array_equal(loaded.views.images[view], room.views.images[view])
+        assert np.array_equal(loaded.views.instances[view], room.views.instances[view])
+        assert np.abs(loaded.views.depths[view] - room.views.depths[view]).max() < 5.1e-4
+    for read, made in zip(loaded.objects, room.objects, strict=True):
+        for field in ("id", "name", "placed", "views", "max_pixels"):
+            assert getattr(read, field) == getattr(made, field)
+        assert np.array_equal(read.aabb_min, made.aabb_min)
+        assert np.array_equal(read.aabb_max, made.aabb_max)
+
+
+@pytest.mark.shared
+def test_a_written_room_has_the_keys_and_file_types_of_the_house_scenes(room, shared, tmp_path):
+    write_room(room, tmp_path / "room")
+    house = shared / "scenes/house/train_000"
+    for name in ("objects.json", "transforms.json"):
+        ours, theirs = (json.loads((folder / name).read_text()) for folder in (tmp_path / "room", house))
+        if name == "objects.json":
+            ours, theirs = ours[0], theirs[0]
+        assert set(ours) == set(theirs)
+    for kind in ("depth", "instance"):
+        with Image.open(tmp_path / "room" / kind / "000.png") as ours, Image.open(house / kind / "000.png") as theirs:
+            assert ours.mode == theirs.mode == "I;16"
+
+
+def test_a_folder_with_something_in_it_is_not_written_over(room, tmp_path):
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(InputError, match="not an empty folder"):
+        write_room(room, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_a_write_that_fails_leaves_nothing_behind(room, tmp_path, monkeypatch):
+    def full(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_room(room, tmp_path / "room")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("shape", ["box", "ellipsoid", "cylinder"])
+def test_solids_rays_normals_and_lattices_agree(shape, rng):
+    solid = Solid(shape=shape, center=np.array([0.3, -0.2, 0.5]), half=np.array([0.3, 0.2, 0.1]), yaw=0.7)
+    points = solid.lattice(0.02)
+    assert not solid.contains(points, -1e-9).any()
+    assert solid.contains(points, 1e-9).all()
+    normals = solid.normals(points)
+    assert not solid.contains(points + 1e-4 * normals, 0.0).any()
+    assert solid.contains(points - 1e-4 * normals, 0.0).all()
+    lower, upper = solid.aabb()
+    assert np.abs(points.min(axis=0) - lower).max() < 0.02
+    assert (points >= lower - 1e-9).all()
+    assert (points <= upper + 1e-9).all()
+    origin = np.array([2.0, 1.0, 1.5])
+    hits = solid.hits(origin, points - origin)
+    facing = np.einsum("ij,ij->i", normals, points - origin) < -1e-3
+    assert np.abs(hits[facing] - 1).max() < 1e-9
+    assert (hits[~np.isinf(hits)] < 1 + 1e-9).all()
+    assert np.isinf(solid.hits(origin, origin - points)).all()
+
+
+def test_ends_of_the_range():
+    assert len(make_room(0, objects=0, views=0).views) == 0
+    tiny = make_room(0, objects=18, views=1, width=1, height=1, spacing=0.2)
+    assert tiny.views.depths[0].shape == (1, 1)
+    assert len(tiny.objects) == 22
+    for arguments in ({"objects": 19}, {"objects": -1}, {"width": 0}, {"views": -1}, {"spacing": 0.0}):
+        with pytest.raises(InputError, match="synthetic room"):
+            make_room(0, **arguments)

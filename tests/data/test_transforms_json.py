@@ -1,0 +1,310 @@
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scene_files import OPENGL, photograph, rewrite, save, world_from_cams, write_transforms
+
+from gsencoder.data.posed import inverse_rigid, rigid_pose
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.transforms_json import read_transforms
+from gsencoder.errors import InputError, SceneWarning
+
+
+def change(folder: Path, data: dict[str, Any], frame: int = 1, **values: Any) -> Path:
+    """Saves the scene with some values of one frame set; None removes a value."""
+    data = copy.deepcopy(data)
+    data["frames"][frame] |= values
+    data["frames"][frame] = {key: value for key, value in data["frames"][frame].items() if value is not None}
+    return rewrite(folder, data)
+
+
+def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
+    # A camera at (0, 0, 5) with OpenGL's identity rotation looks down -z with y up: OpenCV sees the origin in front.
+    pose = np.eye(4)
+    pose[2, 3] = 5
+    data = write_transforms(tmp_path, 1)
+    path = change(tmp_path, data, 0, transform_matrix=pose.tolist())
+    (image,) = read_transforms(path).images
+    assert (image.cam_from_world @ [0, 0, 0, 1] == [0, 0, 5, 1]).all()
+    assert (image.cam_from_world @ [0, 1, 0, 1] == [0, -1, 5, 1]).all()
+
+
+def test_a_frames_own_intrinsics_come_before_the_files(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path)
+    change(tmp_path, data, fl_x=40.0, cx=10.0)
+    cameras = [image.camera.params[:4] for image in read_transforms(tmp_path / "transforms.json").images]
+    assert cameras == [(30, 31, 15.5, 12.5), (40, 31, 10, 12.5), (30, 31, 15.5, 12.5)]
+
+
+def test_blender_files_without_suffix_size_or_focal_length(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path)
+    angle = 2 * np.arctan(16 / 30.0)
+    frames = [frame | {"file_path": f"./images/{i:03d}"} for i, frame in enumerate(data["frames"])]
+    (tmp_path / "transforms.json").unlink()
+    rewrite(tmp_path, {"camera_angle_x": angle, "frames": frames}, "transforms_train.json")
+    views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.names[0] == "./images/000"
+    assert np.abs(views.cameras.Ks[0] - [[30, 0, 16], [0, 30, 12], [0, 0, 1]]).max() < 1e-5
+    # A frame's own angle comes before a length of the file.
+    frames[0]["camera_angle_x"] = float(2 * np.arctan(16 / 50.0))
+    path = rewrite(tmp_path, {"fl_x": 30.0, "frames": frames}, "transforms_train.json")
+    assert read_transforms(path).images[0].camera.params[0] == pytest.approx(50)
+
+
+def test_distortion_takes_the_right_model(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, 1)
+    for values, model, tail in (
+        ({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, "OPENCV", (0.1, 0.2, 0.3, 0.4)),
+        ({"k1": 0.1, "k3": 0.2}, "FULL_OPENCV", (0.1, 0, 0, 0, 0.2, 0, 0, 0)),
+        ({"k1": 0.1, "k4": 0.2, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.2)),
+        ({"k1": 0.1, "is_fisheye": True}, "OPENCV_FISHEYE", (0.1, 0, 0, 0)),
+    ):
+        (image,) = read_transforms(rewrite(tmp_path, data | values)).images
+        assert image.camera.model == model
+        assert image.camera.params[4:] == tail
+
+
+def test_metres_and_up_are_known_only_where_the_file_says_so(tmp_path: Path) -> None:
+    plain = write_transforms(tmp_path, depth=True)
+    for top, metres, up in (
+        ({}, None, None),
+        ({"depth_unit_scale_factor": 0.001}, 1.0, [0, 0, 1]),
+        ({"metres_per_unit": 0.5, "up": [0, -2, 0]}, 0.5, [0, -1, 0]),
+        ({"depth_unit_scale_factor": 0.001, "metres_per_unit": 2.0}, 2.0, [0, 0, 1]),
+    ):
+        rewrite(tmp_path, plain | top)
+        scene = load_scene(tmp_path)
+        assert scene.metres_per_unit == metres
+        assert (None if scene.up is None else scene.up.tolist()) == up
+    without = write_transforms(tmp_path / "rgb", depth_unit_scale_factor=0.001)
+    assert "depth_file_path" not in without["frames"][0]
+    assert load_scene(tmp_path / "rgb").metres_per_unit is None
+
+
+def test_depth_masks_and_instances_are_read(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, depth=True, instances=True, depth_unit_scale_factor=0.01)
+    mask = np.zeros((24, 32), np.uint8)
+    mask[5:, 3:] = 255
+    save(tmp_path / "masks/1.png", mask)
+    change(tmp_path, data, mask_path="masks/1.png")
+    views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.depths is not None
+    assert views.masks is not None
+    assert views.instances is not None
+    assert (views.depths[2] == np.float32(10.02)).all()
+    assert (views.instances[0] == 300).all()
+    assert (views.masks[1] == (mask > 0)).all()
+    assert views.masks[0].all()
+
+
+def test_listed_but_missing_files_are_counted_once(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, 5, depth=True, instances=True)
+    for name in ("images/001.png", "images/003.png"):
+        (tmp_path / name).unlink()
+    with pytest.warns(SceneWarning, match=r"2 of 5 listed images are missing \(first: 'images/001.png'\)") as caught:
+        scene = load_scene(tmp_path)
+    assert len(caught) == 1
+    assert scene.views is not None
+    assert scene.views.names == ("images/000.png", "images/002.png", "images/004.png")
+    assert (np.asarray(scene.views.images[1]) == photograph(2)).all()  # type: ignore[index]
+    save(tmp_path / "images/001.png", photograph(1))
+    save(tmp_path / "images/003.png", photograph(3))
+    (tmp_path / "depth/002.png").unlink()
+    with pytest.warns(SceneWarning, match="1 of 5 listed depth files are missing"):
+        scene = load_scene(tmp_path)
+    assert scene.views is not None
+    assert scene.views.depths is not None
+    assert not scene.views.depths[2].any()
+    assert scene.views.depths[3].all()
+    for frame in data["frames"]:
+        (tmp_path / frame["file_path"]).unlink()
+    with pytest.raises(InputError, match="none of the 5 listed images exists"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["file_path", "depth_file_path", "mask_path", "instance_file_path"])
+@pytest.mark.parametrize("kind", ["dots", "absolute", "link"])
+def test_paths_that_leave_the_scene_folder_are_refused(tmp_path: Path, key: str, kind: str) -> None:
+    folder = tmp_path / "scene"
+    data = write_transforms(folder)
+    wide = np.full((24, 32), 1, np.uint16)
+    outside = save(tmp_path / "outside.png", photograph(1) if key == "file_path" else wide)
+    if kind == "link":
+        (folder / "linked.png").symlink_to(outside)
+    value = {"dots": "images/../../outside.png", "absolute": str(outside), "link": "linked.png"}[kind]
+    path = change(folder, data, **{key: value})
+    with pytest.raises(InputError, match=r"frame 1 .* leads out of the scene folder"):
+        read_transforms(path)
+    assert len(read_transforms(path, allow_outside=True).images) == 3
+
+
+def test_dots_that_stay_inside_are_fine(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path)
+    path = change(tmp_path, data, file_path="images/../images/001.png")
+    assert read_transforms(path).images[1].image.is_file()
+
+
+def matrix(scale: float = 1.0, **entries: float) -> list[list[float]]:
+    pose = world_from_cams(3)[1] @ OPENGL
+    pose[:3, :3] *= scale
+    for name, value in entries.items():
+        pose[int(name[1]), int(name[2])] = value
+    return pose.tolist()
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"transform_matrix": matrix(0.5)}, "uniform scale of 0.5"),
+        ({"transform_matrix": matrix(0.0)}, "singular"),
+        ({"transform_matrix": matrix(m00=3.0)}, "not rigid"),
+        ({"transform_matrix": matrix(m03=float("nan"))}, "finite"),
+        ({"transform_matrix": matrix(m03=float("inf"))}, "finite"),
+        ({"transform_matrix": matrix(m03=1e20)}, "units away"),
+        ({"transform_matrix": matrix(m00=1e200)}, "not rigid"),
+        ({"transform_matrix": matrix(m33=2.0)}, "last row"),
+        ({"transform_matrix": (np.array(matrix()) @ np.diag([1, 1, -1, 1])).tolist()}, "mirrors"),
+        ({"transform_matrix": [[1, 2], [3, 4]]}, "4 rows"),
+        ({"transform_matrix": [["1", 0, 0, 0]] * 4}, "must be a number"),
+        ({"transform_matrix": [[None, 0, 0, 0]] * 4}, "empty entry"),
+        ({"transform_matrix": None}, "4 rows"),
+        ({"fl_x": float("nan")}, "fl_x must be finite"),
+        ({"cx": float("inf")}, "cx must be finite"),
+        ({"fl_x": 10**400}, "fl_x must be finite"),
+        ({"fl_y": -3.0}, "focal length"),
+        ({"fl_x": "30"}, "fl_x must be a number"),
+        ({"k1": True}, "k1 must be a number"),
+        ({"w": 640}, "w is 640 but the image"),
+        ({"h": 23.5}, "h is 23.5 but the image"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"camera_model": ["OPENCV"]}, "camera_model must be a name"),
+        ({"k4": 0.1}, "k4"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "p1 and p2"),
+        ({"file_path": "images/000.png"}, "repeated"),
+        ({"file_path": ""}, "no file_path"),
+        ({"file_path": 7}, "no file_path"),
+        ({"file_path": "a\0b"}, "not a path"),
+        ({"file_path": "x" * 5000}, "not a path"),
+        ({"mask_path": 3}, "mask_path must be a path"),
+        ({"depth_file_path": "images/000.png", "depth_unit_scale_factor": -1}, "depth scale must be positive"),
+    ],
+)
+def test_a_frame_that_cannot_be_used_is_named(tmp_path: Path, values: dict[str, Any], said: str) -> None:
+    path = change(tmp_path, write_transforms(tmp_path), **values)
+    with pytest.raises(InputError, match="frame 1") as caught:
+        read_transforms(path)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_depth_of_another_size_names_both(tmp_path: Path) -> None:
+    write_transforms(tmp_path, depth=True)
+    save(tmp_path / "depth/002.png", np.ones((12, 16), np.uint16))
+    with pytest.raises(InputError, match=r"depth/002.png has 16×12 pixels but .*images/002.png has 32×24"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[]", b"{}", b'{"frames": []}', b'{"frames": {}}', b'{"frames": [1]}', b"\xff\xfe", b"[" * 100_000],
+)
+def test_files_that_are_no_transforms_are_errors(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "transforms.json").write_bytes(content)
+    with pytest.raises(InputError, match=r"transforms\.json"):
+        load_scene(tmp_path)
+
+
+def test_rounding_in_a_pose_is_removed(rng: np.random.Generator) -> None:
+    exact = world_from_cams(5)[3]
+    pose = rigid_pose(np.round(exact, 4), "here")
+    rotation = pose[:3, :3]
+    assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
+    assert np.abs(pose - exact).max() < 2e-4
+    assert np.abs(inverse_rigid(pose) @ pose - np.eye(4)).max() < 1e-12
+
+
+json_values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=8)
+    | st.just(10**400)
+    | st.just("../x.png"),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=6,
+)
+KEYS = [
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
+    "camera_model",
+    "camera_angle_x",
+    "up",
+]
+KEYS += ["metres_per_unit", "depth_unit_scale_factor", "file_path", "transform_matrix", "depth_file_path", "mask_path"]
+KEYS += ["instance_file_path", "depth_path", "integer_depth_scale", "is_fisheye", "frames"]
+
+
+def loads_or_complains(folder: Path) -> None:
+    try:
+        scene = load_scene(folder)
+    except InputError as error:
+        said = str(error)
+    else:
+        said = ""
+        assert scene.views is not None
+        assert np.isfinite(scene.views.cameras.cam_from_world).all()
+        for name in ("images", "depths", "masks", "instances"):
+            sequence = getattr(scene.views, name)
+            assert sequence is None or len(list(sequence)) == len(scene.views)
+    assert "\n" not in said
+
+
+@pytest.mark.filterwarnings("ignore::gsencoder.errors.SceneWarning")
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_mutated_values_give_a_scene_or_an_input_error(tmp_path: Path, no_jaxtyping: None, data: st.DataObject) -> None:
+    scene = write_transforms(tmp_path, 2, depth=True)
+    for _ in range(data.draw(st.integers(1, 3))):
+        target = data.draw(st.sampled_from([scene, *scene["frames"]])) if isinstance(scene["frames"], list) else scene
+        if not isinstance(target, dict):
+            continue
+        key = data.draw(st.sampled_from(KEYS))
+        target[key] = data.draw(json_values)
+        if key == "transform_matrix" and data.draw(st.booleans()):
+            pose = matrix()
+            pose[data.draw(st.integers(0, 3))][data.draw(st.integers(0, 3))] = data.draw(st.floats())
+            target[key] = pose
+    rewrite(tmp_path, scene)
+    loads_or_complains(tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore::gsencoder.errors.SceneWarning")
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_mutated_text_gives_a_scene_or_an_input_error(tmp_path: Path, no_jaxtyping: None, data: st.DataObject) -> None:
+    text = bytearray(json.dumps(write_transforms(tmp_path, 2, depth=True)).encode())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(text) - 1))
+        text[at : at + data.draw(st.integers(0, 2))] = data.draw(
+            st.binary(max_size=2) | st.sampled_from([b"9", b"-", b"e9", b".", b"NaN", b'"', b"]", b","])
+        )
+    (tmp_path / "transforms.json").write_bytes(bytes(text))
+    loads_or_complains(tmp_path)
