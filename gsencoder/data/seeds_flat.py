@@ -17,6 +17,9 @@ NEIGHBOURS = 12
 ENOUGH = 6
 """So many neighbours of the same surface settle the spacing."""
 SAME_FACING_COS = 0.5
+OVER_ANY = 1.5
+"""… but it is at most so many times the spacing of all samples around, of whatever facing: two sheets make √2, and a
+scrap of surface with no like neighbour must not swell over the others."""
 STRETCH = 3.0
 """A spacing may be so many times the median of the neighbours' own: a stray point must not become a great blob."""
 SH_C0 = 0.28209479177387814
@@ -59,7 +62,8 @@ def surface_spacing(
     """Distance between samples of the same surface, √(area of a disc / samples in it), for each point.
 
     The disc reaches to the ENOUGHth neighbour that faces the same way, so the sheet below a thin plate or the next
-    wall does not count. Limited to STRETCH times the neighbours' median, and to `largest`.
+    wall does not count. Limited to OVER_ANY times the spacing of all samples, STRETCH times the neighbours' median, and
+    `largest`.
     """
     limit = np.broadcast_to(np.asarray(largest, np.float32), len(points))
     if len(points) < 2:
@@ -67,18 +71,21 @@ def surface_spacing(
     distances, rows = nearest(points, points, NEIGHBOURS + 1)
     distances, rows = distances[:, 1:], rows[:, 1:]
     alike = np.einsum("nkc,nc->nk", normals[rows], normals) > SAME_FACING_COS
-    alike &= np.isfinite(distances)
-    count = np.minimum(alike.cumsum(axis=1), ENOUGH)
+    on_sheet, on_any = _disc_spacing(distances, alike), _disc_spacing(distances, np.ones_like(alike))
+    spacing = np.minimum(np.minimum(on_sheet, OVER_ANY * on_any), limit)
+    around = np.median(spacing[rows], axis=1)
+    return np.minimum(spacing, STRETCH * around).astype(np.float32)
+
+
+def _disc_spacing(distances: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Spacing by the disc that reaches to the ENOUGHth neighbour that counts, or the last one; infinite without any."""
+    count = np.minimum(counts.cumsum(axis=1), ENOUGH)
     last = count.argmax(axis=1)  # The first place where the largest count is reached.
     found = np.take_along_axis(count, last[:, None], 1)[:, 0]
     radius = np.take_along_axis(distances, last[:, None], 1)[:, 0]
     # The disc's rim passes through its last sample, which is half inside; the point itself is wholly inside.
-    spacing = np.where(found > 0, radius * np.sqrt(np.pi / (found + 0.5)), np.inf)
     # Coincident points have no spacing of their own.
-    spacing[spacing <= 0] = np.inf
-    spacing = np.minimum(spacing, limit)
-    around = np.median(spacing[rows], axis=1)
-    return np.minimum(spacing, STRETCH * around).astype(np.float32)
+    return np.where((found > 0) & (radius > 0), radius * np.sqrt(np.pi / (found + 0.5)), np.inf)
 
 
 def nearest(

@@ -114,7 +114,7 @@ def fuse(
         raise InputError(f"fuse: scene {scene.name} has no views left")
     chosen = _choose(len(scene.views), config.views)
     clock = _Clock()
-    settings = {"fuse": asdict(config), **teacher.settings(), "views": list(chosen)}
+    settings = {"fuse": asdict(config), "teacher": teacher.settings(), "views": list(chosen)}
     kept = PartialFusion(work, settings) if work is not None else None
     maps = _Maps(teacher, scene.views, kept, clock)
     basis, mean, truncation = _find_basis(maps, chosen, config, clock, track)

@@ -4,7 +4,6 @@ Arrays are safetensors files, memory-mapped on load; features are float16 for se
 localisation needs: no photographs, no teacher.
 """
 
-import hashlib
 import json
 import os
 import time
@@ -14,19 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
 from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
 
 VERSION = 1
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
-
-
-def fingerprint(gaussians: Gaussians) -> str:
-    """Names a splat by its contents: features belong to exactly one."""
-    digest = hashlib.sha256()
-    for array in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities):
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()[:32]
 
 
 def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settings: dict[str, Any]) -> None:

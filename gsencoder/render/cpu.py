@@ -14,6 +14,9 @@ from gsencoder.types import Gaussians
 _ENTRIES = 48
 """Room for so many entries a row is set aside; memory that is not touched costs nothing."""
 
+_SCRATCH_KEPT = 1 << 24
+"""Rooms of up to so many entries (200 MB) are kept for the next call."""
+
 
 @kernel
 @no_type_check
@@ -217,6 +220,24 @@ def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, row
     return rows[:count], cols[:count], weights[:count]
 
 
+_free_scratch: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+
+def _take_scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Room for entries, used again from call to call: filling fresh pages costs more than the compositing.
+
+    Taking from the list and giving back are each one step, so that concurrent callers never share a room; what does
+    not fit grows inside the kernel.
+    """
+    try:
+        scratch = _free_scratch.pop()
+    except IndexError:
+        scratch = None
+    if scratch is None or len(scratch[0]) < entries:
+        return np.empty(entries, np.int32), np.empty(entries, np.int32), np.empty(entries, np.float32)
+    return scratch
+
+
 @kernel
 @no_type_check
 def _count(rows, crow):
@@ -264,10 +285,8 @@ def blend_weights(
     starts, members = _bin_tiles(*gaussians[:4], order, tile, tiles_x, tiles_y)
     shape = (lattice.height, lattice.width, lattice.side, tile, tiles_x)
     cuts = even_cuts(starts)
-    # Room for the entries is taken from numpy in one block, which the kernel of the operating system backs with
-    # huge pages: fresh small pages cost more than the compositing. What does not fit grows inside the kernel.
     room = np.concatenate(([0], np.cumsum(_ENTRIES * (tile // lattice.side) ** 2 * np.diff(cuts))))
-    scratch = np.empty(room[-1], np.int32), np.empty(room[-1], np.int32), np.empty(room[-1], np.float32)
+    scratch = _take_scratch(int(room[-1]))
 
     def work(piece: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         space = (part[room[piece] : room[piece + 1]] for part in scratch)
@@ -282,4 +301,6 @@ def blend_weights(
     cols, weights = np.empty(crow[-1], np.int32), np.empty(crow[-1], np.float32)
     # A row belongs to one tile, a tile to one piece: the pieces write to disjoint places.
     parallel(lambda piece: _scatter(*pieces[piece], index, where, cols, weights), range(PIECES))
+    if len(scratch[0]) <= _SCRATCH_KEPT:
+        _free_scratch.append(scratch)
     return crow, cols, weights

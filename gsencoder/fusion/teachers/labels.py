@@ -2,13 +2,25 @@
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.errors import InputError
 from gsencoder.types import FeatureMap, FeatureSpace, SceneObject, Views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LabelsConfig:
+    """Settings of the labels teacher."""
+
+    name: Literal["labels"] = "labels"
+    words: str = field(
+        default="clip_vitb32_names.npz",
+        metadata={"help": "text table of the names; a bare name is also looked for in GSENCODER_MODELS"},
+    )
 
 
 class LabelsTeacher:
@@ -26,7 +38,8 @@ class LabelsTeacher:
         objects: Sequence[SceneObject],
         names: Sequence[str],
         embeddings: Float32[np.ndarray, "C D"],
-        space: FeatureSpace,
+        *,
+        text_encoder: str,
     ) -> None:
         """Makes the scene's table.
 
@@ -34,7 +47,7 @@ class LabelsTeacher:
             objects: which instance value has which name.
             names: the words of the table.
             embeddings: their unit vectors.
-            space: what these are.
+            text_encoder: what made these.
 
         Raises:
             InputError: no objects, or a name that the table lacks.
@@ -51,7 +64,9 @@ class LabelsTeacher:
         self.names = ("other", *used)
         self.table = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)
         self.mean = mean.astype(np.float32)
-        self.space = space
+        self.space = FeatureSpace(
+            name=f"labels-{text_encoder}", channels=embeddings.shape[1], teacher="labels", text_encoder=text_encoder
+        )
         self._code = {o.id: self.names.index(o.name) for o in objects if o.name is not None}
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
@@ -74,4 +89,4 @@ class LabelsTeacher:
 
     def settings(self) -> dict[str, Any]:
         digest = hashlib.sha256(self.table.tobytes() + repr(sorted(self._code.items())).encode()).hexdigest()[:16]
-        return {"teacher": "labels", "table": digest}
+        return {"name": "labels", "table": digest}

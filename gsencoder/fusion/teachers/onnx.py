@@ -3,7 +3,6 @@
 import hashlib
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,16 +10,18 @@ import numpy as np
 from jaxtyping import Float32
 from PIL import Image
 
+from gsencoder.data.model_files import find_file
 from gsencoder.errors import InputError
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OnnxTeacherConfig:
+class OnnxConfig:
     """How to feed a dense ONNX backbone and read its output."""
 
-    model: str = field(default="", metadata={"help": "path of the .onnx file"})
-    name: str = field(default="", metadata={"help": "short name of its feature space"})
+    name: Literal["onnx"] = "onnx"
+    model: str = field(default="", metadata={"help": "the .onnx file; a bare name is also looked for in GSENCODER_MODELS"})
+    space: str = field(default="", metadata={"help": "short name of its feature space; empty = the file's name"})
     input: str = field(default="", metadata={"help": "input tensor [B,3,H,W]; empty = the model's first"})
     output: str = field(default="", metadata={"help": "output tensor; empty = the model's first"})
     layout: Literal["tokens", "grid"] = field(
@@ -35,7 +36,7 @@ class OnnxTeacherConfig:
     classes: str = field(default="", metadata={"help": ".npz with class vectors: logits become mixtures of word vectors"})
     top_k: int = field(default=5, metadata={"help": "classes in a mixture"})
     temperature: float = field(default=1.0, metadata={"help": "softmax temperature of the posteriors"})
-    text_encoder: str = field(default="", metadata={"help": "what turns words into this space; empty if nothing does"})
+    words: str = field(default="", metadata={"help": "text table of the space that words are looked up in; empty if none"})
     threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
 
 
@@ -47,8 +48,12 @@ class OnnxTeacher:
     needs_images = True
     cheap = False
 
-    def __init__(self, config: OnnxTeacherConfig) -> None:
+    def __init__(self, config: OnnxConfig, *, text_encoder: str = "") -> None:
         """Reads the model's signature and, for a classifier, the class vectors.
+
+        Args:
+            config: what to run and how.
+            text_encoder: what turns words into this space; empty if nothing does.
 
         Raises:
             InputError: a missing or unreadable model, or names that it does not have.
@@ -56,9 +61,9 @@ class OnnxTeacher:
         import onnxruntime
 
         self.config = config
-        path = Path(config.model)
-        if not path.is_file():
-            raise InputError(f"teacher onnx: no model at {path}; set teacher.model to an .onnx file")
+        if not config.model:
+            raise InputError("teacher onnx: teacher.model= is missing: the .onnx file of the backbone")
+        path = find_file(config.model, "teacher.model")
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
         if config.threads:
@@ -75,7 +80,8 @@ class OnnxTeacher:
                 f"teacher onnx: {path.name} has inputs {inputs} and outputs {outputs}, "
                 f"not {self._input!r} and {self._output!r}"
             )
-        self._classes = _load_classes(Path(config.classes)) if config.classes else None
+        self._digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        self._classes = _load_classes(find_file(config.classes, "teacher.classes")) if config.classes else None
         shape = self._session.get_outputs()[outputs.index(self._output)].shape
         channels = shape[-1] if config.layout == "tokens" else shape[1]
         if self._classes is not None:
@@ -83,18 +89,14 @@ class OnnxTeacher:
         if not isinstance(channels, int):
             channels = self._probe()
         self.space = FeatureSpace(
-            name=config.name or path.stem,
+            name=config.space or path.stem,
             channels=channels,
             teacher="onnx",
-            weights=self._fingerprint,
+            weights=self._digest,
             layer=self._output + (f", top {config.top_k} classes as words" if config.classes else ""),
             preprocessing=f"resized to {config.size} px in multiples of {config.patch}",
-            text_encoder=config.text_encoder,
+            text_encoder=text_encoder,
         )
-
-    @cached_property
-    def _fingerprint(self) -> str:
-        return hashlib.sha256(Path(self.config.model).read_bytes()).hexdigest()[:16]
 
     def _probe(self) -> int:
         side = self.config.patch * 2
@@ -161,10 +163,10 @@ class OnnxTeacher:
 
     def settings(self) -> dict[str, Any]:
         values = {name: getattr(self.config, name) for name in self.config.__dataclass_fields__}
-        del values["threads"]
-        values["model"] = self._fingerprint
+        del values["threads"], values["words"]
+        values["model"] = self._digest
         values["classes"] = Path(self.config.classes).name
-        return {"teacher": "onnx", **{k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}}
+        return {**{k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}}
 
 
 def _load_classes(path: Path) -> Float32[np.ndarray, "classes D"]:

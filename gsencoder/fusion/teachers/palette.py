@@ -1,6 +1,7 @@
 """The `palette` teacher: photographs as shares of eleven colour names. Works offline on anything that has a picture."""
 
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -26,6 +27,21 @@ _PROTOTYPES: dict[str, tuple[tuple[int, int, int], ...]] = {
 COLOUR_NAMES = tuple(_PROTOTYPES)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaletteConfig:
+    """Settings of the palette teacher."""
+
+    name: Literal["palette"] = "palette"
+    cell: int = field(default=2, metadata={"help": "pixels along the side of a cell, averaged before naming"})
+    softness: float = field(default=12.0, metadata={"help": "L*a*b* distance over which one name gives way to another"})
+
+    def __post_init__(self) -> None:
+        if self.cell < 1:
+            raise InputError(f"cell: expected at least 1 pixel, got {self.cell}")
+        if not self.softness > 0:
+            raise InputError(f"softness: expected a number above 0, got {self.softness}")
+
+
 def lab_from_rgb(rgb: UInt8[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
     """CIE L*a*b* (D65) of 8-bit sRGB; distances in it roughly match what people see (L* from 0 to 100)."""
     c = np.arange(256, dtype=np.float64) / 255
@@ -48,19 +64,9 @@ class PaletteTeacher:
     needs_images = True
     cheap = True
 
-    def __init__(self, *, cell: int = 2, softness: float = 12.0) -> None:
-        """Chooses the grid.
-
-        Args:
-            cell: pixels along the side of a cell, averaged before naming.
-            softness: L*a*b* distance over which one name gives way to another.
-
-        Raises:
-            InputError: knobs out of range.
-        """
-        if cell < 1 or not softness > 0:
-            raise InputError(f"teacher palette: expected cell ≥ 1 and softness > 0, got {cell} and {softness}")
-        self.cell, self.softness = cell, softness
+    def __init__(self, config: PaletteConfig = PaletteConfig()) -> None:  # noqa: B008 - frozen
+        """Prepares the prototypes of each name."""
+        self.cell, self.softness = cell, softness = config.cell, config.softness
         self.space = FeatureSpace(
             name="palette-11",
             channels=len(COLOUR_NAMES),
@@ -102,4 +108,4 @@ class PaletteTeacher:
         return (score / score.sum(axis=1, keepdims=True)).astype(np.float32)
 
     def settings(self) -> dict[str, Any]:
-        return {"teacher": "palette", "cell": self.cell, "softness": self.softness}
+        return {"name": "palette", "cell": self.cell, "softness": self.softness}
