@@ -94,10 +94,14 @@ def project(
     Gaussian just beside the camera covers the whole image. `eps2d` pixels² are added to both variances.
 
     Args:
-        means, quats, scales, opacities: N Gaussians, world units.
+        means: centres, world units.
+        quats: rotations wxyz, normalised here.
+        scales: standard deviations, world units.
+        opacities: in [0, 1].
         cam_from_world: rigid.
         K: intrinsics in pixels.
-        width, height: image size in pixels.
+        width: image width in pixels.
+        height: image height in pixels.
         eps2d: low-pass variance in pixels².
         near: smallest depth, world units.
     """

@@ -135,7 +135,9 @@ class Cameras:
         rigid = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2), initial=0) <= UNIT_TOLERANCE
         rigid &= np.linalg.det(r) > 0
         rigid &= (self.cam_from_world[:, 3] == np.array([0, 0, 0, 1], np.float32)).all(axis=1)
-        _check_rows("Cameras", "cam_from_world", rigid, "rigid transforms (orthonormal, right-handed)", self.cam_from_world)
+        _check_rows(
+            "Cameras", "cam_from_world", rigid, "rigid transforms (orthonormal, right-handed)", self.cam_from_world
+        )
         pinhole = (self.Ks[:, 0, 0] > 0) & (self.Ks[:, 1, 1] > 0) & (self.Ks[:, 2] == np.array([0, 0, 1])).all(axis=1)
         pinhole &= (self.Ks[:, 1, 0] == 0) & (self.Ks[:, 0, 1] == 0)
         _check_rows("Cameras", "Ks", pinhole, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0", self.Ks)
@@ -246,7 +248,9 @@ class FeatureMap:
     def __post_init__(self) -> None:
         dense, coded = self.features is not None, self.codes is not None and self.table is not None
         if dense == coded:
-            _fail("FeatureMap", "features", "either features, or codes with their table", "both" if dense else "neither")
+            _fail(
+                "FeatureMap", "features", "either features, or codes with their table", "both" if dense else "neither"
+            )
         rows = self.features if dense else self.table
         assert rows is not None
         if rows.shape[-1] != self.space.channels:

@@ -6,7 +6,12 @@ from gsencoder.types import Cameras, Gaussians
 
 
 def random_gaussians(
-    n: int = 300, seed: int = 0, *, center: tuple[float, float, float] = (0, 0, 3), log_scale: float = -2.5, degree: int = 0
+    n: int = 300,
+    seed: int = 0,
+    *,
+    center: tuple[float, float, float] = (0, 0, 3),
+    log_scale: float = -2.5,
+    degree: int = 0,
 ) -> Gaussians:
     """A ball of Gaussians in front of `front_camera`."""
     rng = np.random.default_rng(seed)

@@ -123,13 +123,17 @@ def test_spherical_harmonics_are_orthonormal_on_the_sphere() -> None:
     ).reshape(-1, 3)
     basis = sh_basis(torch.from_numpy(directions), 3)
     weights = torch.from_numpy(np.repeat(weight, 16) * 2 * math.pi / 16)
-    torch.testing.assert_close(basis.T @ (weights[:, None] * basis), torch.eye(16, dtype=torch.float64), atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        basis.T @ (weights[:, None] * basis), torch.eye(16, dtype=torch.float64), atol=1e-12, rtol=0
+    )
 
 
 def test_colours_survive_the_round_trip_through_degree_zero() -> None:
     colors = torch.rand(30, 3, dtype=torch.float64)
     means = torch.randn(30, 3, dtype=torch.float64)
-    torch.testing.assert_close(colors_from_sh(sh_from_colors(colors), means, torch.ones(3, dtype=torch.float64)), colors)
+    torch.testing.assert_close(
+        colors_from_sh(sh_from_colors(colors), means, torch.ones(3, dtype=torch.float64)), colors
+    )
 
 
 def test_a_gaussian_at_the_camera_centre_has_a_finite_colour() -> None:

@@ -31,6 +31,8 @@ class Command:
 COMMANDS = {
     command.name: command
     for command in (
+        Command(name="fuse", config="FuseCommandConfig", help="per-Gaussian features from a teacher's maps"),
+        Command(name="localize", config="LocalizeCommandConfig", help="boxes, scores and pictures for words"),
         Command(name="inspect", config="InspectConfig", help="what is in a splat file, and what is wrong with it"),
         Command(name="repair", config="RepairConfig", help="mend a splat file, and say what was changed"),
     )

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,23 +36,22 @@ FEW_CAMERAS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneConfig:
-    """How a scene is read.
+    """How a scene is read."""
 
-    Attributes:
-        allow_outside: let paths in a scene's files lead out of its folder.
-        max_views: 0 = all, else at most this many, evenly spaced in the order of the files.
-        depth_scale: world units for each step of a depth file; None = what the format says (mostly millimetres).
-        image_scale: in (0, 1]; pictures, depth, masks and intrinsics are made smaller by it.
-        metres_per_unit: None = what the files say.
-        images: folder of the photographs of a COLMAP model; empty = `images` beside it.
-    """
-
-    allow_outside: bool = False
-    max_views: int = 0
-    depth_scale: float | None = None
-    image_scale: float = 1.0
-    metres_per_unit: float | None = None
-    images: str = ""
+    allow_outside: bool = field(
+        default=False, metadata={"help": "let paths in a scene's files lead out of its folder"}
+    )
+    max_views: int = field(default=0, metadata={"help": "at most so many views, evenly spaced; 0 = all"})
+    depth_scale: float | None = field(
+        default=None, metadata={"help": "world units for each step of a depth file; empty = what the format says"}
+    )
+    image_scale: float = field(
+        default=1.0, metadata={"help": "pictures, depth, masks and intrinsics are made smaller by this, in (0, 1]"}
+    )
+    metres_per_unit: float | None = field(default=None, metadata={"help": "unit of length; empty = what the files say"})
+    images: str = field(
+        default="", metadata={"help": "folder of the photographs of a COLMAP model; empty = images beside it"}
+    )
 
     def __post_init__(self) -> None:
         if self.max_views < 0:

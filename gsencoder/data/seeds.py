@@ -7,7 +7,7 @@ that the photographs show. Such a splat renders well enough for features to be l
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -35,25 +35,26 @@ SAMPLED_VIEWS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeedConfig:
-    """How Gaussians are made from what a scene holds.
+    """How Gaussians are made from what a scene holds."""
 
-    Attributes:
-        source: depth = RGB-D frames; points = structure-from-motion points; mesh = a file; tsdf = RGB-D frames fused
-            to a mesh first; auto = depth if the views have it, else points.
-        voxel: edge of the grid in metres.
-        voxel_units: edge of the grid in the scene's own units, where its unit is unknown; None = `voxel`, or an
-            estimate with a warning.
-        mesh: the file of source=mesh, in world coordinates.
-        min_cos: surfaces seen at a slant beyond arccos(min_cos) are not taken from a depth image.
-        max_depth: depths beyond, in metres (scene units where those are unknown), are not used; None = all.
-    """
-
-    source: Literal["auto", "depth", "points", "mesh", "tsdf"] = "auto"
-    voxel: float = 0.02
-    voxel_units: float | None = None
-    mesh: str = ""
-    min_cos: float = 0.1
-    max_depth: float | None = None
+    source: Literal["auto", "depth", "points", "mesh", "tsdf"] = field(
+        default="auto",
+        metadata={
+            "help": "depth = RGB-D frames; points = structure-from-motion points; mesh = a file; tsdf = RGB-D frames "
+            "fused to a mesh first; auto = depth if the views have it, else points"
+        },
+    )
+    voxel: float = field(default=0.02, metadata={"help": "edge of the grid in metres"})
+    voxel_units: float | None = field(
+        default=None, metadata={"help": "edge of the grid in the scene's own units, where its unit is unknown"}
+    )
+    mesh: str = field(default="", metadata={"help": "the file of source=mesh, in world coordinates"})
+    min_cos: float = field(
+        default=0.1, metadata={"help": "surfaces seen at a slant beyond arccos(min_cos) are not taken from depth"}
+    )
+    max_depth: float | None = field(
+        default=None, metadata={"help": "depths beyond, in metres (scene units where unknown), are not used"}
+    )
 
     def __post_init__(self) -> None:
         if self.source not in ("auto", "depth", "points", "mesh", "tsdf"):

@@ -22,6 +22,8 @@ SMOOTHING_RADIUS = 2
 """Half width in pixels of the window over which inverse depth is averaged."""
 BETWEEN = 0.3
 """A pixel floats between two surfaces if the steps beyond its neighbours are below this share of those towards them."""
+OCCLUSION = 0.01
+"""A pixel lies behind its neighbour's outline if that is nearer by this share of its depth, 15 mm at 1.5 m."""
 
 
 class SurfacePixels(NamedTuple):
@@ -43,9 +45,9 @@ def surface_pixels(
 ) -> SurfacePixels:
     """Smooths a depth image within its own noise, finds normals, and drops pixels that lie on no surface.
 
-    Dropped are pixels without depth, pixels that lie between the two surfaces at a depth edge (sensors mix both
-    there), and surfaces seen at a slant beyond arccos(min_cos). A silhouette pixel that continues the surface beside
-    it is kept, and so is one that lies in front of both neighbours: thin things consist of such pixels.
+    Dropped are pixels without depth; pixels that lie between the two surfaces at a depth edge, since sensors mix both
+    there; pixels just behind an outline, whose colour is mixed with the nearer thing's; and surfaces seen at a slant
+    beyond arccos(min_cos). The nearer side of an edge is kept: thin things consist of such pixels.
     """
     valid = depth > 0
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=valid)
@@ -148,7 +150,7 @@ def _smooth(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> np.ndar
 
 
 def _gradient(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient along the rows, [H, W], and the pixels that float between two surfaces.
+    """Gradient along the rows, [H, W], and the pixels that float between two surfaces or show beside a nearer one.
 
     Central where the three pixels lie on a line within `step`; at an edge the smaller one-sided step, which stays on
     the pixel's own surface; zero where the pixel is a peak between two edges.
@@ -170,7 +172,11 @@ def _gradient(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> tuple
     flatter = (
         np.maximum(np.hstack([none, size_before[:, :-1]]), np.hstack([size_after[:, 1:], none])) < BETWEEN * smaller
     )
-    return gradient, both & (before * after > 0) & (smaller > step) & flatter
+    between = both & (before * after > 0) & (smaller > step) & flatter
+    # How much nearer the neighbour is, beyond what the pixel's own surface explains by its slope on the other side.
+    edge = np.maximum(step, np.float32(OCCLUSION) * inverse)
+    behind = both & ((np.maximum(after, -before) > edge + 3 * smaller) | ((after > edge) & (-before > edge)))
+    return gradient, between | behind
 
 
 def _rays(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -85,7 +85,7 @@ def _silent(items: Iterable[int], label: str) -> Iterable[int]:  # noqa: ARG001
 def fuse(
     scene: Scene,
     teacher: Teacher,
-    config: FuseConfig = FuseConfig(),  # noqa: B008 - frozen
+    config: FuseConfig = FuseConfig(),
     *,
     work: Path | None = None,
     track: Track = _silent,
@@ -191,7 +191,8 @@ def _vectors(feature_map: FeatureMap) -> Float32[np.ndarray, "P D"]:
     """A map as rows; cells of code −1 are NaN."""
     if feature_map.features is not None:
         return feature_map.features.reshape(-1, feature_map.space.channels)
-    assert feature_map.codes is not None and feature_map.table is not None
+    assert feature_map.codes is not None
+    assert feature_map.table is not None
     codes = feature_map.codes.ravel()
     return np.where((codes >= 0)[:, None], feature_map.table[codes], np.float32(np.nan))
 
@@ -210,7 +211,8 @@ class _Sums:
     ) -> None:
         self.basis, self.table = basis, table
         # numpy, not torch, allocates what is large: its arrays lie in huge pages, which fill many times faster.
-        self.sums: Float32[np.ndarray, "N columns"] = np.zeros((gaussians, columns if table is None else len(table)), np.float32)
+        width = columns if table is None else len(table)
+        self.sums: Float32[np.ndarray, "N columns"] = np.zeros((gaussians, width), np.float32)
         self.weights: Float32[np.ndarray, " N"] = np.zeros(gaussians, np.float32)
 
     def restore(self, kept: PartialFusion | None) -> int:
@@ -256,7 +258,13 @@ class _Sums:
 
 
 def _lift_view(
-    gaussians: Gaussians, views: Views, view: int, feature_map: FeatureMap, sums: _Sums, config: FuseConfig, clock: _Clock
+    gaussians: Gaussians,
+    views: Views,
+    view: int,
+    feature_map: FeatureMap,
+    sums: _Sums,
+    config: FuseConfig,
+    clock: _Clock,
 ) -> None:
     if config.lift == "center":
         with clock("blend"):
@@ -325,5 +333,11 @@ def _center_matrix(
     order = np.argsort(cell, kind="stable")
     crow = np.concatenate(([0], np.bincount(cell, minlength=feature_map.height * feature_map.width).cumsum()))
     lattice = grid_lattice(affine, feature_map.width, feature_map.height, 1)
-    parts: Any = (crow.astype(np.int64), rows[order].astype(np.int32), np.ones(len(rows), np.float32), z.astype(np.float32))
-    return Blend(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts), lattice, config.blend)
+    return Blend(
+        torch.from_numpy(crow.astype(np.int64)),
+        torch.from_numpy(rows[order].astype(np.int32)),
+        torch.ones(len(rows)),
+        torch.from_numpy(z.copy()),
+        lattice,
+        config.blend,
+    )

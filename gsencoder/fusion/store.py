@@ -44,7 +44,8 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
     rows = np.flatnonzero(features.weights > 0)
     kept = features.features[rows]
     if not np.isfinite(kept).all():
-        raise InputError(f"save_features: {int((~np.isfinite(kept).all(axis=1)).sum())} of {len(rows)} rows are not finite")
+        bad = int((~np.isfinite(kept).all(axis=1)).sum())
+        raise InputError(f"save_features: {bad} of {len(rows)} rows are not finite")
     largest = np.abs(kept).max(axis=0, initial=0)
     channel_scale = np.where(largest > 0, largest, 1).astype(np.float32)
     arrays = {
@@ -75,7 +76,7 @@ def load_features(folder: Path) -> Scene:
     if "views" in header:
         names = ("cam_from_world", "Ks", "widths", "heights")
         views = Views(cameras=Cameras(**{name: arrays[name] for name in names}), names=tuple(header["views"]))
-    features, settings = _load_rows(folder, gaussians)
+    features = _load_rows(folder, gaussians)
     return Scene(
         name=header["name"],
         gaussians=gaussians,
@@ -92,7 +93,7 @@ def load_settings(folder: Path) -> dict[str, Any]:
     return _load(folder / FEATURES_FILE)[1]["settings"]
 
 
-def _load_rows(folder: Path, gaussians: Gaussians) -> tuple[GaussianFeatures, dict[str, Any]]:
+def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:
     arrays, header = _load(folder / FEATURES_FILE)
     if header["fingerprint"] != fingerprint(gaussians):
         raise InputError(
@@ -112,8 +113,7 @@ def _load_rows(folder: Path, gaussians: Gaussians) -> tuple[GaussianFeatures, di
         basis = FeatureBasis(
             mean=arrays["mean"], components=arrays["components"], energy_kept=header["energy_kept"], space=space
         )
-    features = GaussianFeatures(features=values, weights=weights, mean=arrays["mean"], space=space, basis=basis)
-    return features, header["settings"]
+    return GaussianFeatures(features=values, weights=weights, mean=arrays["mean"], space=space, basis=basis)
 
 
 def _space_to_json(space: FeatureSpace) -> dict[str, Any]:
@@ -167,7 +167,8 @@ class PartialFusion:
         if path.is_file():
             found = json.loads(path.read_text())
             if found != settings:
-                raise InputError(f"{folder}: holds a fusion begun with {_difference(found, settings)}; delete it to start anew")
+                difference = _difference(found, settings)
+                raise InputError(f"{folder}: holds a fusion begun with {difference}; delete it to start anew")
         else:
             folder.mkdir(parents=True, exist_ok=True)
             temporary = path.with_suffix(".tmp")

@@ -40,14 +40,19 @@ def _near(z: np.ndarray, low: np.ndarray, high: np.ndarray, config: VisibilityCo
 
 
 def visible_points(
-    z: Float32[np.ndarray, " n"], pixels: Int64[np.ndarray, "n 2"], depth: Float32[np.ndarray, "H W"], config: VisibilityConfig
+    z: Float32[np.ndarray, " n"],
+    pixels: Int64[np.ndarray, "n 2"],
+    depth: Float32[np.ndarray, "H W"],
+    config: VisibilityConfig,
 ) -> Bool[np.ndarray, " n"]:
     """Tests Gaussians' centres at their own pixel (x, y), which must lie inside the map."""
     d = depth[pixels[:, 1], pixels[:, 0]]
     return _near(z, d, d, config)
 
 
-def visible_entries(b: Blend, depth: Float32[np.ndarray, "H W"], config: VisibilityConfig) -> Bool[torch.Tensor, " nnz"]:
+def visible_entries(
+    b: Blend, depth: Float32[np.ndarray, "H W"], config: VisibilityConfig
+) -> Bool[torch.Tensor, " nnz"]:
     """Tests each entry of B against the depths that its row's rays meet, from the nearest to the farthest of them."""
     low, high = _row_range(depth, b.lattice)
     row = torch.repeat_interleave(torch.arange(b.rows), b.crow.diff()).numpy()

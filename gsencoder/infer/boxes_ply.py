@@ -7,7 +7,7 @@ from jaxtyping import Float64, UInt8
 
 from gsencoder.data.atomic import atomic_file
 from gsencoder.errors import InputError
-from gsencoder.types import Box, Gaussians, Localization
+from gsencoder.types import Box, Localization, Scene
 
 EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1], np.int32)
 """The 12 edges of a box whose corner k lies at the upper end of axis d where bit d of k is set."""
@@ -34,9 +34,8 @@ def box_corners(box: Box, *, oriented: bool = True) -> Float64[np.ndarray, "8 3"
 
 def write_boxes_ply(
     path: str | Path,
+    scene: Scene,
     localization: Localization,
-    gaussians: Gaussians,
-    origin: Float64[np.ndarray, "3"],
     *,
     oriented: bool = False,
 ) -> None:
@@ -47,27 +46,27 @@ def write_boxes_ply(
 
     Args:
         path: a .ply file.
-        localization: what was found.
-        gaussians: the scene's.
-        origin: the scene's, which the Gaussians are relative to.
+        scene: its Gaussians and origin.
+        localization: what was found in it.
         oriented: draw the oriented boxes, not the axis-aligned ones.
 
     Raises:
-        InputError: rows that the splat does not have, or a file that cannot be written.
+        InputError: a scene without Gaussians or with fewer than the boxes name, or a file that cannot be written.
     """
+    means = np.zeros((0, 3), np.float32) if scene.gaussians is None else scene.gaussians.means
     points: list[np.ndarray] = []
     colors: list[np.ndarray] = []
     edges: list[np.ndarray] = []
     count = 0
     steps = np.linspace(0, 1, POINTS_ON_EDGE)[1:-1, None]
     for box in localization.boxes:
-        if box.rows.size and int(box.rows.max()) >= len(gaussians):
+        if box.rows.size and int(box.rows.max()) >= len(means):
             raise InputError(
-                f"write_boxes_ply: box of {box.query!r} has row {box.rows.max()} of {len(gaussians)} Gaussians"
+                f"write_boxes_ply: box of {box.query!r} has row {box.rows.max()} of {len(means)} Gaussians"
             )
         corners = box_corners(box, oriented=oriented)
         lines = [corners[a] + steps * (corners[b] - corners[a]) for a, b in EDGES]
-        inside = gaussians.means[box.rows].astype(np.float64) + origin
+        inside = means[box.rows].astype(np.float64) + scene.origin
         part = np.concatenate([corners, *lines, inside])
         points.append(part)
         shade = 1.0 if box.rank == 0 else 0.6

@@ -24,7 +24,10 @@ class LocalizeConfig:
         default="centred", metadata={"help": "cosines after removing each side's mean, or as they are"}
     )
     contrast: bool = field(
-        default=False, metadata={"help": "score against the negative and the other asked words (LERF), not by cosine"}
+        default=False,
+        metadata={
+            "help": "score against negative and other asked words (LERF), not by cosine; set threshold.fixed=0.9"
+        },
     )
     negatives: tuple[str, ...] = field(
         default=("object", "things", "stuff", "texture"), metadata={"help": "negative words for contrast"}

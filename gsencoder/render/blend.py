@@ -96,8 +96,9 @@ class Blend:
         if self.weight.device.type == "cpu":
             from gsencoder.render import products
 
-            parts = products.transpose(self.crow.numpy(), self.col.numpy(), self.weight.numpy(), self.gaussians)
-            return tuple(torch.from_numpy(part) for part in parts)  # type: ignore[return-value]
+            arrays = (self.crow.numpy(), self.col.numpy(), self.weight.numpy())
+            columns, crow, row, weight = map(torch.from_numpy, products.transpose(*arrays, self.gaussians))
+            return columns, crow, row, weight
         return reference.transpose(self.crow, self.col, self.weight)
 
     @property
@@ -193,7 +194,7 @@ class _Render(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         return _Lift.apply(grad, ctx.blend), None
 
 
@@ -206,7 +207,7 @@ class _Lift(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         return _Render.apply(grad, ctx.blend), None
 
 
@@ -217,7 +218,7 @@ def blend(
     *,
     patch: int | None = None,
     like: FeatureMap | None = None,
-    config: BlendConfig = BlendConfig(),  # noqa: B008 - frozen
+    config: BlendConfig = BlendConfig(),
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Blend:
@@ -261,11 +262,21 @@ def blend(
 def _project(
     gaussians: Gaussians, cameras: Cameras, view: int, config: BlendConfig, device: Any, dtype: torch.dtype
 ) -> geometry.Projected:
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    arrays += (cameras.cam_from_world[view], cameras.Ks[view])
-    tensors = [torch.as_tensor(array, device=device).to(dtype) for array in arrays]
-    width, height = int(cameras.widths[view]), int(cameras.heights[view])
-    return geometry.project(*tensors, width, height, eps2d=config.eps2d, near=config.near)
+    def tensor(array: np.ndarray) -> Tensor:
+        return torch.as_tensor(array, device=device).to(dtype)
+
+    return geometry.project(
+        tensor(gaussians.means),
+        tensor(gaussians.quats),
+        tensor(gaussians.scales),
+        tensor(gaussians.opacities),
+        tensor(cameras.cam_from_world[view]),
+        tensor(cameras.Ks[view]),
+        int(cameras.widths[view]),
+        int(cameras.heights[view]),
+        eps2d=config.eps2d,
+        near=config.near,
+    )
 
 
 def _blend_cpu(gaussians: Gaussians, cameras: Cameras, view: int, lattice: Lattice, config: BlendConfig) -> Blend:
@@ -275,7 +286,8 @@ def _blend_cpu(gaussians: Gaussians, cameras: Cameras, view: int, lattice: Latti
     projected, index = cpu.project(
         gaussians, cameras.cam_from_world[view], cameras.Ks[view], *size, eps2d=config.eps2d, near=config.near
     )
-    parts = cpu.blend_weights(lattice, projected, index, stop=config.stop_transmittance, keep=config.min_weight)
+    keep, stop = config.min_weight, config.stop_transmittance
+    crow, col, weight = map(torch.from_numpy, cpu.blend_weights(lattice, projected, index, stop=stop, keep=keep))
     depths = np.zeros(len(gaussians), np.float32)
     depths[index] = projected[9]
-    return Blend(*(torch.from_numpy(part) for part in parts), torch.from_numpy(depths), lattice, config)
+    return Blend(crow, col, weight, torch.from_numpy(depths), lattice, config)

@@ -37,7 +37,8 @@ def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d,
         y = pose[1, 0] * mx + pose[1, 1] * my + pose[1, 2] * mz + pose[1, 3]
         tx = min(max(x / z, -(cx / fx + slack_x)), (width - cx) / fx + slack_x)
         ty = min(max(y / z, -(cy / fy + slack_y)), (height - cy) / fy + slack_y)
-        w, qx, qy, qz = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        w, qx = np.float64(quats[i, 0]), np.float64(quats[i, 1])
+        qy, qz = np.float64(quats[i, 2]), np.float64(quats[i, 3])
         n = 1.0 / math.sqrt(w * w + qx * qx + qy * qy + qz * qz + 1e-24)
         w, qx, qy, qz = w * n, qx * n, qy * n, qz * n
         for k in range(3):
@@ -267,8 +268,10 @@ def blend_weights(
 
     Args:
         lattice: where the rays are.
-        projected, index: from `project`.
-        stop: transmittance at which a ray ends. keep: smallest weight stored.
+        projected: Gaussians on the image plane, from `project`.
+        index: which columns of B they are.
+        stop: transmittance at which a ray ends.
+        keep: smallest weight stored.
     """
     # In lattice units the rays lie on whole numbers, whatever the grid.
     gaussians = projected.copy()

@@ -60,14 +60,13 @@ def patch_lattice(width: int, height: int, patch: int, rays_per_patch: int) -> L
     return grid_lattice(grid_from_image, math.ceil(width / patch), math.ceil(height / patch), rays_per_patch)
 
 
-def grid_lattice(
-    grid_from_image: Float64[np.ndarray, "2 3"], width: int, height: int, rays_per_patch: int
-) -> Lattice:
+def grid_lattice(grid_from_image: Float64[np.ndarray, "2 3"], width: int, height: int, rays_per_patch: int) -> Lattice:
     """Rays for any grid that is a resize and crop of the image.
 
     Args:
         grid_from_image: diagonal affine from pixel to grid coordinates; cell (r, c) covers [c, c+1) × [r, r+1).
-        width, height: cells of the grid.
+        width: cells in a line of the grid.
+        height: lines of the grid.
         rays_per_patch: 1, 4, 9, 16, …
 
     Raises:
@@ -78,6 +77,4 @@ def grid_lattice(
         raise InputError(f"rays_per_patch: expected a square number (1, 4, 9, 16, …), got {rays_per_patch}")
     (ax, _, bx), (_, ay, by) = grid_from_image.tolist()
     dx, dy = 1 / (ax * side), 1 / (ay * side)
-    return Lattice(
-        height=height, width=width, side=side, x0=-bx / ax + dx / 2, y0=-by / ay + dy / 2, dx=dx, dy=dy
-    )
+    return Lattice(height=height, width=width, side=side, x0=-bx / ax + dx / 2, y0=-by / ay + dy / 2, dx=dx, dy=dy)

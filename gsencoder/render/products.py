@@ -3,7 +3,6 @@
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int32, Int64
 
 from gsencoder.render.threads import PIECES, even_cuts, kernel, parallel
 

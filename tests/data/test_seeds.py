@@ -117,7 +117,7 @@ class TestDepth:
         view = camera()
         g = seed_from_depth(frames((view, plane_depth(view, (0, 0, 1.0), 1.5))), voxel=0.02)
         inner = (np.abs(g.means[:, :2]) < 0.4).all(axis=1)
-        assert 0.6 * 0.02 < np.median(g.scales[inner, 0]) < 0.8 * 0.02
+        assert 0.5 * 0.02 < np.median(g.scales[inner, 0]) < 0.7 * 0.02
         queries = np.random.default_rng(0).uniform(-0.4, 0.4, (600, 2))
         squares = ((queries[:, None] - g.means[None, :, :2]) ** 2).sum(-1)
         alpha = g.opacities * np.exp(-squares / (2 * g.scales[:, 0] ** 2))
@@ -150,8 +150,15 @@ class TestDepth:
         mixed[60:180, 99] = 1.4  # What a sensor returns across the edge.
         use = surface_pixels(mixed, K).use
         assert not use[61:179, 99].any()
-        assert np.count_nonzero(~use) <= 122
-        assert surface_pixels(depth, K).use.all()
+        # Beside it only the ring of background whose colour the outline is mixed into is left out.
+        ring = np.zeros_like(use)
+        ring[59:181, 98:201] = True
+        ring[60:180, 100:200] = False
+        assert use[~ring].all()
+        clean = surface_pixels(depth, K).use
+        assert clean[60:180, 100:200].all()
+        assert clean[~ring].all()
+        assert not clean[100, [99, 200]].any()
 
     def test_a_wire_of_one_pixel_is_kept(self):
         depth = np.full((240, 320), 2.0, np.float32)

@@ -13,7 +13,9 @@ from gsencoder.types import FeatureSpace
 SPACE = FeatureSpace(name="s", channels=24)
 
 
-def low_rank(rng: np.random.Generator, n: int = 500, rank: int = 5, noise: float = 0.0, mean: float = 0.0) -> np.ndarray:
+def low_rank(
+    rng: np.random.Generator, n: int = 500, rank: int = 5, noise: float = 0.0, mean: float = 0.0
+) -> np.ndarray:
     x = rng.normal(size=(n, rank)) @ rng.normal(size=(rank, 24)) + noise * rng.normal(size=(n, 24)) + mean
     return x.astype(np.float32)
 

@@ -35,7 +35,9 @@ class FixedTeacher:
         if view == self.fail_at:
             raise KeyboardInterrupt
         return FeatureMap(
-            features=self.maps[view], grid_from_image=np.array([[1 / self.stride, 0, 0], [0, 1 / self.stride, 0]]), space=SPACE
+            features=self.maps[view],
+            grid_from_image=np.array([[1 / self.stride, 0, 0], [0, 1 / self.stride, 0]]),
+            space=SPACE,
         )
 
     def settings(self) -> dict[str, Any]:
@@ -140,7 +142,9 @@ def test_cells_without_a_code_give_no_weight(rng: np.random.Generator) -> None:
     codes = np.ones((24, 32), np.int32)
     codes[:, 16:] = -1
     fusion = fuse(scene, CodedTeacher([codes], table), FuseConfig(table_energy=1.0))
-    np.testing.assert_allclose(decoded(fusion)[fusion.features.seen], np.broadcast_to(table[1], (fusion.features.seen.sum(), 6)), atol=1e-5)
+    np.testing.assert_allclose(
+        decoded(fusion)[fusion.features.seen], np.broadcast_to(table[1], (fusion.features.seen.sum(), 6)), atol=1e-5
+    )
     whole = fuse(scene, CodedTeacher([np.ones((24, 32), np.int32)], table))
     assert fusion.features.weights.sum() < 0.8 * whole.features.weights.sum()
 
@@ -175,7 +179,9 @@ def test_the_center_lift_sees_a_hidden_wall_unless_an_occlusion_test_hides_it(ag
     assert fuse(scene, FixedTeacher(maps), tested).features.weights.tolist() == [1, 0]
 
 
-@pytest.mark.parametrize(("relative", "absolute", "passes"), [(0.1, 0.0, True), (0.01, 0.0, False), (0.0, 0.2, True), (0.1, 0.05, False)])
+@pytest.mark.parametrize(
+    ("relative", "absolute", "passes"), [(0.1, 0.0, True), (0.01, 0.0, False), (0.0, 0.2, True), (0.1, 0.05, False)]
+)
 def test_tolerances_combine(relative: float, absolute: float, passes: bool) -> None:
     """The wall is at 2, the sensor says 2.1."""
     depth = np.full((24, 32), 2.1, np.float32)

@@ -8,7 +8,7 @@ from splats import front_camera
 
 from gsencoder.errors import InputError
 from gsencoder.fusion.teachers.labels import LabelsTeacher
-from gsencoder.fusion.teachers.onnx import OnnxTeacher, OnnxConfig
+from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteTeacher, lab_from_rgb
 from gsencoder.types import SceneObject, Views
 
@@ -52,7 +52,8 @@ def test_lab_of_white_black_and_grey_is_neutral() -> None:
 def label_objects() -> tuple[SceneObject, ...]:
     corner = np.zeros(3)
     return tuple(
-        SceneObject(id=i, name=name, aabb_min=corner, aabb_max=corner + 1) for i, name in ((3, "mug"), (5, None), (9, "ball"))
+        SceneObject(id=i, name=name, aabb_min=corner, aabb_max=corner + 1)
+        for i, name in ((3, "mug"), (5, None), (9, "ball"))
     )
 
 
@@ -108,7 +109,14 @@ def write_mean_model(path: Path, patch: int = 4) -> None:
 
 
 def onnx_config(path: Path, **options: object) -> OnnxConfig:
-    values = {"model": str(path), "patch": 4, "size": 32, "skip_tokens": 1, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
+    values = {
+        "model": str(path),
+        "patch": 4,
+        "size": 32,
+        "skip_tokens": 1,
+        "mean": (0.0, 0.0, 0.0),
+        "std": (1.0, 1.0, 1.0),
+    }
     return OnnxConfig(**{**values, **options})  # type: ignore[arg-type]
 
 

@@ -111,7 +111,9 @@ def test_a_grid_that_is_no_whole_ratio_follows_the_affine_of_the_feature_map() -
     g, camera = random_gaussians(300, 2), front_camera()
     space = FeatureSpace(name="s", channels=1)
     like = FeatureMap(
-        features=np.zeros((5, 7, 1), np.float32), grid_from_image=np.array([[7 / 61, 0, 0.1], [0, 5 / 43, -0.2]]), space=space
+        features=np.zeros((5, 7, 1), np.float32),
+        grid_from_image=np.array([[7 / 61, 0, 0.1], [0, 5 / 43, -0.2]]),
+        space=space,
     )
     fast = blend(g, camera, like=like)
     slow = blend(g, camera, like=like, config=BlendConfig(backend="reference"), dtype=torch.float64)
@@ -196,7 +198,9 @@ def test_moving_scene_and_camera_together_changes_nothing() -> None:
     )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ shift
-    seen = Cameras(cam_from_world=pose[None].astype(np.float32), Ks=camera.Ks, widths=camera.widths, heights=camera.heights)
+    seen = Cameras(
+        cam_from_world=pose[None].astype(np.float32), Ks=camera.Ks, widths=camera.widths, heights=camera.heights
+    )
     difference = np.abs(dense(blend(moved, seen)) - dense(blend(g, camera))).max(axis=1)
     assert np.quantile(difference, 0.98) < 1e-4
 
@@ -293,7 +297,9 @@ def test_non_unit_quaternions_within_tolerance_are_normalised_by_both_backends()
 def test_rendering_scales_with_the_values(magnitude: float) -> None:
     b = blend(random_gaussians(100, 2), front_camera())
     values = torch.randn(100, 4)
-    torch.testing.assert_close(b.render(values * magnitude), b.render(values) * magnitude, rtol=1e-4, atol=1e-5 * magnitude)
+    torch.testing.assert_close(
+        b.render(values * magnitude), b.render(values) * magnitude, rtol=1e-4, atol=1e-5 * magnitude
+    )
 
 
 def test_wrong_knobs_and_views_are_refused_by_name() -> None:

@@ -22,6 +22,10 @@ class LabelsConfig:
         metadata={"help": "text table of the names; a bare name is also looked for in GSENCODER_MODELS"},
     )
 
+    def __post_init__(self) -> None:
+        if not self.words:
+            raise InputError("words: the labels teacher needs a text table of its names")
+
 
 class LabelsTeacher:
     """Each pixel has the embedding of its object's name; pixels without a name the normalised mean of the table.

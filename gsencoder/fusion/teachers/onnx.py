@@ -1,4 +1,4 @@
-"""The `onnx` teacher: any dense ONNX backbone, run by onnxruntime; outputs as they are or as mixtures of word vectors."""
+"""The `onnx` teacher: any dense ONNX backbone under onnxruntime, its outputs as they are or as word mixtures."""
 
 import hashlib
 import math
@@ -20,7 +20,7 @@ class OnnxConfig:
     """How to feed a dense ONNX backbone and read its output."""
 
     name: Literal["onnx"] = "onnx"
-    model: str = field(default="", metadata={"help": "the .onnx file; a bare name is also looked for in GSENCODER_MODELS"})
+    model: str = field(default="", metadata={"help": "the .onnx file; also looked for in GSENCODER_MODELS"})
     space: str = field(default="", metadata={"help": "short name of its feature space; empty = the file's name"})
     input: str = field(default="", metadata={"help": "input tensor [B,3,H,W]; empty = the model's first"})
     output: str = field(default="", metadata={"help": "output tensor; empty = the model's first"})
@@ -28,15 +28,15 @@ class OnnxConfig:
         default="tokens", metadata={"help": "output as [B, T, D] tokens or as [B, D, h, w] grid"}
     )
     skip_tokens: int = field(default=0, metadata={"help": "leading tokens that are no patches (CLS, registers)"})
-    patch: int = field(default=14, metadata={"help": "pixels of the resized picture per cell; sizes are multiples of it"})
+    patch: int = field(default=14, metadata={"help": "pixels of the resized picture in a cell"})
     size: int = field(default=448, metadata={"help": "longer side of the resized picture in pixels"})
     scale: float = field(default=255.0, metadata={"help": "8-bit values are divided by this, then mean and std apply"})
     mean: tuple[float, ...] = field(default=(0.485, 0.456, 0.406), metadata={"help": "subtracted per channel"})
     std: tuple[float, ...] = field(default=(0.229, 0.224, 0.225), metadata={"help": "divided per channel"})
-    classes: str = field(default="", metadata={"help": ".npz with class vectors: logits become mixtures of word vectors"})
+    classes: str = field(default="", metadata={"help": ".npz of class vectors: logits become mixtures of them"})
     top_k: int = field(default=5, metadata={"help": "classes in a mixture"})
     temperature: float = field(default=1.0, metadata={"help": "softmax temperature of the posteriors"})
-    words: str = field(default="", metadata={"help": "text table of the space that words are looked up in; empty if none"})
+    words: str = field(default="", metadata={"help": "text table that leads into the space; empty if none"})
     threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
 
 

@@ -46,7 +46,9 @@ def lab_from_rgb(rgb: UInt8[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
     """CIE L*a*b* (D65) of 8-bit sRGB; distances in it roughly match what people see (L* from 0 to 100)."""
     c = np.arange(256, dtype=np.float64) / 255
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)[rgb]
-    to_xyz = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]])
+    to_xyz = np.array(
+        [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.072175], [0.0193339, 0.119192, 0.9503041]]
+    )
     xyz = linear @ to_xyz.T / to_xyz.sum(axis=1)
     f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
     lab = np.stack((116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])), axis=-1)
@@ -64,7 +66,7 @@ class PaletteTeacher:
     needs_images = True
     cheap = True
 
-    def __init__(self, config: PaletteConfig = PaletteConfig()) -> None:  # noqa: B008 - frozen
+    def __init__(self, config: PaletteConfig = PaletteConfig()) -> None:
         """Prepares the prototypes of each name."""
         self.cell, self.softness = cell, softness = config.cell, config.softness
         self.space = FeatureSpace(

@@ -1,0 +1,129 @@
+"""`gsencoder fuse SCENE… teacher=…`: per-Gaussian features from a teacher's maps of the views."""
+
+import shutil
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.config import CommonConfig, settings
+from gsencoder.data.orbits import orbit_cameras
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.splats import READABLE
+from gsencoder.data.text_table import TextTable, save_text_table
+from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
+from gsencoder.fusion.store import save_features
+from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.teachers.onnx import OnnxConfig
+from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.outputs import output_folder
+from gsencoder.progress import Progress, console
+from gsencoder.render.rgb import RenderedImages
+from gsencoder.summary import Summary
+from gsencoder.types import Scene, Views
+
+WORDS_FILE = "words.safetensors"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FuseCommandConfig(CommonConfig):
+    """Settings of `fuse`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "scenes, or folders of scenes: views, or a bare splat", "metavar": "SCENE", "required": True},
+    )
+    splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
+    orbits: int = field(default=24, metadata={"help": "cameras put around a splat that has no views"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    fusion: FuseConfig = field(default_factory=FuseConfig)
+    teacher: LabelsConfig | PaletteConfig | OnnxConfig = field(default_factory=LabelsConfig)
+
+
+def run(config: FuseCommandConfig, summary: Summary) -> None:
+    """Fuses one scene into out=, or each of several into a folder of its name below out=."""
+    paths = find_scenes(config.paths)
+    with summary.step("teacher"):
+        words = text_table_of(config.teacher)
+    screen = console(config.quiet)
+    for path in paths:
+        one = summary if len(paths) == 1 else Summary(summary.command, summary.settings)
+        scene = load_fusable(path, config, one)
+        out = config.out or Path("outputs") / scene.name / "features"
+        if len(paths) > 1:
+            out = out / scene.name
+        with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
+            fusion = fuse_scene(scene, config.teacher, words, config, one, out)
+            write_features(folder, scene, fusion, words, config, one)
+        shutil.rmtree(work_folder(out), ignore_errors=True)
+        seen, total = one.results["seen"], one.results["gaussians"]
+        screen.print(
+            f"{out}: {seen:,} of {total:,} Gaussians have features, {one.results['channels']} channels "
+            f"(rank {one.results['rank']}, keeps {one.results['energy_kept']:.4f} of the energy), "
+            f"from {one.results['views']} views"
+        )
+
+
+def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Scene:
+    """A scene with Gaussians and views: seeds where it has no splat, orbits where it has no views."""
+    with summary.step("load"):
+        scene = load_scene(path, splat=config.splat or None, options=config.data)
+    if scene.gaussians is None:
+        with summary.step("seeds"):
+            scene = replace(scene, gaussians=seed(scene, config.seeds))
+    if scene.views is None:
+        assert scene.gaussians is not None
+        cameras = orbit_cameras(scene.gaussians, count=config.orbits, up=scene.up)
+        names = tuple(f"orbit_{view:03d}" for view in range(len(cameras)))
+        images = RenderedImages(scene.gaussians, cameras, config.fusion.blend)
+        scene = replace(scene, views=Views(cameras=cameras, names=names, images=images))
+    return scene
+
+
+def work_folder(out: Path) -> Path:
+    """Where a fusion under way keeps its maps and sums, until `out` is whole."""
+    return out.parent / f".{out.name}.fusing"
+
+
+def fuse_scene(
+    scene: Scene,
+    teacher: TeacherConfig,
+    words: TextTable | None,
+    config: FuseCommandConfig,
+    summary: Summary,
+    out: Path,
+) -> Fusion:
+    """Fuses, and adds the steps' seconds to the summary."""
+    built = build_teacher(teacher, scene, words)
+    work = None if built.cheap else work_folder(out)
+    fusion = fuse(scene, built, config.fusion, work=work, track=Progress(quiet=config.quiet))
+    for step, seconds in fusion.seconds.items():
+        summary.timings[step] = summary.timings.get(step, 0.0) + seconds
+    return fusion
+
+
+def write_features(
+    folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, config: FuseCommandConfig, summary: Summary
+) -> None:
+    """Writes features, scene and words, and says in the summary what was chosen and what it cost."""
+    features = fusion.features
+    with summary.step("write"):
+        chosen = {"teacher": settings(config.teacher), "fusion": settings(config.fusion)}
+        save_features(folder, scene, features, chosen)
+        if words is not None:
+            save_text_table(folder / WORDS_FILE, words)
+    summary.results.update(
+        gaussians=len(features),
+        seen=int(features.seen.sum()),
+        views=len(fusion.views),
+        channels=features.space.channels,
+        rank=features.features.shape[1],
+        energy_kept=features.basis.energy_kept if features.basis is not None else 1.0,
+        truncation=fusion.truncation,
+        median_weight=float(np.median(features.weights[features.seen])),
+        space=features.space.describe(),
+        features="features.safetensors",
+    )

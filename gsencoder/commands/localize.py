@@ -1,0 +1,103 @@
+"""`gsencoder localize FEATURES query=…`: boxes, scores and pictures for words."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.config import CommonConfig
+from gsencoder.data.text_table import TextTable, load_text_table
+from gsencoder.errors import InputError
+from gsencoder.fusion.store import load_features
+from gsencoder.infer.boxes_ply import write_boxes_ply
+from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
+from gsencoder.infer.relevancy_views import relevancy_pictures
+from gsencoder.outputs import output_folder, write_json
+from gsencoder.progress import console
+from gsencoder.summary import Summary
+from gsencoder.types import Localization
+
+WORDS_FILE = "words.safetensors"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalizeCommandConfig(CommonConfig):
+    """Settings of `localize`."""
+
+    paths: tuple[str, ...] = field(
+        default=(), metadata={"help": "a folder that fuse or encode made", "metavar": "FEATURES", "required": True}
+    )
+    query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
+    queries: str = field(default="", metadata={"help": "a text file with one query a line"})
+    words: str = field(default="", metadata={"help": "text table; empty = the one beside the features"})
+    space: str = field(default="", metadata={"help": "which features, where the folder holds several"})
+    pictures: int = field(default=4, metadata={"help": "views drawn for each word; 0 = no pictures"})
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+
+    def __post_init__(self) -> None:
+        if len(self.paths) > 1:
+            raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        if self.pictures < 0:
+            raise InputError(f"pictures: expected 0 or more, got {self.pictures}")
+
+
+def run(config: LocalizeCommandConfig, summary: Summary) -> None:
+    """Reads features, finds each word, writes boxes as JSON and .ply, and draws them."""
+    folder = Path(config.paths[0])
+    words = asked_words(config)
+    with summary.step("load"):
+        scene = load_features(folder)
+        table = words_of(folder, config.words)
+    with summary.step("localize"):
+        found = localize(scene, words, table, config.localize, space=config.space or None)
+    out = config.out or Path("outputs") / scene.name / "boxes"
+    boxes = localization_to_json(found)
+    summary.results.update(boxes=boxes, thresholds=dict(zip(words, found.thresholds.tolist(), strict=True)))
+    summary.results["metres_per_unit"] = scene.metres_per_unit
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
+        write_json(target / "boxes.json", boxes)
+        write_boxes_ply(target / "boxes.ply", scene, found)
+        if config.pictures and scene.views is not None:
+            with summary.step("pictures"):
+                for name, picture in relevancy_pictures(scene, found, per_word=config.pictures):
+                    picture.save(target / f"{name}.png")
+    screen = console(config.quiet)
+    for word in words:
+        screen.print(f"{word}: {_first_box(found, word)}")
+    screen.print(f"{out}: boxes.json, boxes.ply and pictures; boxes are drawn around Gaussian {config.localize.extent}")
+
+
+def asked_words(config: LocalizeCommandConfig) -> list[str]:
+    """The words of query= and of the file queries=, blanks stripped, each once, in order."""
+    lines = list(config.query)
+    if config.queries:
+        try:
+            lines += Path(config.queries).read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"queries: {config.queries} cannot be read as text: {error}") from error
+    words = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+    if not words:
+        raise InputError("query= is missing: one or several words, separated by commas (or queries=FILE)")
+    return words
+
+
+def words_of(folder: Path, given: str) -> TextTable:
+    """The text table that was given, or the one that lies beside the features."""
+    if given:
+        return load_text_table(given)
+    path = folder / WORDS_FILE
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: no words lead into these features; fuse with a teacher that has words, or give words="
+        )
+    return load_text_table(path)
+
+
+def _first_box(found: Localization, word: str) -> str:
+    boxes = [box for box in found.boxes if box.query == word]
+    if not boxes:
+        return "not found"
+    best = boxes[0]
+    center = ", ".join(f"{value:.3f}" for value in best.center)
+    size = " × ".join(f"{value:.3f}" for value in np.asarray(best.aabb_max - best.aabb_min))
+    return f"at ({center}), {size}, score {best.score:.3f}, {len(best.rows):,} Gaussians ({len(boxes)} boxes)"

@@ -1,0 +1,250 @@
+"""A closed vocabulary as a table: names, their embeddings, and the files that hold them."""
+
+import difflib
+import json
+import re
+import unicodedata
+import zipfile
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsencoder.data.atomic import atomic_file
+from gsencoder.errors import InputError
+from gsencoder.types import FeatureSpace
+
+UNIT_TOLERANCE = 1e-2
+"""How far from 1 the norm of a stored embedding may be: float16 rounding is about 1e-3."""
+LARGEST_TABLE = 1 << 30
+"""Bytes that an array of a table file may claim."""
+FORMAT = "gsencoder text table 1"
+
+
+def normalise(word: str) -> str:
+    """A word as the table compares it: NFKC, lower case, one blank where there were blanks, `_` or `-`, no article."""
+    text = " ".join(re.split(r"[\s_\-]+", unicodedata.normalize("NFKC", word).casefold())).strip()
+    return re.sub(r"^(?:a|an|the) (?=.)", "", text)
+
+
+def _other_numbers(key: str) -> list[str]:
+    """Simple English singulars of a word, then its plurals; made-up forms do no harm, as no table has them."""
+    forms = []
+    for ending, singular in (("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")):
+        if key.endswith(ending) and len(key) > len(ending) + 1 and not key.endswith("ss"):
+            forms.append(key[: -len(ending)] + singular)
+    forms += [key + "s", key + "es"]
+    if key.endswith("y"):
+        forms.append(key[:-1] + "ies")
+    if key.endswith("fe"):
+        forms.append(key[:-2] + "ves")
+    if key.endswith("f"):
+        forms.append(key[:-1] + "ves")
+    return forms
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TextTable:
+    """A closed vocabulary: names and their embeddings.
+
+    Attributes:
+        names: the words, unique after `normalise`.
+        embeddings: one unit vector a name.
+        space: what the vectors are; `text_encoder` names the encoder that made them.
+        mean: the mean of the embeddings. Text and image features of a joint model have different means, so each side
+            is centred by its own.
+    """
+
+    names: tuple[str, ...]
+    embeddings: Float32[np.ndarray, "C D"]
+    space: FeatureSpace
+    mean: Float32[np.ndarray, " D"]
+    _row_of: dict[str, int] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        table = self.embeddings
+        if not self.names or table.ndim != 2 or len(table) != len(self.names):
+            raise InputError(f"TextTable: expected one embedding a name, got {len(self.names)} names and {table.shape}")
+        if table.shape[1] != self.space.channels or self.mean.shape != (self.space.channels,):
+            raise InputError(
+                f"TextTable: expected {self.space.channels} channels ({self.space.name}), got embeddings of "
+                f"{table.shape[1]} and a mean of {self.mean.shape}"
+            )
+        norms = np.sqrt((table.astype(np.float64) ** 2).sum(axis=1))
+        bad = np.flatnonzero(~(np.abs(norms - 1) <= UNIT_TOLERANCE))
+        if bad.size or not np.isfinite(self.mean).all():
+            first = f"{self.names[bad[0]]!r} has norm {norms[bad[0]]:.4g}" if bad.size else "the mean is not finite"
+            raise InputError(f"TextTable: expected finite unit vectors, {first} ({bad.size} bad of {len(norms)} rows)")
+        for row, name in enumerate(self.names):
+            key = normalise(name)
+            if not key or key in self._row_of:
+                raise InputError(f"TextTable: name {name!r} in row {row} is {'repeated' if key else 'empty'}")
+            self._row_of[key] = row
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def find(self, word: str) -> int | None:
+        """The row that a word means (itself, else its singular or plural), or None."""
+        key = normalise(word)
+        return next((self._row_of[form] for form in (key, *_other_numbers(key)) if form in self._row_of), None)
+
+    def near(self, word: str, count: int = 6) -> tuple[str, ...]:
+        """Names that a user may have meant: names that share a word with it first, then those spelt alike."""
+        row_of, key = self._row_of, normalise(word)
+        tokens = {form for token in key.split() for form in (token, *_other_numbers(token))}
+        sharing = [name for name in row_of if tokens & set(name.split())]
+        sharing.sort(key=lambda name: (-difflib.SequenceMatcher(None, key, name).ratio(), name))
+        alike = difflib.get_close_matches(key, list(row_of), n=count, cutoff=0.6)
+        found = dict.fromkeys([*alike[:1], *sharing, *alike])
+        return tuple(self.names[row_of[name]] for name in list(found)[:count])
+
+    def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
+        """The embeddings of words, forgiving case, blanks, `_`, `-`, a leading article and simple plurals.
+
+        Raises:
+            InputError: words that the table does not have; the message says which names are near.
+        """
+        rows = [self.find(word) for word in words]
+        unknown = [word for word, row in zip(words, rows, strict=True) if row is None]
+        if unknown:
+            parts = [f"{word!r}{_did_you_mean(self.near(word))}" for word in unknown[:3]]
+            more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
+            raise InputError(f"not among the {len(self)} words of {self.space.name}: {'; '.join(parts)}{more}")
+        return self.embeddings[np.array(rows, np.int64)]
+
+
+def _did_you_mean(names: Sequence[str]) -> str:
+    return f" (near: {', '.join(names)})" if names else " (no name is near)"
+
+
+def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) -> TextTable:
+    """A table from names and their unit vectors of any float type; `encoder` names what made them.
+
+    Rows are normalised in float32, which undoes the rounding of a float16 file.
+
+    Raises:
+        InputError: repeated or empty names, rows that are not finite unit vectors, sizes that differ.
+    """
+    table = np.ascontiguousarray(embeddings, dtype=np.float32)
+    if table.ndim != 2 or 0 in table.shape:
+        raise InputError(f"text table of {encoder}: expected embeddings [names, channels], got shape {table.shape}")
+    norms = np.linalg.norm(table, axis=1, keepdims=True)
+    # Rows far from unit length stay as they are, for TextTable to complain about.
+    rounded = np.abs(norms - 1) <= UNIT_TOLERANCE
+    table = np.where(rounded, table / np.where(rounded, norms, 1), table)
+    space = FeatureSpace(name=encoder, channels=table.shape[1], text_encoder=encoder)
+    mean = table.mean(axis=0, dtype=np.float64).astype(np.float32)
+    return TextTable(names=tuple(names), embeddings=table, space=space, mean=mean)
+
+
+def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
+    """Reads an `.npz` with `names` and `embeddings`, or a `.safetensors` of `save_text_table`.
+
+    Args:
+        path: the file.
+        encoder: what made the embeddings. Left empty, it is what the file says in an entry `encoder`, else the file's
+            name without a trailing "_names".
+
+    Raises:
+        InputError: missing, damaged or hostile, or not such a table.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; expected a text table (.npz or .safetensors)")
+    with file.open("rb") as stream:
+        zipped = stream.read(2) == b"PK"
+    if zipped or file.suffix == ".npz":
+        return _read_npz(file, encoder)
+    return _read_safetensors(file)
+
+
+def save_text_table(path: str | Path, table: TextTable) -> None:
+    """Writes the table as safetensors (embeddings and mean), with the names and the space as JSON in its header.
+
+    Raises:
+        InputError: the file cannot be written; what was there before stays.
+    """
+    from safetensors.numpy import save
+
+    space = {item.name: getattr(table.space, item.name) for item in fields(table.space)}
+    header = json.dumps({"names": table.names, "space": space}, ensure_ascii=False)
+    data = save({"embeddings": table.embeddings, "mean": table.mean}, {"format": FORMAT, "table": header})
+    with atomic_file(path) as stream:
+        stream.write(data)
+
+
+def _read_safetensors(file: Path) -> TextTable:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(file, framework="np") as stored:
+            metadata = stored.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise InputError(f"{file}: is no text table of this version (expected {FORMAT!r} in its header)")
+            arrays = {name: stored.get_tensor(name) for name in ("embeddings", "mean")}
+        header = json.loads(metadata["table"])
+        names, space = header["names"], FeatureSpace(**header["space"])
+        good = all(isinstance(name, str) for name in names) and isinstance(space.channels, int)
+        good &= all(isinstance(getattr(space, item.name), str) for item in fields(space) if item.name != "channels")
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
+    shapes = arrays["embeddings"].ndim == 2 and arrays["mean"].ndim == 1
+    if not good or not shapes or any(array.dtype != np.float32 for array in arrays.values()):
+        raise InputError(f"{file}: expected float32 embeddings [C, D] and mean [D], names and a space of text")
+    try:
+        return TextTable(names=tuple(names), space=space, **arrays)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+
+
+def _read_npz(file: Path, encoder: str) -> TextTable:
+    try:
+        with zipfile.ZipFile(file) as archive:
+            present = set(archive.namelist())
+            missing = {"names.npy", "embeddings.npy"} - present
+            if missing:
+                raise InputError(
+                    f"{file}: expected the arrays names and embeddings, {sorted(missing)[0][:-4]} is missing"
+                )
+            names = _read_member(archive, "names.npy", "U", 1)
+            embeddings = _read_member(archive, "embeddings.npy", "f", 2)
+            if not encoder and "encoder.npy" in present:
+                encoder = str(_read_member(archive, "encoder.npy", "U", 0))
+        return make_text_table([str(name) for name in names], embeddings, encoder or file.stem.removesuffix("_names"))
+    except InputError as error:
+        raise error if str(error).startswith(str(file)) else InputError(f"{file}: {error}") from error
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, MemoryError) as error:
+        raise InputError(f"{file}: cannot be read as .npz: {_one_line(error)}") from error
+
+
+def _read_member(archive: zipfile.ZipFile, name: str, kind: str, ndim: int) -> np.ndarray:
+    """One array of an .npz, whose header must agree with the size that the archive states, before memory is taken."""
+    size = archive.getinfo(name).file_size
+    if size > LARGEST_TABLE:
+        raise InputError(f"{name[:-4]} claims {size:,} bytes; a text table has at most {LARGEST_TABLE:,}")
+    with archive.open(name) as stream:
+        version = np.lib.format.read_magic(stream)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+        if read is None:
+            raise InputError(f"{name[:-4]}: unknown .npy version {version}")
+        shape, fortran, dtype = read(stream)
+        count = int(np.prod(shape, dtype=object))
+        if dtype.kind != kind or len(shape) != ndim:
+            raise InputError(f"{name[:-4]}: expected {ndim} axes of type {kind!r}, got {dtype}{list(shape)}")
+        wanted = size - stream.tell()
+        if count * dtype.itemsize != wanted:
+            raise InputError(f"{name[:-4]}: header claims {count * dtype.itemsize:,} bytes, the file holds {wanted:,}")
+        data = stream.read(wanted)
+    if len(data) != wanted:
+        raise InputError(f"{name[:-4]}: truncated, {wanted - len(data):,} of {wanted:,} bytes are missing")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _one_line(error: BaseException) -> str:
+    return (" ".join(str(error).split()) or type(error).__name__)[:200]
