@@ -83,11 +83,12 @@ class Gaussians:
         for name in ("means", "quats", "scales", "opacities", "sh"):
             _check_finite("Gaussians", name, getattr(self, name))
         norms = np.linalg.norm(self.quats, axis=1)
-        _check_rows("Gaussians", "quats", np.abs(norms - 1) <= UNIT_TOLERANCE, "unit quaternions", self.quats)
-        _check_rows("Gaussians", "scales", (self.scales > 0).all(axis=1), "scales > 0", self.scales)
         _check_rows(
-            "Gaussians", "opacities", (self.opacities >= 0) & (self.opacities <= 1), "values in [0, 1]", self.opacities
+            "Gaussians", "quats", np.asarray(np.abs(norms - 1) <= UNIT_TOLERANCE), "unit quaternions", self.quats
         )
+        _check_rows("Gaussians", "scales", np.asarray((self.scales > 0).all(axis=1)), "scales > 0", self.scales)
+        inside = np.asarray((self.opacities >= 0) & (self.opacities <= 1))
+        _check_rows("Gaussians", "opacities", inside, "values in [0, 1]", self.opacities)
 
     def __len__(self) -> int:
         return len(self.means)

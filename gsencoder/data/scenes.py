@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -38,9 +38,7 @@ FEW_CAMERAS = 8
 class SceneConfig:
     """How a scene is read."""
 
-    allow_outside: bool = field(
-        default=False, metadata={"help": "let paths in a scene's files lead out of its folder"}
-    )
+    allow_outside: bool = field(default=False, metadata={"help": "let paths in a scene's files lead out of its folder"})
     max_views: int = field(default=0, metadata={"help": "at most so many views, evenly spaced; 0 = all"})
     depth_scale: float | None = field(
         default=None, metadata={"help": "world units for each step of a depth file; empty = what the format says"}
@@ -120,6 +118,49 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         sfm_points=(points - origin).astype(np.float32) if len(points) else None,
         sfm_colors=posed.colors if len(points) else None,
     )
+
+
+def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
+    """The scenes that paths name: a path that is a scene itself stays, a folder of scenes becomes its scenes by name.
+
+    A folder is a scene if it holds what `load_scene` looks for; of any other the direct subfolders are looked at.
+
+    Raises:
+        InputError: a path that does not exist, or a folder with no scene in it.
+    """
+    found: dict[Path, None] = {}
+    for given in map(Path, paths):
+        try:
+            if not given.exists():
+                raise InputError(f"{given}: no such file or folder")
+            inside = [given] if _is_scene(given) else sorted(entry for entry in given.iterdir() if _is_listed(entry))
+        except (OSError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{str(given)[:200]!r} cannot be looked into ({type(error).__name__})") from error
+        if not inside:
+            raise InputError(
+                f"{given}: neither a scene nor a folder of scenes; a scene holds {' or '.join(TRANSFORMS)}, a COLMAP "
+                "model, a ScanNet export or a splat"
+            )
+        found |= dict.fromkeys(inside)
+    return tuple(found)
+
+
+def _is_scene(path: Path) -> bool:
+    """Whether `load_scene` would find something to read; files are left to it."""
+    if path.is_file():
+        return True
+    return (
+        any((path / file).is_file() for file in (*TRANSFORMS, "meta.json"))
+        or any(is_colmap_model(path / folder) for folder in COLMAP_FOLDERS)
+        or is_scannet_export(path)
+        or any(entry.suffix.lower() in SPLAT_SUFFIXES and entry.is_file() for entry in path.iterdir())
+    )
+
+
+def _is_listed(entry: Path) -> bool:
+    return entry.is_dir() and not entry.name.startswith(".") and _is_scene(entry)
 
 
 def _read_views(root: Path, options: SceneConfig) -> tuple[PosedImages | None, Path]:

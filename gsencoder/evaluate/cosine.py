@@ -27,7 +27,7 @@ class FieldError:
 
     @property
     def total(self) -> float:
-        """1 − mean centred cosine over all that the reference saw; a Gaussian that the other did not see counts as 0."""
+        """1 − mean centred cosine over all that the reference saw; a Gaussian that only it saw counts as 0."""
         return 1 - self.covered * (1 - self.centred)
 
 

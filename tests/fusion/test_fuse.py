@@ -225,7 +225,7 @@ def test_sums_of_an_interrupted_lift_are_taken_up(
 
     scene, maps = make_scene(), random_maps(rng)
     module = sys.modules["gsencoder.fusion.fuse"]
-    monkeypatch.setattr("gsencoder.fusion.store.PartialFusion.due", lambda self: True)
+    monkeypatch.setattr("gsencoder.fusion.store.PartialFusion.due", lambda _: True)
     whole = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "whole")
     lifted: list[int] = []
     lift_view = module._lift_view  # type: ignore[attr-defined]

@@ -20,11 +20,20 @@ class Teacher(Protocol):
         cheap: whether making a map twice costs less than keeping it on disk.
     """
 
-    space: FeatureSpace
-    table: Float32[np.ndarray, "C D"] | None
-    mean: Float32[np.ndarray, " D"] | None
-    needs_images: bool
-    cheap: bool
+    @property
+    def space(self) -> FeatureSpace: ...
+
+    @property
+    def table(self) -> Float32[np.ndarray, "C D"] | None: ...
+
+    @property
+    def mean(self) -> Float32[np.ndarray, " D"] | None: ...
+
+    @property
+    def needs_images(self) -> bool: ...
+
+    @property
+    def cheap(self) -> bool: ...
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         """The features of one view."""

@@ -54,7 +54,7 @@ class SyntheticTeacher:
             rank: directions that carry the signal.
             noise: share of the energy that is noise, in [0, 1).
             seed: of everything that is random.
-            height: cells of a map; the whole image is resized to them, as 336 × 448 pixels are to 24 × 32 patches of 14.
+            height: cells of a map; the whole image is resized to them, as 336 × 448 pixels to 24 × 32.
             width: cells of a map.
             wavelength: shortest wave of the signal in world units; the longest is four times as long.
 
@@ -64,17 +64,23 @@ class SyntheticTeacher:
         if min(channels, rank, height, width) < 1 or rank > channels:
             raise InputError(f"synthetic teacher: expected sizes ≥ 1 and rank ≤ channels, got {rank} of {channels}")
         if not 0 <= noise < 1 or not 0 < wavelength < math.inf:
-            raise InputError(f"synthetic teacher: expected noise in [0, 1) and wavelength > 0, got {noise}, {wavelength}")
+            raise InputError(
+                f"synthetic teacher: expected noise in [0, 1) and wavelength > 0, got {noise}, {wavelength}"
+            )
         self.noise, self.seed, self.height, self.width, self.wavelength = noise, seed, height, width, wavelength
         rng = np.random.default_rng(seed)
         directions = rng.standard_normal((rank, channels))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        self.directions: Float32[np.ndarray, "rank D"] = (directions * math.sqrt(2 * (1 - noise) / rank)).astype(np.float32)
+        self.directions: Float32[np.ndarray, "rank D"] = (directions * math.sqrt(2 * (1 - noise) / rank)).astype(
+            np.float32
+        )
         center = rng.standard_normal(channels)
         self.center: Float32[np.ndarray, " D"] = (center / np.linalg.norm(center)).astype(np.float32)
         waves = rng.standard_normal((rank, 3))
         lengths = wavelength * 4 ** rng.uniform(size=(rank, 1))
-        self.waves: Float64[np.ndarray, "rank 3"] = 2 * np.pi * waves / np.linalg.norm(waves, axis=1, keepdims=True) / lengths
+        self.waves: Float64[np.ndarray, "rank 3"] = (
+            2 * np.pi * waves / np.linalg.norm(waves, axis=1, keepdims=True) / lengths
+        )
         self.phases: Float64[np.ndarray, " rank"] = rng.uniform(0, 2 * np.pi, rank)
         self.space = FeatureSpace(
             name=f"synthetic-{channels}",

@@ -1,0 +1,117 @@
+"""`gsencoder evaluate SCENE… protocol=localization`: a paper's metric on labelled scenes."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.table import Table
+
+from gsencoder.config import CommonConfig
+from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.seeds import SeedConfig
+from gsencoder.evaluate.localization import (
+    LocalizationProtocol,
+    SceneOutcome,
+    evaluate_localization,
+    scores,
+    scores_by_name,
+)
+from gsencoder.evaluate.tables import csv_text
+from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.teachers.onnx import OnnxConfig
+from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.outputs import output_folder, write_bytes
+from gsencoder.progress import Progress, console
+from gsencoder.summary import Summary
+
+SHOWN_NAMES = 15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateConfig(CommonConfig):
+    """Settings of `evaluate`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "labelled scenes, or folders of scenes", "metavar": "SCENE", "required": True},
+    )
+    protocol: LocalizationProtocol = field(default_factory=LocalizationProtocol)
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    fusion: FuseConfig = field(default_factory=FuseConfig)
+    teacher: LabelsConfig | PaletteConfig | OnnxConfig = field(default_factory=LabelsConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+
+
+def run(config: EvaluateConfig, summary: Summary) -> None:
+    """Evaluates, prints the scores, and writes them with every hit beside them."""
+    out = config.out or Path("outputs") / "evaluate" / config.protocol.name
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+        outcomes = evaluate_localization(
+            find_scenes(config.paths),
+            teacher=config.teacher,
+            protocol=config.protocol,
+            data=config.data,
+            seeds=config.seeds,
+            fusion=config.fusion,
+            localization=config.localize,
+            track=Progress(quiet=config.quiet),
+        )
+        record(outcomes, summary)
+        hits = [hit for outcome in outcomes for hit in outcome.hits]
+        rows = [{"scene": h.scene, "name": h.name, "iou": h.iou, "oracle_iou": h.oracle_iou} for h in hits]
+        write_bytes(folder / "hits.csv", csv_text(rows).encode())
+        names = [{"name": name, **row} for name, row in scores_by_name(hits).items()]
+        write_bytes(folder / "names.csv", csv_text(names).encode())
+    screen = console(config.quiet)
+    screen.print(names_table(summary.results))
+    screen.print(f"{out}: {scores_line(summary.results)}")
+
+
+def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
+    """Puts scores, scenes and seconds into the summary."""
+    hits = [hit for outcome in outcomes for hit in outcome.hits]
+    for outcome in outcomes:
+        for step, seconds in outcome.seconds.items():
+            summary.timings[step] = summary.timings.get(step, 0.0) + seconds
+    summary.results.update(
+        protocol="localization",
+        **scores(hits),
+        boxless=sum(outcome.boxless for outcome in outcomes),
+        names=scores_by_name(hits),
+        scenes=[
+            {
+                "scene": outcome.scene,
+                "gaussians": outcome.gaussians,
+                "seen": outcome.seen,
+                "rank": outcome.rank,
+                "seconds": sum(outcome.seconds.values()),
+                **scores(outcome.hits),
+            }
+            for outcome in outcomes
+        ],
+        hits="hits.csv",
+        names_table="names.csv",
+    )
+
+
+def scores_line(results: dict) -> str:
+    """The main figures in one line."""
+    return (
+        f"{results['objects']} objects in {len(results['scenes'])} scenes: Acc@0.25 {results['acc_25']:.3f}, "
+        f"Acc@0.5 {results['acc_50']:.3f}, mean IoU {results['mean_iou']:.3f} (best of all boxes: "
+        f"{results['oracle_acc_25']:.3f}, {results['oracle_acc_50']:.3f}, {results['oracle_mean_iou']:.3f})"
+    )
+
+
+def names_table(results: dict) -> Table:
+    """The names that were found worst."""
+    names = results["names"]
+    table = Table(title="hardest names" if len(names) > SHOWN_NAMES else "names", title_justify="left")
+    for title in ("name", "objects", "Acc@0.25", "Acc@0.5", "mean IoU", "best box"):
+        table.add_column(title, justify="left" if title == "name" else "right")
+    for name, row in list(names.items())[:SHOWN_NAMES]:
+        figures = (row["acc_25"], row["acc_50"], row["mean_iou"], row["oracle_mean_iou"])
+        table.add_row(name, str(row["objects"]), *(f"{figure:.3f}" for figure in figures))
+    return table

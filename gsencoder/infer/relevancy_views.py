@@ -1,0 +1,74 @@
+"""Relevancy as pictures: a word's heat over rendered views of the scene, with its boxes drawn."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from PIL import Image
+
+from gsencoder.errors import InputError
+from gsencoder.infer.pictures import draw_boxes, relevancy_overlay
+from gsencoder.render import BlendConfig, blend
+from gsencoder.render.rgb import render_image
+from gsencoder.types import Cameras, Gaussians, Localization, Scene
+
+_SIDE = 96
+"""Views are judged at this size, longer side in pixels, which is enough to see who sees what."""
+
+
+def best_views(gaussians: Gaussians, cameras: Cameras, rows: np.ndarray, count: int) -> list[int]:
+    """The `count` views that show the most of some Gaussians, best first.
+
+    A view's worth is the share of its picture that `rows` fill, by their blending weights: what hides them counts.
+    """
+    factor = _SIDE / np.maximum(cameras.widths, cameras.heights)
+    Ks = cameras.Ks * np.stack((factor, factor, np.ones_like(factor)), axis=1)[:, :, None]
+    small = Cameras(
+        cam_from_world=cameras.cam_from_world,
+        Ks=Ks.astype(np.float32),
+        widths=np.maximum(1, cameras.widths * factor).astype(np.int32),
+        heights=np.maximum(1, cameras.heights * factor).astype(np.int32),
+    )
+    chosen = torch.zeros(len(gaussians))
+    chosen[torch.from_numpy(np.ascontiguousarray(rows, np.int64))] = 1
+    worth = [float(blend(gaussians, small, view).render(chosen).mean()) for view in range(len(cameras))]
+    return sorted(range(len(cameras)), key=lambda view: (-worth[view], view))[:count]
+
+
+def relevancy_pictures(
+    scene: Scene,
+    found: Localization,
+    *,
+    per_word: int,
+    config: BlendConfig = BlendConfig(),  # noqa: B008
+) -> Iterator[tuple[str, Image.Image]]:
+    """For each word its best views, rendered, with relevancy over them and its boxes.
+
+    Args:
+        scene: Gaussians and cameras.
+        found: what was asked and found.
+        per_word: views drawn for each word.
+        config: accuracy of the rendering.
+
+    Yields:
+        A name (word and view, safe for a file) and the picture.
+
+    Raises:
+        InputError: the scene has no Gaussians or no cameras.
+    """
+    if scene.gaussians is None or scene.views is None:
+        raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
+    cameras = scene.views.cameras
+    for index, word in enumerate(found.queries):
+        boxes = [box for box in found.boxes if box.query == word]
+        rows = boxes[0].rows if boxes else np.flatnonzero(found.relevancy[index] > found.thresholds[index])
+        for view in best_views(scene.gaussians, cameras, rows, per_word):
+            b = blend(scene.gaussians, cameras, view, config=config)
+            rgb = render_image(scene.gaussians, cameras, view, blended=b)
+            scores = torch.from_numpy(np.nan_to_num(found.relevancy[index], nan=0.0))
+            heat = b.render(scores).reshape(b.shape).numpy()
+            picture = relevancy_overlay(rgb, heat)
+            pose, K = cameras.cam_from_world[view], cameras.Ks[view]
+            picture = draw_boxes(picture, boxes, pose, K, origin=scene.origin)
+            safe = "".join(c if c.isalnum() else "_" for c in word)[:60]
+            yield f"{index:02d}_{safe}_view{view:03d}", Image.fromarray(picture)

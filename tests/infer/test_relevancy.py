@@ -1,0 +1,207 @@
+"""Relevancy against plain formulas on decoded features; thresholds at their ends."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gsencoder.errors import InputError
+from gsencoder.infer.relevancy import ThresholdConfig, otsu, relevancy, threshold
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
+
+SPACE = FeatureSpace(name="toy", channels=24, text_encoder="toy")
+
+
+def in_basis(rng: np.random.Generator, n: int = 500, rank: int = 5, scale: float = 1.0) -> GaussianFeatures:
+    components = np.linalg.qr(rng.normal(size=(24, rank)))[0].T.astype(np.float32)
+    mean = (scale * rng.normal(size=24)).astype(np.float32)
+    basis = FeatureBasis(mean=mean, components=components, energy_kept=1.0, space=SPACE)
+    coordinates = (scale * rng.normal(size=(n, rank))).astype(np.float32)
+    weights = rng.random(n).astype(np.float32)
+    weights[::7] = 0
+    coordinates[::7] = 0
+    return GaussianFeatures(features=coordinates, weights=weights, mean=mean, space=SPACE, basis=basis)
+
+
+def decoded(features: GaussianFeatures) -> GaussianFeatures:
+    vectors = features.decode().astype(np.float32)
+    return GaussianFeatures(features=vectors, weights=features.weights, mean=features.mean, space=SPACE)
+
+
+def words(rng: np.random.Generator, count: int = 3) -> np.ndarray:
+    vectors = rng.normal(size=(count, 24)).astype(np.float32)
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def plain_cosine(features: np.ndarray, text: np.ndarray) -> np.ndarray:
+    a, b = features.astype(np.float64), text.astype(np.float64)
+    return (b / np.linalg.norm(b, axis=1, keepdims=True)) @ (a / np.linalg.norm(a, axis=1, keepdims=True)).T
+
+
+@pytest.mark.parametrize("mode", ["raw", "centred"])
+def test_relevancy_in_coordinates_is_the_cosine_of_decoded_vectors(rng: np.random.Generator, mode: str) -> None:
+    features, text, text_mean = in_basis(rng), words(rng), rng.normal(size=24).astype(np.float32) / 9
+    scores = relevancy(features, text, text_mean, mode=mode)
+    seen = features.seen
+    vectors = features.features.astype(np.float64) @ features.basis.components + features.basis.mean
+    centred = mode == "centred"
+    expected = plain_cosine(vectors - (features.mean if centred else 0), text - (text_mean if centred else 0))
+    # A feature's length below a thousandth of the mean's fades: here that is a millionth of the square.
+    np.testing.assert_allclose(scores[:, seen], expected[:, seen], atol=1e-4 if centred else 1e-6)
+    assert np.isnan(scores[:, ~seen]).all()
+
+
+@pytest.mark.parametrize("mode", ["raw", "centred"])
+@pytest.mark.parametrize("with_negatives", [False, True])
+def test_features_in_a_basis_and_decoded_ones_score_alike(
+    rng: np.random.Generator, mode: str, with_negatives: bool
+) -> None:
+    features, text, text_mean = in_basis(rng), words(rng), rng.normal(size=24).astype(np.float32) / 9
+    negatives = words(rng, 2) if with_negatives else None
+    a = relevancy(features, text, text_mean, negatives=negatives, mode=mode)
+    b = relevancy(decoded(features), text, text_mean, negatives=negatives, mode=mode)
+    np.testing.assert_allclose(a, b, atol=2e-6)
+
+
+def test_a_mean_that_is_not_the_bases_own_is_removed_exactly(rng: np.random.Generator) -> None:
+    features, text = in_basis(rng), words(rng)
+    other = rng.normal(size=24).astype(np.float32)
+    moved = GaussianFeatures(
+        features=features.features, weights=features.weights, mean=other, space=SPACE, basis=features.basis
+    )
+    scores = relevancy(moved, text, np.zeros(24, np.float32))
+    expected = plain_cosine(features.decode().astype(np.float64) - other, text)
+    np.testing.assert_allclose(scores[:, moved.seen], expected[:, moved.seen], atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e-3, 1e6])
+def test_the_length_of_features_does_not_matter_at_either_end(rng: np.random.Generator, scale: float) -> None:
+    features, text, text_mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
+    basis = features.basis
+    mean = (basis.mean * scale).astype(np.float32)
+    scaled = GaussianFeatures(
+        features=(features.features * scale).astype(np.float32),
+        weights=features.weights,
+        mean=mean,
+        space=SPACE,
+        basis=FeatureBasis(mean=mean, components=basis.components, energy_kept=1.0, space=SPACE),
+    )
+    for mode in ("raw", "centred"):
+        a = relevancy(scaled, text, text_mean, mode=mode)
+        assert np.isfinite(a[:, scaled.seen]).all()
+        np.testing.assert_allclose(a, relevancy(features, text, text_mean, mode=mode), atol=1e-5)
+
+
+def test_a_feature_equal_to_the_mean_answers_nothing_however_it_was_rounded(rng: np.random.Generator) -> None:
+    mean = rng.normal(size=24).astype(np.float32)
+    rows = np.stack([mean, mean * np.float32(1 + 1e-7), mean.astype(np.float16).astype(np.float32)])
+    features = GaussianFeatures(features=rows, weights=np.ones(3, np.float32), mean=mean, space=SPACE)
+    text = words(rng, 20)
+    assert np.abs(relevancy(features, text, np.zeros(24, np.float32))).max() < 0.2
+
+
+def test_a_zero_feature_and_a_zero_word_score_zero() -> None:
+    features = GaussianFeatures(
+        features=np.zeros((2, 24), np.float32),
+        weights=np.ones(2, np.float32),
+        mean=np.zeros(24, np.float32),
+        space=SPACE,
+    )
+    text = np.zeros((1, 24), np.float32)
+    assert np.array_equal(relevancy(features, text, np.zeros(24, np.float32), mode="raw"), np.zeros((1, 2), np.float32))
+
+
+def test_words_one_by_one_score_as_they_do_together(rng: np.random.Generator) -> None:
+    features, text, mean = in_basis(rng), words(rng, 4), np.zeros(24, np.float32)
+    together = relevancy(features, text, mean)
+    np.testing.assert_allclose(
+        together, np.concatenate([relevancy(features, row[None], mean) for row in text]), atol=1e-7
+    )
+
+
+def test_chunks_do_not_change_scores(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    features, text, mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
+    whole = relevancy(features, text, mean)
+    monkeypatch.setattr("gsencoder.infer.relevancy.CHUNK_BYTES", 1000)
+    np.testing.assert_allclose(relevancy(features, text, mean), whole, atol=1e-7)
+
+
+def test_permuting_the_gaussians_permutes_the_scores(rng: np.random.Generator) -> None:
+    features, text, mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
+    order = rng.permutation(len(features))
+    moved = GaussianFeatures(
+        features=features.features[order],
+        weights=features.weights[order],
+        mean=features.mean,
+        space=SPACE,
+        basis=features.basis,
+    )
+    np.testing.assert_allclose(relevancy(moved, text, mean), relevancy(features, text, mean)[:, order], atol=1e-7)
+
+
+def test_contrast_is_the_smallest_pairwise_softmax(rng: np.random.Generator) -> None:
+    features, text, negatives, mean = in_basis(rng), words(rng), words(rng, 4), np.zeros(24, np.float32)
+    scores = relevancy(features, text, mean, negatives=negatives, mode="raw", temperature=0.1)
+    cosines = plain_cosine(features.decode(), np.concatenate([text, negatives]))
+    for row in range(3):
+        rivals = [other for other in range(7) if other != row]
+        pairs = [np.exp(10 * cosines[row]) / (np.exp(10 * cosines[row]) + np.exp(10 * cosines[k])) for k in rivals]
+        np.testing.assert_allclose(scores[row, features.seen], np.min(pairs, axis=0)[features.seen], atol=1e-5)
+
+
+def test_contrast_at_any_temperature_is_finite_and_a_word_is_no_rival_of_itself(rng: np.random.Generator) -> None:
+    features, text, mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
+    for temperature in (1e-12, 1e12):
+        scores = relevancy(features, text, mean, negatives=text[:0], temperature=temperature)
+        assert np.isfinite(scores[:, features.seen]).all()
+    twice = np.concatenate([text[:1], text])
+    scores = relevancy(features, twice, mean, negatives=text[1:])
+    np.testing.assert_array_equal(scores[0], scores[1])
+    assert np.nanmax(scores[0]) > 0.6
+    with pytest.raises(InputError, match="two different asked words"):
+        relevancy(features, text[:1], mean, negatives=text[:1])
+
+
+def test_wrong_sizes_and_values_are_named(rng: np.random.Generator, no_jaxtyping: None) -> None:
+    features, text, mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
+    with pytest.raises(InputError, match="24 channels"):
+        relevancy(features, text[:, :5], mean)
+    with pytest.raises(InputError, match="NaN or Inf"):
+        relevancy(features, text * np.nan, mean)
+    with pytest.raises(InputError, match="temperature > 0"):
+        relevancy(features, text, mean, temperature=0.0)
+
+
+def test_thresholds_of_each_kind() -> None:
+    scores = np.r_[np.linspace(0, 0.8, 81), np.nan].astype(np.float32)
+    assert threshold(scores, ThresholdConfig(kind="fixed", fixed=0.3)) == 0.3
+    assert threshold(scores, ThresholdConfig(kind="relative", relative=0.5)) == pytest.approx(0.4)
+    assert threshold(scores, ThresholdConfig(kind="quantile", quantile=0.25)) == pytest.approx(0.2)
+    assert math.isnan(threshold(scores[-1:], ThresholdConfig()))
+
+
+def test_otsu_splits_two_groups_between_them(rng: np.random.Generator) -> None:
+    few = rng.normal(0.9, 0.02, 50)
+    many = rng.normal(0.0, 0.05, 20_000)
+    level = otsu(np.r_[few, many].astype(np.float32))
+    assert many.max() < level < few.min()
+
+
+def test_otsu_agrees_with_an_exhaustive_search(rng: np.random.Generator) -> None:
+    values = np.r_[rng.normal(0.2, 0.1, 400), rng.normal(0.7, 0.1, 300)].astype(np.float32)
+    upper = np.sort(values[values >= np.median(values)]).astype(np.float64)
+    cuts = [upper[:k].size * upper[k:].size * (upper[k:].mean() - upper[:k].mean()) ** 2 for k in range(1, upper.size)]
+    best = upper[int(np.argmax(cuts)) : int(np.argmax(cuts)) + 2]
+    assert otsu(values, bins=4096) == pytest.approx(best.mean(), abs=0.01)
+
+
+def test_otsu_of_one_value_is_that_value() -> None:
+    assert otsu(np.full(9, 0.25, np.float32)) == 0.25
+
+
+@pytest.mark.parametrize(
+    ("wrong", "name"), [({"fixed": 1.5}, "fixed"), ({"relative": 0.0}, "relative"), ({"quantile": -0.1}, "quantile")]
+)
+def test_a_threshold_out_of_range_is_named(wrong: dict[str, float], name: str) -> None:
+    with pytest.raises(InputError, match=name):
+        ThresholdConfig(**wrong)
