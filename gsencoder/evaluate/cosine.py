@@ -16,7 +16,7 @@ class FieldError:
     """One field held against a more accurate one; each seen Gaussian counts the same, however much it was seen.
 
     Attributes:
-        centred: 1 − mean cosine after the reference's mean is taken off both, over Gaussians that both saw.
+        centred: 1 − mean cosine after each field's own mean is taken off, over Gaussians that both saw.
         raw: the same without taking the mean off.
         covered: share of the reference's seen Gaussians that the other saw too.
     """
@@ -58,7 +58,7 @@ def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, samp
         part = both[start : start + CHUNK]
         a, b = features.decode(part).astype(np.float64), reference.decode(part).astype(np.float64)
         raw += _cosines(a, b)
-        centred += _cosines(a - reference.mean, b - reference.mean)
+        centred += _cosines(a - features.mean, b - reference.mean)
     if not len(both):
         return FieldError(centred=1.0, raw=1.0, covered=0.0)
     return FieldError(centred=1 - centred / len(both), raw=1 - raw / len(both), covered=len(both) / len(rows))

@@ -104,7 +104,7 @@ def evaluate_localization(
     if words is None:
         raise InputError(f"evaluate: no words lead into the space of teacher {teacher.name}; give teacher.words=")
     outcomes = []
-    for path in track(paths, "scenes"):
+    for path in track([Path(path) for path in paths], "scenes"):
         clock = time.perf_counter()
         scene = load_scene(path, options=data)
         loaded = time.perf_counter() - clock

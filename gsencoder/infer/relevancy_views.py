@@ -40,7 +40,7 @@ def relevancy_pictures(
     found: Localization,
     *,
     per_word: int,
-    config: BlendConfig = BlendConfig(),  # noqa: B008
+    config: BlendConfig = BlendConfig(),
 ) -> Iterator[tuple[str, Image.Image]]:
     """For each word its best views, rendered, with relevancy over them and its boxes.
 

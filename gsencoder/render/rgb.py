@@ -28,7 +28,7 @@ def render_image(
     *,
     blended: Blend | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    config: BlendConfig = BlendConfig(),  # noqa: B008 - frozen
+    config: BlendConfig = BlendConfig(),
 ) -> UInt8[np.ndarray, "H W 3"]:
     """One view in colour.
 
@@ -53,7 +53,7 @@ def depth_image(b: Blend, min_alpha: float = 0.5) -> Float32[np.ndarray, "H W"]:
 class RenderedImages(Sequence[UInt8[np.ndarray, "H W 3"]]):
     """Pictures of a splat through each of its cameras, rendered on access: photographs for a splat that has none."""
 
-    def __init__(self, gaussians: Gaussians, cameras: Cameras, config: BlendConfig = BlendConfig()) -> None:  # noqa: B008
+    def __init__(self, gaussians: Gaussians, cameras: Cameras, config: BlendConfig = BlendConfig()) -> None:
         self.gaussians, self.cameras, self.config = gaussians, cameras, config
 
     def __len__(self) -> int:

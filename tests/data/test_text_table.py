@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.data.text_table import TextTable, load_text_table, make_text_table, normalise, save_text_table
+from gsencoder.data.text_table import TextTable, load_text_table, make_text_table, save_text_table
 from gsencoder.errors import InputError
 
 NAMES = (
@@ -87,11 +87,12 @@ def test_an_unknown_word_with_nothing_near_says_so(table: TextTable) -> None:
 @settings(deadline=None, max_examples=100)
 def test_any_text_is_a_word_of_the_table_or_an_error_of_one_line(word: str) -> None:
     table = make_text_table(("mug", "box"), np.eye(2), "toy")
-    try:
-        assert table.encode([word]).shape == (1, 2)
-    except InputError as error:
-        assert "not among" in str(error)
-    assert normalise(normalise(word)) == normalise(word) or word.casefold().lstrip().startswith(("a", "an", "the"))
+    known = table.find(word)
+    if known is not None:
+        assert np.array_equal(table.encode([word])[0], table.embeddings[known])
+    else:
+        with pytest.raises(InputError, match="not among the 2 words of toy"):
+            table.encode([word])
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
@@ -205,10 +206,13 @@ def test_bytes_overwritten_anywhere_give_a_table_or_an_input_error(
     at %= len(data)
     data[at : at + len(patch)] = patch
     path.write_bytes(data)
+    message = ""
     try:
-        assert isinstance(load_text_table(path), TextTable)
+        read: TextTable | None = load_text_table(path)
     except InputError as error:
-        assert "\n" not in str(error)
+        read, message = None, str(error)
+    assert (read is None) == bool(message)
+    assert "\n" not in message
 
 
 def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None:
@@ -235,9 +239,9 @@ def test_the_real_table_knows_what_its_names_say(shared: Path) -> None:
     table = load_text_table(shared / "models" / "clip_vitb32_names.npz")
     assert len(table) == 1583
     assert table.space.text_encoder == "clip_vitb32"
-    assert np.array_equal(table.encode(["Coffee_Mugs"]), table.encode(["coffee mug"]))
-    with pytest.raises(InputError, match="near: "):
-        table.encode(["cofee mug"])
+    assert np.array_equal(table.encode(["Coffee_Cups"]), table.encode(["coffee cup"]))
+    with pytest.raises(InputError, match=r"near: coffee cup.*mug"):
+        table.encode(["coffee mug"])
     # Names of such a space all look alike until their mean is removed.
     raw = table.embeddings[:200] @ table.embeddings[:200].T
     centred = table.embeddings[:200] - table.mean

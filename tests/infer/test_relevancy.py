@@ -35,7 +35,8 @@ def words(rng: np.random.Generator, count: int = 3) -> np.ndarray:
 
 def plain_cosine(features: np.ndarray, text: np.ndarray) -> np.ndarray:
     a, b = features.astype(np.float64), text.astype(np.float64)
-    return (b / np.linalg.norm(b, axis=1, keepdims=True)) @ (a / np.linalg.norm(a, axis=1, keepdims=True)).T
+    a, b = (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300) for x in (a, b))
+    return b @ a.T
 
 
 @pytest.mark.parametrize("mode", ["raw", "centred"])

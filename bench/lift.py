@@ -1,0 +1,239 @@
+"""Lifting 1280-channel maps: in a basis of rank 32 against dense loops over all channels, in one run.
+
+    python bench/lift.py SCENE [--voxel 0.02] [--views 0] [--runs 5] [--quick]
+
+Maps: `SyntheticTeacher` (rank 32 plus noise of about 10 % of the energy, seed 0) on 24 × 32 cells, which is what a
+teacher with patches of 14 pixels sees of a picture resized to 336 × 448. Blending weights with their transposes, and
+the visibility of Gaussians' centres, are made beforehand and timed apart; so is finding the basis. Timed as the lift:
+allocating the sums, projecting the maps onto the basis (for lifts in a basis), adding up all views, and dividing.
+
+Ways:
+    blend     the library: Bᵀ @ maps, all of B's entries
+    center    the library: one entry for each visible centre (OpenScene's and SplatDistill's rule)
+    gather    the dense loop that one would write: for each view the features of the visible centres are gathered into
+              one reused buffer and added to the rows of their Gaussians
+The dense loops work on all channels; for each, the lift in the basis follows the same rule and is judged against it.
+
+Memory is the growth of the peak of resident memory (VmHWM, set back before) during one lift. The maps and matrices are
+there before, for all ways alike.
+
+The errors are those of the lift in the basis against the dense loop, and of both against the same lift of maps without
+noise: what the basis leaves out is mostly noise.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.evaluate.cosine import field_error
+from gsencoder.evaluate.memory import memory_growth
+from gsencoder.fusion.basis import Moments, encode, fit_basis
+from gsencoder.fusion.fuse import FuseConfig, _center_matrix
+from gsencoder.fusion.teachers.synthetic import SyntheticTeacher
+from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Views
+
+RANK = 32
+VISIBILITY = FuseConfig(visibility=VisibilityConfig(against=("sensor",), relative=0.02))
+
+
+@dataclass
+class Problem:
+    """All that a lift starts from."""
+
+    gaussians: Gaussians
+    maps: list[FeatureMap]
+    clean: list[FeatureMap]
+    blends: list[Blend]
+    centers: list[Blend]
+    basis: FeatureBasis
+    mean: np.ndarray
+    seconds: dict[str, float]
+
+
+def prepare(path: str, voxel: float, count: int) -> Problem:
+    scene = load_scene(path)
+    gaussians = seed(scene, SeedConfig(voxel=voxel))
+    views = scene.views
+    assert views is not None
+    assert views.depths is not None
+    chosen = range(len(views) if not count else min(count, len(views)))
+    teacher = SyntheticTeacher(rank=RANK)
+    maps = [teacher.feature_map(views, view) for view in chosen]
+    quiet = SyntheticTeacher(rank=RANK, noise=0.0)
+    clean = [quiet.feature_map(views, view) for view in chosen]
+    seconds: dict[str, float] = {}
+    blends = timed_list(seconds, "blending weights", lambda view: build(gaussians, views, view, maps[view]), chosen)
+    centers = timed_list(seconds, "visible centres", lambda view: visible(gaussians, views, view, maps[view]), chosen)
+    start = time.perf_counter()
+    moments = Moments(teacher.space.channels)
+    for one in maps:
+        moments.add(one.features.reshape(-1, teacher.space.channels))
+    covariance = moments.covariance()
+    basis = fit_basis(moments.mean, covariance, teacher.space, energy=1.0, max_rank=RANK)
+    seconds["basis"] = time.perf_counter() - start
+    return Problem(gaussians, maps, clean, blends, centers, basis, basis.mean, seconds)
+
+
+def timed_list(seconds: dict[str, float], name: str, make: Callable[[int], Blend], views: range) -> list[Blend]:
+    make(views[0])
+    start = time.perf_counter()
+    made = [make(view) for view in views]
+    seconds[name] = time.perf_counter() - start
+    return made
+
+
+def build(gaussians: Gaussians, views: Views, view: int, one: FeatureMap) -> Blend:
+    made = blend(gaussians, views.cameras, view, like=one, config=BlendConfig())
+    _ = made.transposed
+    return made
+
+
+def visible(gaussians: Gaussians, views: Views, view: int, one: FeatureMap) -> Blend:
+    made = _center_matrix(gaussians, views, view, one, [views.depths[view]], VISIBILITY)
+    _ = made.transposed
+    return made
+
+
+def rows_of(one: FeatureMap) -> np.ndarray:
+    return one.features.reshape(-1, one.space.channels)
+
+
+def lift_matrix(problem: Problem, matrices: list[Blend], basis: FeatureBasis | None) -> tuple[np.ndarray, np.ndarray]:
+    """The library's way: sums and weights by sparse products, in a basis or in all channels."""
+    columns = basis.rank if basis is not None else problem.mean.size
+    sums = np.zeros((len(problem.gaussians), columns), np.float32)
+    weights = np.zeros((len(problem.gaussians), 1), np.float32)
+    for b, one in zip(matrices, problem.maps, strict=True):
+        maps = rows_of(one)
+        maps = encode(basis, maps) if basis is not None else maps
+        b.lift_into(torch.from_numpy(maps), torch.from_numpy(sums))
+        b.lift_into(torch.ones(len(maps), 1), torch.from_numpy(weights))
+    np.divide(sums, weights, out=sums, where=weights > 0)
+    return sums, weights[:, 0]
+
+
+def lift_gather(problem: Problem, basis: FeatureBasis | None) -> tuple[np.ndarray, np.ndarray]:
+    """The dense loop: visible rows only, one buffer for all views, torch's own gather and add."""
+    assert basis is None
+    n, channels = len(problem.gaussians), problem.mean.size
+    # numpy's zeros lie in huge pages, which fill several times faster than torch's; a good loop takes them.
+    sums = torch.from_numpy(np.zeros((n, channels), np.float32))
+    weights = torch.zeros(n, 1)
+    most = max(len(b.transposed[0]) for b in problem.centers)
+    buffer = torch.from_numpy(np.empty((most, channels), np.float32))
+    for b, one in zip(problem.centers, problem.maps, strict=True):
+        rows, _, cells, _ = b.transposed
+        part = buffer[: len(rows)]
+        torch.index_select(torch.from_numpy(rows_of(one)), 0, cells.long(), out=part)
+        sums.index_add_(0, rows, part)
+        weights.index_add_(0, rows, torch.ones(len(rows), 1))
+    sums.div_(weights.clamp(min=1))
+    return sums.numpy(), weights[:, 0].numpy()
+
+
+def lift_gather_blocks(problem: Problem, basis: FeatureBasis | None) -> tuple[np.ndarray, np.ndarray]:
+    """The same in blocks of 1024 rows, so that the buffer stays in the processor's cache."""
+    assert basis is None
+    n, channels = len(problem.gaussians), problem.mean.size
+    sums = torch.from_numpy(np.zeros((n, channels), np.float32))
+    weights = torch.zeros(n, 1)
+    buffer = torch.empty(1024, channels)
+    for b, one in zip(problem.centers, problem.maps, strict=True):
+        rows, _, cells, _ = b.transposed
+        source = torch.from_numpy(rows_of(one))
+        for some, where in zip(rows.split(1024), cells.long().split(1024), strict=True):
+            part = buffer[: len(some)]
+            torch.index_select(source, 0, where, out=part)
+            sums.index_add_(0, some, part)
+        weights.index_add_(0, rows, torch.ones(len(rows), 1))
+    sums.div_(weights.clamp(min=1))
+    return sums.numpy(), weights[:, 0].numpy()
+
+
+Lift = Callable[[Problem, FeatureBasis | None], tuple[np.ndarray, np.ndarray]]
+
+WAYS: dict[str, tuple[Lift, str]] = {
+    "blend": (lambda p, basis: lift_matrix(p, p.blends, basis), "blend"),
+    "center": (lambda p, basis: lift_matrix(p, p.centers, basis), "center"),
+    "gather": (lift_gather, "center"),
+    "gather in blocks": (lift_gather_blocks, "center"),
+}
+"""The lift, and the rule that it follows."""
+
+
+def memory_of(problem: Problem, way: str, dense: bool) -> float:
+    """How much one lift makes the process grow at its peak, MiB."""
+    with memory_growth() as growth:
+        WAYS[way][0](problem, None if dense else problem.basis)
+    return growth.mib
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene")
+    parser.add_argument("--voxel", type=float, default=0.02)
+    parser.add_argument("--views", type=int, default=0, help="0 = all")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="6 views, 2 runs")
+    options = parser.parse_args()
+    if options.quick:
+        options.views, options.runs = 6, 2
+    problem = prepare(options.scene, options.voxel, options.views)
+    n, channels, views = len(problem.gaussians), problem.mean.size, len(problem.maps)
+    mean_columns = [round(float(np.mean([len(b.columns) for b in some]))) for some in (problem.blends, problem.centers)]
+    print(f"{n:,} Gaussians, {views} views of 24 × 32 cells, {channels} channels, {torch.get_num_threads()} threads")
+    print(f"a view reaches {mean_columns[0]:,} Gaussians by blending, {mean_columns[1]:,} by visible centres")
+    for name, value in problem.seconds.items():
+        print(f"{name + ' (apart)':24s} {value:.2f} s")
+    print(f"basis of rank {problem.basis.rank} keeps {problem.basis.energy_kept:.3f} of the energy\n")
+
+    entries = [(way, dense) for way in WAYS for dense in (False, True) if dense or "gather" not in way]
+    seconds: dict[tuple[str, bool], list[float]] = {entry: [] for entry in entries}
+    for run in range(options.runs + 1):
+        for way, dense in entries:  # A B A B: what else the machine does falls on all alike.
+            start = time.perf_counter()
+            WAYS[way][0](problem, None if dense else problem.basis)
+            if run:  # The first round warms up.
+                seconds[way, dense].append(time.perf_counter() - start)
+    median = {entry: float(np.median(values)) for entry, values in seconds.items()}
+    memory = {entry: memory_of(problem, *entry) for entry in entries}
+    print(f"{'way':18s}{'channels':>9s}{'seconds':>9s}{'(least, most)':>16s}{'MiB':>8s}")
+    for entry in entries:
+        spread = f"({min(seconds[entry]):.2f}, {max(seconds[entry]):.2f})"
+        width = channels if entry[1] else problem.basis.rank
+        print(f"{entry[0]:18s}{width:9d}{median[entry]:9.3f}{spread:>16s}{memory[entry]:8.0f}")
+    print()
+    for way, rule in ((way, WAYS[way][1]) for way, dense in entries if dense):
+        low, high = (rule, False), (way, True)
+        narrow, wide = field(problem, *low), field(problem, *high)
+        error = field_error(narrow, wide)
+        print(
+            f"{rule} in the basis against {way}, all channels: {median[high] / median[low]:.1f}× faster, "
+            f"{memory[high] / max(memory[low], 1e-9):.1f}× less memory, centred cosine error {error.centred:.4f} "
+            f"(raw {error.raw:.4f}; {error.covered:.1%} of the seen Gaussians)"
+        )
+        if way == rule:
+            truth = field(replace(problem, maps=problem.clean), *high)
+            found = field_error(narrow, truth).centred, field_error(wide, truth).centred
+            print(f"    against maps without noise: in the basis {found[0]:.4f}, all channels {found[1]:.4f}")
+        del narrow, wide
+
+
+def field(problem: Problem, way: str, dense: bool) -> GaussianFeatures:
+    basis = None if dense else problem.basis
+    features, weights = WAYS[way][0](problem, basis)
+    mean = np.mean([rows_of(one).mean(axis=0) for one in problem.maps], axis=0).astype(np.float32)
+    space = problem.basis.space
+    return GaussianFeatures(features=features, weights=weights, mean=mean, space=space, basis=basis)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,237 @@
+"""Clusters, boxes and scores: laws, and the clusters of one, two and three points."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gsencoder.infer.boxes import Extents, box_around, cluster, oriented_axes, scene_spacing, score_clusters
+from gsencoder.types import Gaussians
+
+
+def splat(means: np.ndarray, scale: float = 0.01, quats: np.ndarray | None = None) -> Gaussians:
+    n = len(means)
+    return Gaussians(
+        means=np.asarray(means, np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)) if quats is None else quats.astype(np.float32),
+        scales=np.tile(np.float32([scale, 2 * scale, 3 * scale]), (n, 1)),
+        opacities=np.ones(n, np.float32),
+        sh=np.zeros((n, 1, 3), np.float32),
+    )
+
+
+def bounds(points: np.ndarray, **options: object) -> Extents:
+    return box_around(splat(points), np.arange(len(points)), **options)
+
+
+def inside(points: np.ndarray, box: Extents, slack: float = 1e-5) -> bool:
+    turned = (points.astype(np.float64) - box.center) @ box.rotation
+    axis_aligned = (points >= box.aabb_min - slack).all() and (points <= box.aabb_max + slack).all()
+    return bool((np.abs(turned) <= box.size / 2 + slack).all() and axis_aligned)
+
+
+def is_rotation(matrix: np.ndarray) -> bool:
+    return np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-9) and math.isclose(np.linalg.det(matrix), 1)
+
+
+def test_the_spacing_of_a_grid_is_its_step_whatever_the_order_and_the_duplicates(rng: np.random.Generator) -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(12)] * 3), axis=-1).reshape(-1, 3).astype(np.float32) * np.float32(0.02)
+    assert scene_spacing(grid) == pytest.approx(0.02, rel=1e-4)
+    shuffled = rng.permutation(grid)
+    assert scene_spacing(shuffled) == scene_spacing(grid)
+    assert scene_spacing(np.concatenate([shuffled, shuffled, shuffled])) == pytest.approx(0.02, rel=1e-4)
+
+
+def test_the_spacing_of_a_sample_does_not_depend_on_order(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = rng.random((4000, 3)).astype(np.float32)
+    whole = scene_spacing(points)
+    monkeypatch.setattr("gsencoder.infer.boxes.SPACING_SAMPLE", 500)
+    sampled = scene_spacing(points)
+    assert sampled == scene_spacing(rng.permutation(points))
+    assert sampled == pytest.approx(whole, rel=0.1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_points_in_one_place_have_no_spacing(count: int) -> None:
+    assert scene_spacing(np.full((count, 3), 1.5, np.float32)) == 0
+
+
+def two_groups(rng: np.random.Generator) -> np.ndarray:
+    return np.concatenate([rng.normal(0, 0.05, (200, 3)), rng.normal(1, 0.05, (100, 3)), [[5.0, 5, 5]]]).astype(
+        np.float32
+    )
+
+
+@pytest.mark.parametrize("grid_above", [0, 10**9])
+def test_two_groups_and_a_floater_are_told_apart_on_the_grid_and_without(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, grid_above: int
+) -> None:
+    monkeypatch.setattr("gsencoder.infer.boxes.GRID_ABOVE", grid_above)
+    labels = cluster(two_groups(rng), 0.2, 3)
+    assert len(set(labels[:200])) == 1
+    assert len(set(labels[200:300])) == 1
+    assert labels[0] != labels[200]
+    assert labels[300] == -1
+
+
+def test_clusters_on_the_grid_are_those_of_dbscan_on_a_surface(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    centers = rng.random((30, 3)) * 4
+    points = (centers[rng.integers(0, 30, 6000)] + rng.normal(0, 0.03, (6000, 3))).astype(np.float32)
+    exact = cluster(points, 0.08, 3)
+    monkeypatch.setattr("gsencoder.infer.boxes.GRID_ABOVE", 0)
+    coarse = cluster(points, 0.08, 3)
+    from sklearn.metrics import adjusted_rand_score
+
+    assert adjusted_rand_score(exact, coarse) > 0.99
+
+
+def test_nothing_selected_has_no_clusters() -> None:
+    assert cluster(np.zeros((0, 3), np.float32), 0.1, 3).shape == (0,)
+    empty = np.zeros(0, np.int64)
+    assert score_clusters(empty, empty, empty.astype(np.float32), empty.astype(np.float32)) == []
+
+
+def test_a_small_cluster_that_answers_better_comes_before_a_large_one_that_answers_worse() -> None:
+    labels = np.r_[np.zeros(900, int), np.ones(100, int), [-1]]
+    scores = np.where(labels == 1, 0.9, 0.45).astype(np.float32)
+    found = score_clusters(labels, np.arange(1001), scores, np.ones(1001, np.float32))
+    assert [len(one.rows) for one in found] == [100, 900]
+    assert found[0].score == pytest.approx(0.9 * (100 / 1001) ** 0.25)
+
+
+def test_floaters_are_dropped_by_their_share_of_the_best_clusters_weight() -> None:
+    labels = np.r_[np.zeros(96, int), np.ones(4, int)]
+    scores, weights = np.full(100, 0.8, np.float32), np.ones(100, np.float32)
+    rows = np.arange(100) + 7
+    assert len(score_clusters(labels, rows, scores, weights)) == 2
+    found = score_clusters(labels, rows, scores, weights, min_share=0.05)
+    assert [one.rows.tolist() for one in found] == [list(range(7, 103))]
+
+
+def test_scores_do_not_change_when_all_weights_are_scaled(rng: np.random.Generator) -> None:
+    labels, scores = rng.integers(-1, 3, 60), rng.random(60).astype(np.float32)
+    weights = rng.random(60).astype(np.float32) + np.float32(0.1)
+    a = score_clusters(labels, np.arange(60), scores, weights)
+    b = score_clusters(labels, np.arange(60), scores, weights * np.float32(1e4))
+    np.testing.assert_allclose([one.score for one in a], [one.score for one in b], rtol=1e-5)
+
+
+@given(
+    st.integers(1, 40),
+    st.sampled_from(["volume", "plane", "line", "place", "tilted plane"]),
+    st.integers(0, 10_000),
+    st.booleans(),
+    st.sampled_from([1e-4, 1.0, 1e3]),
+)
+@settings(deadline=None, max_examples=150)
+def test_boxes_hold_their_points_and_have_sides_of_no_negative_length(
+    count: int, shape: str, seed: int, upright: bool, size: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    flattened = {
+        "volume": [1, 1, 1],
+        "plane": [1, 1, 0],
+        "line": [1, 0, 0],
+        "place": [0, 0, 0],
+        "tilted plane": [1, 1, 0],
+    }
+    points = rng.normal(size=(count, 3)) * flattened[shape]
+    if shape == "tilted plane":
+        points = points @ Rotation.random(rng=seed).as_matrix()
+    points = (points * size + 1).astype(np.float32)
+    box = bounds(points, up=np.array([0.0, 0, 1]) if upright else None)
+    assert is_rotation(box.rotation)
+    assert (box.size >= 0).all()
+    assert (box.aabb_max >= box.aabb_min).all()
+    assert inside(points, box, slack=1e-5 * max(size, 1))
+    if upright:
+        np.testing.assert_allclose(box.rotation[:, 2], [0, 0, 1], atol=1e-12)
+
+
+def test_the_oriented_box_of_a_turned_brick_is_the_brick(rng: np.random.Generator) -> None:
+    brick = rng.uniform(-0.5, 0.5, (3000, 3)) * [3, 2, 1]
+    corners = np.array([[x, y, z] for x in (-1.5, 1.5) for y in (-1, 1) for z in (-0.5, 0.5)])
+    turn = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
+    points = (np.concatenate([brick, corners]) @ turn.T).astype(np.float32)
+    box = bounds(points)
+    np.testing.assert_allclose(np.sort(box.size), [1, 2, 3], rtol=0.02)
+    np.testing.assert_allclose(box.center, 0, atol=0.01)
+
+
+def test_the_upright_box_of_a_brick_turned_about_up_is_the_brick(rng: np.random.Generator) -> None:
+    corners = np.array([[x, y, z] for x in (-1.5, 1.5) for y in (-1, 1) for z in (-0.5, 0.5)])
+    for up in np.array([[0.0, 0, 1], [0, -1, 0], [0.6, 0, 0.8]]):
+        stand = Rotation.align_vectors(up[None], [[0, 0, 1]])[0]
+        points = stand.apply(Rotation.from_euler("z", 0.4).apply(corners)).astype(np.float32)
+        box = bounds(points, up=up)
+        np.testing.assert_allclose(np.sort(box.size), [1, 2, 3], rtol=1e-4)
+        np.testing.assert_allclose(box.rotation[:, 2], up, atol=1e-12)
+        assert box.size[2] == pytest.approx(1, rel=1e-4)
+
+
+def test_a_flat_turned_rectangle_has_its_smallest_area() -> None:
+    corners = np.array([[x, y, 0] for x in (-2.0, 2) for y in (-1, 1)])
+    points = Rotation.from_euler("xyz", [0.5, 0.2, 0.9]).apply(corners).astype(np.float32)
+    np.testing.assert_allclose(np.sort(bounds(points).size), [0, 2, 4], atol=1e-5)
+
+
+def test_points_on_a_line_have_a_box_along_it() -> None:
+    direction = np.array([1.0, 2, 2]) / 3
+    points = (np.linspace(0, 3, 7)[:, None] * direction).astype(np.float32)
+    box = bounds(points)
+    np.testing.assert_allclose(np.sort(box.size), [0, 0, 3], atol=1e-5)
+    assert abs(box.rotation[:, box.size.argmax()] @ direction) == pytest.approx(1)
+
+
+def test_one_two_and_three_points_have_boxes() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], np.float32)
+    assert bounds(points[:1]).size.tolist() == [0, 0, 0]
+    np.testing.assert_allclose(np.sort(bounds(points[:2]).size), [0, 0, 1], atol=1e-7)
+    area = np.sort(bounds(points).size)
+    assert area[0] == pytest.approx(0, abs=1e-7)
+    assert area[1] * area[2] <= 2 + 1e-6
+
+
+def test_the_margin_grows_both_boxes_on_every_side(rng: np.random.Generator) -> None:
+    points = rng.random((50, 3)).astype(np.float32)
+    plain, grown = bounds(points), bounds(points, margin=0.25)
+    np.testing.assert_allclose(grown.size, plain.size + 0.5)
+    np.testing.assert_allclose(grown.aabb_min, plain.aabb_min - 0.25)
+    np.testing.assert_allclose(grown.aabb_max, plain.aabb_max + 0.25)
+
+
+def test_sigma_boxes_bound_the_ellipsoids(rng: np.random.Generator) -> None:
+    quats = Rotation.random(20, rng=1).as_quat()[:, [3, 0, 1, 2]]
+    gaussians = splat(rng.random((20, 3)), 0.05, quats)
+    box = box_around(gaussians, np.arange(20), extent="sigma", sigmas=2.0)
+    directions = rng.normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turns = Rotation.from_quat(gaussians.quats[:, [1, 2, 3, 0]]).as_matrix()
+    surface = np.concatenate(
+        [m + 2 * (directions * s) @ r.T for m, s, r in zip(gaussians.means, gaussians.scales, turns, strict=True)]
+    )
+    assert inside(surface, box, slack=1e-6)
+    np.testing.assert_allclose(surface.min(axis=0), box.aabb_min, atol=2e-3)
+    np.testing.assert_allclose(surface.max(axis=0), box.aabb_max, atol=2e-3)
+    turned = (surface - box.center) @ box.rotation
+    np.testing.assert_allclose(np.ptp(turned, axis=0), box.size, atol=4e-3)
+
+
+def test_boxes_move_with_their_points(rng: np.random.Generator) -> None:
+    points = rng.random((80, 3)).astype(np.float32)
+    offset = np.array([4.0, -8, 16])
+    a, b = bounds(points), bounds((points + offset).astype(np.float32))
+    np.testing.assert_allclose(b.aabb_min, a.aabb_min + offset, atol=2e-6)
+    assert np.prod(b.size) == pytest.approx(np.prod(a.size), rel=1e-3)
+
+
+def test_the_axes_of_a_cube_that_stands_along_the_worlds_axes_are_the_worlds() -> None:
+    corners = np.array([[x, y, z] for x in (0.0, 1) for y in (0, 1) for z in (0, 1)])
+    np.testing.assert_allclose(oriented_axes(corners, np.array([0.0, 0, 1])), np.eye(3), atol=1e-12)
