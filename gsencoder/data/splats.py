@@ -108,6 +108,8 @@ def gaussians_from_raw(
     )
 
 
+# Damaged numbers reach the caller as they are: no warning about a signalling NaN that is cast on the way.
+@np.errstate(invalid="ignore", over="ignore")
 def read_raw(path: str | Path) -> RawSplat:
     """Reads a splat file without judging its values: only what breaks the format is an error.
 

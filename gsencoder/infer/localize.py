@@ -82,10 +82,10 @@ def localize(
 ) -> Localization:
     """Finds words in a scene.
 
-    Each word's Gaussians above the threshold are clustered (DBSCAN); every cluster becomes a box with the score that
-    `infer.boxes.score_clusters` defines. Axis-aligned and oriented boxes are drawn around Gaussian means, with
-    `config.margin` spacings on every side, unless `config.extent` says "sigma", and have the scene's origin added back
-    in float64. A word's boxes do not depend on the other words asked, unless `config.contrast` is on.
+    Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
+    score that `infer.boxes.score_clusters` defines. Axis-aligned and oriented boxes are drawn around Gaussian means,
+    with `config.margin` spacings on every side, unless `config.extent` says "sigma", and have the scene's origin
+    added back in float64. A word's boxes do not depend on the other words asked, unless `config.contrast` is on.
 
     Args:
         scene: Gaussians with features.
@@ -128,7 +128,7 @@ def localize(
         named = ", ".join(map(repr, empty[:5])) + (", …" if len(empty) > 5 else "")
         warnings.warn(
             f"scene {scene.name}: {len(empty)} of {len(queries)} words have no box ({named}): no cluster of Gaussians "
-            "lies above the threshold",
+            "reaches the threshold",
             SceneWarning,
             stacklevel=2,
         )
@@ -187,7 +187,7 @@ def _boxes_of(
 ) -> list[Box]:
     """The boxes of one word, best first."""
     # Comparisons with NaN are false: Gaussians never seen are never taken.
-    rows = np.flatnonzero((scores > level) & (features.weights > config.min_weight))
+    rows = np.flatnonzero((scores >= level) & (features.weights > config.min_weight))
     eps = config.eps if config.eps is not None else config.eps_spacings * spacing
     labels = cluster(gaussians.means[rows], eps, config.min_samples)
     ranked = score_clusters(labels, rows, scores[rows], features.weights[rows], min_share=config.min_share)

@@ -144,7 +144,7 @@ def _contrast(
 
 
 def threshold(scores: Float32[np.ndarray, " N"], config: ThresholdConfig) -> float:
-    """The relevancy above which one word's Gaussians are taken; NaN where no Gaussian was seen."""
+    """The relevancy from which on one word's Gaussians are taken; NaN where no Gaussian was seen."""
     seen = scores[np.isfinite(scores)]
     if seen.size == 0:
         return math.nan
