@@ -31,6 +31,9 @@ class Command:
 COMMANDS = {
     command.name: command
     for command in (
+        Command(
+            name="demo", config="DemoConfig", help="the whole pipeline on a built-in scene, offline, in one report"
+        ),
         Command(name="fuse", config="FuseCommandConfig", help="per-Gaussian features from a teacher's maps"),
         Command(name="localize", config="LocalizeCommandConfig", help="boxes, scores and pictures for words"),
         Command(name="evaluate", config="EvaluateConfig", help="a paper's metric on labelled scenes"),

@@ -13,7 +13,7 @@ from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
-from gsencoder.fusion.store import save_features
+from gsencoder.fusion.store import WORDS_FILE, save_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.onnx import OnnxConfig
@@ -23,8 +23,6 @@ from gsencoder.progress import Progress, console
 from gsencoder.render.rgb import RenderedImages
 from gsencoder.summary import Summary
 from gsencoder.types import Scene, Views
-
-WORDS_FILE = "words.safetensors"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

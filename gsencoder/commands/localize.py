@@ -8,7 +8,7 @@ import numpy as np
 from gsencoder.config import CommonConfig
 from gsencoder.data.text_table import TextTable, load_text_table
 from gsencoder.errors import InputError
-from gsencoder.fusion.store import load_features
+from gsencoder.fusion.store import WORDS_FILE, load_features
 from gsencoder.infer.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
 from gsencoder.infer.relevancy_views import relevancy_pictures
@@ -16,8 +16,6 @@ from gsencoder.outputs import output_folder, write_json
 from gsencoder.progress import console
 from gsencoder.summary import Summary
 from gsencoder.types import Localization
-
-WORDS_FILE = "words.safetensors"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

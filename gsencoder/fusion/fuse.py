@@ -43,6 +43,7 @@ class FuseConfig:
     table_energy: float = field(default=0.9999, metadata={"help": "the same for coded maps (labels, regions)"})
     max_rank: int = field(default=0, metadata={"help": "largest rank of the basis; 0 = as many as the energy asks"})
     basis: bool = field(default=True, metadata={"help": "fuse in a low-rank basis; false = in all channels"})
+    narrow: int = field(default=64, metadata={"help": "teachers with no more channels than this keep all of them"})
     views: int = field(default=0, metadata={"help": "views used, evenly spaced; 0 = all"})
 
 
@@ -167,9 +168,10 @@ def _find_basis(
     maps: _Maps, chosen: tuple[int, ...], config: FuseConfig, clock: _Clock, track: Track
 ) -> tuple[FeatureBasis | None, Float32[np.ndarray, " D"], float]:
     teacher, space = maps.teacher, maps.teacher.space
+    wanted = config.basis and space.channels > config.narrow
     if teacher.table is not None:
         mean = teacher.mean if teacher.mean is not None else teacher.table.mean(axis=0)
-        if not config.basis:
+        if not wanted:
             return None, mean, 0.0
         basis = table_basis(teacher.table, mean, space, energy=config.table_energy)
         return basis, mean, _truncation(basis, teacher.table)
@@ -179,7 +181,7 @@ def _find_basis(
         with clock("basis"):
             moments.add(vectors[np.isfinite(vectors[:, 0])])
     mean = moments.mean.astype(np.float32)
-    if not config.basis:
+    if not wanted:
         return None, mean, 0.0
     with clock("basis"):
         basis = fit_basis(moments.mean, moments.covariance(), space, energy=config.energy, max_rank=config.max_rank)

@@ -19,6 +19,8 @@ from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, Gau
 
 VERSION = 1
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
+WORDS_FILE = "words.safetensors"
+"""The text table whose words lead into the features, beside them where there is one."""
 
 
 def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settings: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scen
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizeConfig:
-    """How words become boxes. Lengths in units of the scene's spacing, the median distance to the nearest Gaussian."""
+    """How words become boxes. Lengths in units of the scene's spacing (`infer.boxes.scene_spacing`)."""
 
     mode: Literal["centred", "raw"] = field(
         default="centred", metadata={"help": "cosines after removing each side's mean, or as they are"}
@@ -38,14 +38,14 @@ class LocalizeConfig:
     eps: float | None = field(
         default=None, metadata={"help": "DBSCAN radius in world units; left out: eps_spacings times the spacing"}
     )
-    eps_spacings: float = field(default=2.0, metadata={"help": "DBSCAN radius in spacings, where eps is not given"})
+    eps_spacings: float = field(default=1.5, metadata={"help": "DBSCAN radius in spacings, where eps is not given"})
     min_samples: int = field(default=3, metadata={"help": "Gaussians within the radius that make a core of a cluster"})
     min_share: float = field(default=0.05, metadata={"help": "clusters with less of the best one's weight are dropped"})
     extent: Literal["means", "sigma"] = field(
         default="means", metadata={"help": "boxes around Gaussian means, or around their ellipsoids"}
     )
     sigmas: float = field(default=1.0, metadata={"help": "size of the ellipsoids for extent=sigma"})
-    margin: float = field(default=0.1, metadata={"help": "added on every side of a box, in spacings"})
+    margin: float = field(default=0.0, metadata={"help": "added on every side of a box, in spacings"})
     upright: bool = field(
         default=True, metadata={"help": "oriented boxes stand along the scene's up, where it is known"}
     )

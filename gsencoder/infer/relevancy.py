@@ -29,7 +29,7 @@ class ThresholdConfig:
         default="fixed",
         metadata={"help": "fixed value, share of the word's best, quantile of the scene, or Otsu's split"},
     )
-    fixed: float = field(default=0.4, metadata={"help": "relevancy for kind=fixed"})
+    fixed: float = field(default=0.5, metadata={"help": "relevancy for kind=fixed"})
     relative: float = field(default=0.4, metadata={"help": "share of the word's highest relevancy for kind=relative"})
     quantile: float = field(default=0.995, metadata={"help": "share of the seen Gaussians left out, kind=quantile"})
 

@@ -1,9 +1,10 @@
 """Relevancy as pictures: a word's heat over rendered views of the scene, with its boxes drawn."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Integer
 from PIL import Image
 
 from gsencoder.errors import InputError
@@ -16,10 +17,13 @@ _SIDE = 96
 """Views are judged at this size, longer side in pixels, which is enough to see who sees what."""
 
 
-def best_views(gaussians: Gaussians, cameras: Cameras, rows: np.ndarray, count: int) -> list[int]:
-    """The `count` views that show the most of some Gaussians, best first.
+def best_views(
+    gaussians: Gaussians, cameras: Cameras, groups: Sequence[Integer[np.ndarray, "_n"]], count: int
+) -> list[list[int]]:
+    """For each group of Gaussians the `count` views that show the most of it, best first.
 
-    A view's worth is the share of its picture that `rows` fill, by their blending weights: what hides them counts.
+    A view's worth is the share of its picture that the group's rows fill, by their blending weights: what hides them
+    counts.
     """
     factor = _SIDE / np.maximum(cameras.widths, cameras.heights)
     Ks = cameras.Ks * np.stack((factor, factor, np.ones_like(factor)), axis=1)[:, :, None]
@@ -29,10 +33,15 @@ def best_views(gaussians: Gaussians, cameras: Cameras, rows: np.ndarray, count: 
         widths=np.maximum(1, cameras.widths * factor).astype(np.int32),
         heights=np.maximum(1, cameras.heights * factor).astype(np.int32),
     )
-    chosen = torch.zeros(len(gaussians))
-    chosen[torch.from_numpy(np.ascontiguousarray(rows, np.int64))] = 1
-    worth = [float(blend(gaussians, small, view).render(chosen).mean()) for view in range(len(cameras))]
-    return sorted(range(len(cameras)), key=lambda view: (-worth[view], view))[:count]
+    chosen = np.zeros((len(gaussians), len(groups)), np.float32)
+    for column, rows in enumerate(groups):
+        chosen[rows, column] = 1
+    members = torch.from_numpy(chosen)
+    worth = np.array(
+        [blend(gaussians, small, view).render(members).mean(dim=0).numpy() for view in range(len(cameras))]
+    )
+    # A stable sort of negated values: of equal views the first.
+    return [order[:count].tolist() for order in np.argsort(-worth, axis=0, kind="stable").T]
 
 
 def relevancy_pictures(
@@ -59,10 +68,15 @@ def relevancy_pictures(
     if scene.gaussians is None or scene.views is None:
         raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
     cameras = scene.views.cameras
+    boxes_of = {word: [box for box in found.boxes if box.query == word] for word in found.queries}
+    groups = [
+        boxes_of[word][0].rows if boxes_of[word] else np.flatnonzero(relevancy >= threshold)
+        for word, relevancy, threshold in zip(found.queries, found.relevancy, found.thresholds, strict=True)
+    ]
+    chosen = best_views(scene.gaussians, cameras, groups, per_word)
     for index, word in enumerate(found.queries):
-        boxes = [box for box in found.boxes if box.query == word]
-        rows = boxes[0].rows if boxes else np.flatnonzero(found.relevancy[index] > found.thresholds[index])
-        for view in best_views(scene.gaussians, cameras, rows, per_word):
+        boxes = boxes_of[word]
+        for view in chosen[index]:
             b = blend(scene.gaussians, cameras, view, config=config)
             rgb = render_image(scene.gaussians, cameras, view, blended=b)
             scores = torch.from_numpy(np.nan_to_num(found.relevancy[index], nan=0.0))

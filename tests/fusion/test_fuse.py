@@ -15,7 +15,7 @@ from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=6)
-EXACT = FuseConfig(energy=1.0)
+EXACT = FuseConfig(energy=1.0, narrow=0)
 
 
 class FixedTeacher:
@@ -126,11 +126,19 @@ def test_the_order_of_views_does_not_matter(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(decoded(one), decoded(other), atol=1e-4)
 
 
+def test_a_narrow_teacher_keeps_all_channels_and_a_wide_one_a_basis(rng: np.random.Generator) -> None:
+    scene, maps = make_scene(), random_maps(rng)
+    whole = fuse(scene, FixedTeacher(maps), FuseConfig(narrow=SPACE.channels)).features
+    assert whole.basis is None
+    assert whole.features.shape[1] == SPACE.channels
+    assert fuse(scene, FixedTeacher(maps), FuseConfig(narrow=SPACE.channels - 1)).features.basis is not None
+
+
 def test_coded_maps_are_the_same_as_their_vectors(rng: np.random.Generator) -> None:
     scene = make_scene()
     table = rng.normal(size=(4, 6)).astype(np.float32)
     codes = [rng.integers(0, 4, size=(24, 32)).astype(np.int32) for _ in range(5)]
-    coded = fuse(scene, CodedTeacher(codes, table), FuseConfig(table_energy=1.0))
+    coded = fuse(scene, CodedTeacher(codes, table), FuseConfig(table_energy=1.0, narrow=0))
     dense = fuse(scene, FixedTeacher([table[c] for c in codes], stride=1), EXACT)
     np.testing.assert_allclose(decoded(coded), decoded(dense), atol=1e-4)
     np.testing.assert_allclose(coded.features.weights, dense.features.weights, rtol=1e-4)
@@ -141,7 +149,7 @@ def test_cells_without_a_code_give_no_weight(rng: np.random.Generator) -> None:
     table = rng.normal(size=(4, 6)).astype(np.float32)
     codes = np.ones((24, 32), np.int32)
     codes[:, 16:] = -1
-    fusion = fuse(scene, CodedTeacher([codes], table), FuseConfig(table_energy=1.0))
+    fusion = fuse(scene, CodedTeacher([codes], table), FuseConfig(table_energy=1.0, narrow=0))
     np.testing.assert_allclose(
         decoded(fusion)[fusion.features.seen], np.broadcast_to(table[1], (fusion.features.seen.sum(), 6)), atol=1e-5
     )

@@ -1,0 +1,87 @@
+"""How each lift and each visibility test changes what is found: SplatDistill's protocol on labelled scenes.
+
+    python bench/visibility.py SCENE… [--voxels 0.02,0.01] [--thresholds 0.4] [--out table.csv]
+
+Seeds are made once a scene and voxel, then fused in every way. Rays per patch do not matter for the labels teacher,
+whose maps have one cell a pixel. Rows appear in the table when all scenes are done; a line a scene tells how far it is.
+"""
+
+import argparse
+import dataclasses
+import time
+import warnings
+from pathlib import Path
+
+from gsencoder.data.scenes import find_scenes, load_scene
+from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.errors import SceneWarning
+from gsencoder.evaluate.boxes import Hit
+from gsencoder.evaluate.localization import LocalizationProtocol, ask, scores
+from gsencoder.evaluate.tables import csv_text
+from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.fusion.teachers.build import build_teacher, text_table_of
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.relevancy import ThresholdConfig
+
+VISIBILITIES = {
+    "none": VisibilityConfig(),
+    **{
+        f"{source} {kind} {size}": VisibilityConfig(
+            against=(source,),
+            relative=size if kind == "relative" else 0.0,
+            absolute=size if kind == "absolute" else 0.0,
+        )
+        for source in ("sensor", "rendered")
+        for kind, size in (("relative", 0.01), ("relative", 0.02), ("relative", 0.05), ("absolute", 0.05))
+    },
+    "both relative 0.02": VisibilityConfig(against=("sensor", "rendered"), relative=0.02),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+")
+    parser.add_argument("--voxels", default="0.02,0.01")
+    parser.add_argument("--thresholds", default="0.4")
+    parser.add_argument("--only", default="", help="names of visibility tests, separated by commas")
+    parser.add_argument("--out", type=Path, default=Path("visibility.csv"))
+    options = parser.parse_args()
+    warnings.simplefilter("ignore", SceneWarning)
+    teacher = LabelsConfig()
+    words = text_table_of(teacher)
+    assert words is not None
+    tests = {name: VISIBILITIES[name] for name in options.only.split(",") if name} or VISIBILITIES
+    thresholds = [float(value) for value in options.thresholds.split(",")]
+    hits: dict[tuple[float, str, str, float], list[Hit]] = {}
+    seen: dict[tuple[float, str, str], list[float]] = {}
+    start = time.perf_counter()
+    for path in find_scenes(options.scenes):
+        for voxel in map(float, options.voxels.split(",")):
+            scene = load_scene(path)
+            scene = dataclasses.replace(scene, gaussians=seed(scene, SeedConfig(voxel=voxel)))
+            labels = build_teacher(teacher, scene, words)
+            for lift in ("blend", "center"):
+                for name, visibility in tests.items():
+                    config = FuseConfig(lift=lift, visibility=visibility)  # type: ignore[arg-type]
+                    features = fuse(scene, labels, config).features
+                    seen.setdefault((voxel, lift, name), []).append(float(features.seen.mean()))
+                    for level in thresholds:
+                        asked = LocalizeConfig(threshold=ThresholdConfig(fixed=level))
+                        found, _ = ask(scene, features, words, LocalizationProtocol(), asked)
+                        hits.setdefault((voxel, lift, name, level), []).extend(found)
+        print(f"{path.name}: {time.perf_counter() - start:.0f} s", flush=True)
+        rows = [
+            {
+                "voxel": voxel, "lift": lift, "visibility": name, "threshold": level, **scores(found),
+                "seen": sum(seen[voxel, lift, name]) / len(seen[voxel, lift, name]),
+            }
+            for (voxel, lift, name, level), found in hits.items()
+        ]  # fmt: skip
+        options.out.write_text(csv_text(rows))
+    print(options.out.read_text())
+
+
+if __name__ == "__main__":
+    main()

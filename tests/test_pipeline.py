@@ -1,0 +1,133 @@
+"""The commands one after the other, as a user runs them, on the scene that the demo makes."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsencoder import cli
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.splats import load_splat
+from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.fusion.store import load_features
+
+QUICK = ("views=8", "width=160", "objects=6", "quiet=true")
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("demo") / "demo"
+    assert cli.main(["demo", f"out={out}", *QUICK]) == 0
+    return out
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    record = json.loads((folder / "summary.json").read_text())
+    assert {"command", "version", "settings", "timings", "peak_memory_mb", "warnings", "results"} <= record.keys()
+    return record
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line that a refused command prints."""
+    capsys.readouterr()
+    assert cli.main([*arguments, "quiet=true"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = [line for line in captured.err.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_the_demo_finds_what_was_seen_and_shows_it_in_one_page(demo: Path) -> None:
+    results = summary_of(demo)["results"]
+    # In eight small pictures half of the chair and of the mug is never seen, and the lamp's stem is too thin to seed.
+    assert sum(iou >= 0.5 for iou in results["names"]["iou"].values()) >= 3
+    assert results["names"]["mean_iou"] > 0.5
+    assert results["colors"]["mean_iou"] > 0.4
+    page = (demo / results["report"]).read_text()
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
+    for heading in ("What went in", "Gaussians", "Features", "Where is each object?", "Where the time went"):
+        assert f"<h2>{heading}</h2>" in page
+    # Four views as pictures, renders, depths and two fields; a picture a word; two colour bars.
+    assert page.count("<img") == 5 * 4 + 2 * 6 + 2
+
+
+def test_the_demo_gives_the_same_boxes_again(demo: Path, tmp_path: Path) -> None:
+    assert cli.main(["demo", f"out={tmp_path / 'again'}", *QUICK]) == 0
+    for name in ("names/boxes.json", "colors/boxes.json", "splat.ply"):
+        assert (demo / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+
+
+def test_fuse_and_localize_find_in_the_demo_room_what_the_demo_found(demo: Path, tmp_path: Path) -> None:
+    features, boxes = tmp_path / "features", tmp_path / "boxes"
+    table = demo / "names" / "words.safetensors"
+    fused = ["fuse", str(demo / "room"), f"teacher.words={table}", f"out={features}", "quiet=true"]
+    assert cli.main(fused) == 0
+    results = summary_of(features)["results"]
+    assert results["gaussians"] == len(load_splat(demo / "splat.ply")) >= results["seen"] > 0
+    assert results["views"] == 8
+    truth = {thing.name: thing for thing in load_scene(demo / "room").objects if thing.placed}
+    word = max(summary_of(demo)["results"]["names"]["iou"].items(), key=lambda item: item[1])[0]
+    assert cli.main(["localize", str(features), f"query={word}", f"out={boxes}", "pictures=1", "quiet=true"]) == 0
+    best = summary_of(boxes)["results"]["boxes"][0]
+    thing = truth[word]
+    corners = np.array(best["aabb_min"]), np.array(best["aabb_max"])
+    assert aabb_iou(*corners, thing.aabb_min, thing.aabb_max) > 0.5
+    assert len(list(boxes.glob("*.png"))) == 1
+    assert (boxes / "boxes.ply").is_file()
+
+
+def test_evaluate_scores_the_demo_room(demo: Path, tmp_path: Path) -> None:
+    table = demo / "names" / "words.safetensors"
+    out = tmp_path / "scores"
+    asked = ["protocol.min_views=1", "protocol.min_pixels=1", f"out={out}", "quiet=true"]
+    assert cli.main(["evaluate", str(demo / "room"), f"teacher.words={table}", *asked]) == 0
+    results = summary_of(out)["results"]
+    ious = list(summary_of(demo)["results"]["names"]["iou"].values())
+    assert results["objects"] == 6
+    assert results["acc_50"] == pytest.approx(np.mean(np.array(ious) >= 0.5))
+    assert results["mean_iou"] == pytest.approx(np.mean(ious), abs=1e-6)
+    assert len((out / "hits.csv").read_text().splitlines()) == 7
+
+
+def test_a_splat_without_views_is_fused_from_orbits(demo: Path, tmp_path: Path) -> None:
+    out = tmp_path / "features"
+    fused = ["fuse", str(demo / "splat.ply"), "teacher=palette", "orbits=6", f"out={out}", "quiet=true"]
+    assert cli.main(fused) == 0
+    scene = load_features(out)
+    assert scene.views is not None
+    assert len(scene.views) == 6
+    assert cli.main(["localize", str(out), "query=red", f"out={tmp_path / 'boxes'}", "quiet=true"]) == 0
+
+
+def test_a_word_outside_the_table_is_refused_with_the_near_ones(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal(capsys, "localize", str(demo / "colors"), "query=purpel", f"out={tmp_path / 'boxes'}")
+    assert "purpel" in line
+    assert "purple" in line
+    assert not (tmp_path / "boxes").exists()
+
+
+def test_features_beside_another_splat_are_refused(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mixed = tmp_path / "mixed"
+    shutil.copytree(demo / "names", mixed)
+    assert cli.main(["demo", f"out={tmp_path / 'other'}", "seed=1", *QUICK]) == 0
+    shutil.copy(tmp_path / "other" / "names" / "scene.safetensors", mixed / "scene.safetensors")
+    assert "splat" in refusal(capsys, "localize", str(mixed), "query=mug", f"out={tmp_path / 'boxes'}")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["views=0", "width=3", "objects=0", "objects=1000", "seed=-1", "seeds.voxel=0", "localize.threshold.fixed=2"],
+)
+def test_the_demo_refuses_what_it_cannot_do(wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refusal(capsys, "demo", wrong, f"out={tmp_path / 'demo'}")
+    assert wrong.split("=")[0].split(".")[-1] in line
+    assert not (tmp_path / "demo").exists()
