@@ -37,6 +37,7 @@ COMMANDS = {
         Command(name="fuse", config="FuseCommandConfig", help="per-Gaussian features from a teacher's maps"),
         Command(name="localize", config="LocalizeCommandConfig", help="boxes, scores and pictures for words"),
         Command(name="evaluate", config="EvaluateConfig", help="a paper's metric on labelled scenes"),
+        Command(name="tradeoff", config="TradeoffConfig", help="what each accuracy knob costs and gives, measured"),
         Command(name="inspect", config="InspectConfig", help="what is in a splat file, and what is wrong with it"),
         Command(name="repair", config="RepairConfig", help="mend a splat file, and say what was changed"),
     )

@@ -39,12 +39,20 @@ class FuseConfig:
     )
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
     blend: BlendConfig = field(default_factory=BlendConfig)
-    energy: float = field(default=0.95, metadata={"help": "share of a dense teacher's energy that the basis keeps"})
+    energy: float = field(default=0.999, metadata={"help": "share of a dense teacher's energy that the basis keeps"})
     table_energy: float = field(default=0.9999, metadata={"help": "the same for coded maps (labels, regions)"})
-    max_rank: int = field(default=0, metadata={"help": "largest rank of the basis; 0 = as many as the energy asks"})
+    max_rank: int = field(default=128, metadata={"help": "largest rank of the basis; 0 = as many as the energy asks"})
     basis: bool = field(default=True, metadata={"help": "fuse in a low-rank basis; false = in all channels"})
     narrow: int = field(default=64, metadata={"help": "teachers with no more channels than this keep all of them"})
     views: int = field(default=0, metadata={"help": "views used, evenly spaced; 0 = all"})
+
+    def __post_init__(self) -> None:
+        for name in ("energy", "table_energy"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InputError(f"{name}: expected a share in (0, 1], got {getattr(self, name)}")
+        for name in ("max_rank", "narrow", "views"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -137,8 +145,6 @@ def fuse(
 
 
 def _choose(available: int, wanted: int) -> tuple[int, ...]:
-    if wanted < 0:
-        raise InputError(f"views: expected 0 (all) or more, got {wanted}")
     count = min(wanted or available, available)
     return tuple(int(view) for view in np.unique(np.linspace(0, available - 1, count).round().astype(int)))
 
@@ -180,7 +186,7 @@ def _find_basis(
         vectors = _vectors(maps.get(view))
         with clock("basis"):
             moments.add(vectors[np.isfinite(vectors[:, 0])])
-    mean = moments.mean.astype(np.float32)
+    mean = teacher.mean if teacher.mean is not None else moments.mean.astype(np.float32)
     if not wanted:
         return None, mean, 0.0
     with clock("basis"):

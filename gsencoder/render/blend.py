@@ -35,7 +35,7 @@ class BlendConfig:
         backend: "cpu" (numba), "reference" (plain torch, any device and float type), or "auto".
     """
 
-    rays_per_patch: int = field(default=4, metadata={"help": "rays averaged into one patch: 1, 4, 9, 16, …"})
+    rays_per_patch: int = field(default=64, metadata={"help": "rays averaged into one patch: 1, 4, 9, 16, …"})
     min_weight: float = field(default=0.0, metadata={"help": "smallest blending weight that is kept"})
     stop_transmittance: float = field(default=1e-4, metadata={"help": "a ray ends where less than this is left of it"})
     near: float = field(default=0.01, metadata={"help": "near plane in world units"})

@@ -89,7 +89,7 @@ def by_definition(scene: Scene, maps: list[np.ndarray]) -> tuple[np.ndarray, np.
     n = len(scene.gaussians)
     sums, weights = np.zeros((n, 6)), np.zeros(n)
     for view, features in enumerate(maps):
-        b = blend(scene.gaussians, scene.views.cameras, view, patch=4)
+        b = blend(scene.gaussians, scene.views.cameras, view, patch=4, config=BlendConfig(rays_per_patch=16))
         row = np.repeat(np.arange(b.rows), b.crow.diff().numpy())
         np.add.at(sums, b.col.numpy(), b.weight.numpy()[:, None] * features.reshape(-1, 6)[row])
         np.add.at(weights, b.col.numpy(), b.weight.numpy())

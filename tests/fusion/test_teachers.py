@@ -172,3 +172,20 @@ def test_real_backbones_give_finite_features_of_their_stated_width(shared: Path)
     assert features is not None
     assert features.shape == (8, 8, 384)
     assert np.isfinite(features).all()
+
+
+def test_labels_on_cells_are_the_means_of_their_pixels() -> None:
+    rng = np.random.default_rng(0)
+    instances = rng.choice(np.array([0, 3, 9]), (7, 10)).astype(np.int32)
+    table = np.eye(4, dtype=np.float32)
+    names = ("mug", "ball", "cup", "fork")
+    fine = LabelsTeacher(label_objects(), names, table, text_encoder="t").feature_map(views_of(instances=instances), 0)
+    teacher = LabelsTeacher(label_objects(), names, table, text_encoder="t", cell=3)
+    coarse = teacher.feature_map(views_of(instances=instances), 0)
+    assert fine.table is not None
+    assert fine.codes is not None
+    pixels = fine.table[fine.codes][:6, :9].reshape(2, 3, 3, 3, 4)
+    np.testing.assert_allclose(coarse.features, pixels.mean(axis=(1, 3)), atol=1e-6)
+    assert coarse.grid_from_image[0, 0] == pytest.approx(1 / 3)
+    with pytest.raises(InputError, match="smaller than a cell of 3"):
+        teacher.feature_map(views_of(instances=instances[:2]), 0)

@@ -41,4 +41,6 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: TextTable | None) 
     if isinstance(config, OnnxConfig):
         return OnnxTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
     assert words is not None
-    return LabelsTeacher(scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder)
+    return LabelsTeacher(
+        scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder, cell=config.cell
+    )

@@ -22,16 +22,24 @@ class LabelsConfig:
         metadata={"help": "text table of the names; a bare name is also looked for in GSENCODER_MODELS"},
     )
 
+    cell: int = field(
+        default=1,
+        metadata={"help": "pixels along a cell; above 1 its vectors are averaged, as a teacher with patches sees them"},
+    )
+
     def __post_init__(self) -> None:
         if not self.words:
             raise InputError("words: the labels teacher needs a text table of its names")
+        if self.cell < 1:
+            raise InputError(f"cell: expected at least 1 pixel, got {self.cell}")
 
 
 class LabelsTeacher:
     """Each pixel has the embedding of its object's name; pixels without a name the normalised mean of the table.
 
     The mean is a direction too, so "other" is something that a Gaussian can be, and not a hole. Maps are coded: an
-    index for each pixel into the names of this scene.
+    index for each pixel into the names of this scene. With `cell` above 1 they are dense: means over square cells,
+    what a perfect teacher with patches of that size would give; pixels over the last whole cell are left out.
     """
 
     needs_images = False
@@ -44,6 +52,7 @@ class LabelsTeacher:
         embeddings: Float32[np.ndarray, "C D"],
         *,
         text_encoder: str,
+        cell: int = 1,
     ) -> None:
         """Makes the scene's table.
 
@@ -52,6 +61,7 @@ class LabelsTeacher:
             names: the words of the table.
             embeddings: their unit vectors.
             text_encoder: what made these.
+            cell: pixels along the side of a cell of the maps.
 
         Raises:
             InputError: no objects, or a name that the table lacks.
@@ -66,31 +76,43 @@ class LabelsTeacher:
         mean = embeddings.mean(axis=0, dtype=np.float64)
         other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)
         self.names = ("other", *used)
-        self.table = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)
+        self._vectors = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)
+        self.cell = cell
+        self.table = self._vectors if cell == 1 else None
         self.mean = mean.astype(np.float32)
         self.space = FeatureSpace(
-            name=f"labels-{text_encoder}", channels=embeddings.shape[1], teacher="labels", text_encoder=text_encoder
+            name=f"labels-{text_encoder}",
+            channels=embeddings.shape[1],
+            teacher="labels",
+            preprocessing=f"mean of {cell}×{cell} pixels" if cell > 1 else "",
+            text_encoder=text_encoder,
         )
         self._code = {o.id: self.names.index(o.name) for o in objects if o.name is not None}
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """Codes at image resolution.
+        """Codes at image resolution, or vectors on a grid of cells.
 
         Raises:
-            InputError: the scene has no instance maps.
+            InputError: the scene has no instance maps, or one smaller than a cell.
         """
         if views.instances is None:
             raise InputError("teacher labels: the scene has no instance maps (instance_file_path in transforms.json)")
         instances = views.instances[view]
         values, inverse = np.unique(instances, return_inverse=True)
-        codes = np.array([self._code.get(int(value), 0) for value in values], np.int32)
-        return FeatureMap(
-            codes=codes[inverse].reshape(instances.shape),
-            table=self.table,
-            grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]),
-            space=self.space,
-        )
+        codes = np.array([self._code.get(int(value), 0) for value in values], np.int32)[
+            inverse.reshape(instances.shape)
+        ]
+        affine = np.array([[1 / self.cell, 0, 0], [0, 1 / self.cell, 0]])
+        if self.table is not None:
+            return FeatureMap(codes=codes, table=self.table, grid_from_image=affine, space=self.space)
+        h, w = (size // self.cell for size in instances.shape)
+        if h == 0 or w == 0:
+            raise InputError(f"teacher labels: view {views.names[view]} is smaller than a cell of {self.cell} pixels")
+        cells = codes[: h * self.cell, : w * self.cell].reshape(h, self.cell, w, self.cell)
+        shares = np.stack([(cells == code).mean(axis=(1, 3)) for code in range(len(self.names))], axis=-1)
+        features = (shares @ self._vectors).astype(np.float32)
+        return FeatureMap(features=features, grid_from_image=affine, space=self.space)
 
     def settings(self) -> dict[str, Any]:
-        digest = hashlib.sha256(self.table.tobytes() + repr(sorted(self._code.items())).encode()).hexdigest()[:16]
-        return {"name": "labels", "table": digest}
+        digest = hashlib.sha256(self._vectors.tobytes() + repr(sorted(self._code.items())).encode()).hexdigest()[:16]
+        return {"name": "labels", "table": digest, "cell": self.cell}
