@@ -102,7 +102,8 @@ def test_the_command_measures_writes_and_advises(
     assert errors["defaults"] < min(errors[name] for name in labels[2:])
     assert float(rows["max_rank=1"]["rank"]) == 1
     assert int(rows["defaults"]["objects"]) == 3  # One of four is hidden from every camera.
-    assert Image.open(out / "tradeoff.png").size[0] > 500
+    with Image.open(out / "tradeoff.png") as plot:
+        assert plot.size[0] > 500
     assert "budget: " in capsys.readouterr().out
     assert json.loads((out / "summary.json").read_text())["results"]["picked"].startswith("budget: ")
 
