@@ -34,14 +34,14 @@ from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.memory import memory_growth
 from gsencoder.fusion.basis import Moments, encode, fit_basis
-from gsencoder.fusion.fuse import FuseConfig, _center_matrix
+from gsencoder.fusion.lift import center_matrix
 from gsencoder.fusion.teachers.synthetic import SyntheticTeacher
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Views
 
 RANK = 32
-VISIBILITY = FuseConfig(visibility=VisibilityConfig(against=("sensor",), relative=0.02))
+VISIBILITY = VisibilityConfig(against=("sensor",), relative=0.02)
 
 
 @dataclass
@@ -97,7 +97,7 @@ def build(gaussians: Gaussians, views: Views, view: int, one: FeatureMap) -> Ble
 
 
 def visible(gaussians: Gaussians, views: Views, view: int, one: FeatureMap) -> Blend:
-    made = _center_matrix(gaussians, views, view, one, [views.depths[view]], VISIBILITY)
+    made = center_matrix(gaussians, views, view, one, [views.depths[view]], VISIBILITY, BlendConfig())
     _ = made.transposed
     return made
 

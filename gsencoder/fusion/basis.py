@@ -14,8 +14,10 @@ from gsencoder.types import FeatureBasis, FeatureSpace
 class Moments:
     """Streaming first and second moments of feature vectors, in float64, one chunk at a time."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, *, second: bool = True) -> None:
+        """`second=False` keeps the mean alone."""
         self.count = 0.0
+        self.second = second
         self.sum: Float64[np.ndarray, " D"] = np.zeros(channels)
         self.outer: Float64[np.ndarray, "D D"] = np.zeros((channels, channels))
         self._shift: np.ndarray | None = None
@@ -33,13 +35,14 @@ class Moments:
             # those of vision transformers are, would otherwise lose the spread to cancellation.
             self._shift = vectors.mean(axis=0, dtype=np.float64)
         shifted = vectors - self._shift.astype(np.float32)
-        gram = (shifted.T @ shifted).astype(np.float64)
+        gram = (shifted.T @ shifted).astype(np.float64) if self.second else shifted.sum(axis=0, dtype=np.float64)
         if not np.isfinite(gram).all():
             bad = int((~np.isfinite(vectors).all(axis=1)).sum())
             raise InputError(f"features: expected finite values, got {bad} bad rows of {len(vectors)}")
         self.count += len(vectors)
         self.sum += shifted.sum(axis=0, dtype=np.float64)
-        self.outer += gram
+        if self.second:
+            self.outer += gram
 
     @property
     def mean(self) -> Float64[np.ndarray, " D"]:
@@ -50,6 +53,7 @@ class Moments:
 
     def covariance(self) -> Float64[np.ndarray, "D D"]:
         """Second moment about the mean."""
+        assert self.second, "Moments: made without second moments"
         offset = self.sum / max(self.count, 1.0)
         return self.outer / max(self.count, 1.0) - np.outer(offset, offset)
 

@@ -10,6 +10,7 @@ from splats import front_camera, one_gaussian, random_gaussians
 
 from gsencoder.errors import InputError
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
+from gsencoder.fusion.lift import view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
@@ -236,24 +237,23 @@ def test_sums_of_an_interrupted_lift_are_taken_up(
     monkeypatch.setattr("gsencoder.fusion.store.PartialFusion.due", lambda _: True)
     whole = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "whole")
     lifted: list[int] = []
-    lift_view = module._lift_view  # type: ignore[attr-defined]
 
-    def stop_after_two(*arguments: Any) -> None:
+    def stop_after_two(*arguments: Any, **settings: Any) -> Any:
         if len(lifted) == 2:
             raise KeyboardInterrupt
         lifted.append(arguments[2])
-        lift_view(*arguments)
+        return view_matrix(*arguments, **settings)
 
-    monkeypatch.setattr(module, "_lift_view", stop_after_two)
+    monkeypatch.setattr(module, "view_matrix", stop_after_two)
     with pytest.raises(KeyboardInterrupt):
         fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "cut")
     lifted.clear()
 
-    def record(*arguments: Any) -> None:
+    def record(*arguments: Any, **settings: Any) -> Any:
         lifted.append(arguments[2])
-        lift_view(*arguments)
+        return view_matrix(*arguments, **settings)
 
-    monkeypatch.setattr(module, "_lift_view", record)
+    monkeypatch.setattr(module, "view_matrix", record)
     resumed = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "cut")
     assert lifted == [2, 3, 4]
     np.testing.assert_allclose(decoded(resumed), decoded(whole), atol=1e-6)

@@ -1,0 +1,204 @@
+"""One view's part in fusion: the matrix that its map is lifted with, and the sums that all views add to."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32
+
+from gsencoder.errors import InputError
+from gsencoder.fusion.basis import encode
+from gsencoder.fusion.store import PartialFusion
+from gsencoder.fusion.visibility import VisibilityConfig, row_mask, visible_entries, visible_points
+from gsencoder.geometry import transform
+from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.render.lattice import grid_lattice
+from gsencoder.render.rgb import depth_image
+from gsencoder.types import FeatureBasis, FeatureMap, Gaussians, Views
+
+
+class Clock:
+    """Seconds by step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, step: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[step] = self.seconds.get(step, 0.0) + time.perf_counter() - start
+
+
+def map_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "P D"]:
+    """A map as rows; cells of code −1 are NaN."""
+    if feature_map.features is not None:
+        return feature_map.features.reshape(-1, feature_map.space.channels)
+    assert feature_map.codes is not None
+    assert feature_map.table is not None
+    codes = feature_map.codes.ravel()
+    return np.where((codes >= 0)[:, None], feature_map.table[codes], np.float32(np.nan))
+
+
+class Sums:
+    """Running sums over views: coordinates (or channels), or for coded maps the weight of each code."""
+
+    def __init__(
+        self, gaussians: int, columns: int, basis: FeatureBasis | None, table: Float32[np.ndarray, "C D"] | None
+    ) -> None:
+        self.basis, self.table = basis, table
+        # numpy, not torch, allocates what is large: its arrays lie in huge pages, which fill many times faster.
+        width = columns if table is None else len(table)
+        self.sums: Float32[np.ndarray, "N columns"] = np.zeros((gaussians, width), np.float32)
+        self.weights: Float32[np.ndarray, " N"] = np.zeros(gaussians, np.float32)
+
+    def restore(self, kept: PartialFusion | None) -> int:
+        """Takes up the sums of an earlier run; returns how many views they hold."""
+        found = kept.load_sums() if kept is not None else None
+        if found is None:
+            return 0
+        done, self.sums, self.weights = found
+        return done
+
+    def add(self, b: Blend, feature_map: FeatureMap, mask: Bool[np.ndarray, "H W"] | None) -> None:
+        """One view's share: sums += Bᵀ @ (share · maps), weights += Bᵀ @ share, the share of a row in the mask."""
+        share = row_mask(mask, b.lattice) if mask is not None else None
+        if self.table is not None:
+            assert feature_map.codes is not None
+            codes = feature_map.codes.ravel()
+            if share is not None:
+                codes = np.where(share > 0.5, codes, np.int32(-1))
+            b.lift_codes_into(torch.from_numpy(codes), torch.from_numpy(self.sums))
+            return
+        vectors = map_rows(feature_map)
+        scale = np.isfinite(vectors[:, 0]).astype(np.float32)
+        if not scale.all():
+            vectors = np.where(scale[:, None] > 0, vectors, np.float32(0))
+        if share is not None:
+            scale *= share
+        maps = encode(self.basis, vectors) if self.basis is not None else vectors
+        if scale.min() < 1:
+            maps = maps * scale[:, None]
+        b.lift_into(torch.from_numpy(maps), torch.from_numpy(self.sums))
+        b.lift_into(torch.from_numpy(scale[:, None]), torch.from_numpy(self.weights[:, None]))
+
+    def finish(self) -> tuple[Float32[np.ndarray, "N columns"], Float32[np.ndarray, " N"]]:
+        """Divides once: (features, weights); rows without weight are zero."""
+        if self.table is None:
+            weights, sums = self.weights, self.sums
+        else:
+            weights = self.sums.sum(axis=1)
+            sums = self.sums @ (encode(self.basis, self.table) if self.basis is not None else self.table)
+        # A row whose whole weight is below the smallest normal number would divide into noise or infinity.
+        seen = weights > np.finfo(np.float32).tiny
+        features = np.divide(sums, weights[:, None], where=seen[:, None], out=np.zeros_like(sums))
+        return features, np.where(seen, weights, 0).astype(np.float32)
+
+
+def view_matrix(
+    gaussians: Gaussians,
+    views: Views,
+    view: int,
+    feature_map: FeatureMap,
+    clock: Clock,
+    *,
+    lift: Literal["blend", "center"],
+    visibility: VisibilityConfig,
+    config: BlendConfig,
+) -> Blend:
+    """The matrix that a view's map is lifted with: B of its cells, or one entry for each visible centre.
+
+    Args:
+        gaussians: the splat.
+        views: cameras, and sensor depth where it is tested against.
+        view: which of them.
+        feature_map: its cells are the rows.
+        clock: takes the seconds of each step.
+        lift: blend or center.
+        visibility: what hides an entry.
+        config: knobs of B.
+
+    Raises:
+        InputError: a test against sensor depth in a scene without.
+    """
+    if lift == "center":
+        with clock("blend"):
+            depths = _depth_maps(gaussians, views, view, visibility, config, None)
+        with clock("lift"):
+            return center_matrix(gaussians, views, view, feature_map, depths, visibility, config)
+    with clock("blend"):
+        b = blend(gaussians, views.cameras, view, like=feature_map, config=_capped(config, feature_map))
+    with clock("visibility"):
+        for depth in _depth_maps(gaussians, views, view, visibility, config, b):
+            b = b.keep(visible_entries(b, depth, visibility))
+    return b
+
+
+def _capped(config: BlendConfig, feature_map: FeatureMap) -> BlendConfig:
+    """No more rays than pixels: the map of a labels teacher has one cell a pixel, and one ray is enough for it."""
+    side = max(1, round(1 / float(np.sqrt(feature_map.grid_from_image[0, 0] * feature_map.grid_from_image[1, 1]))))
+    if config.rays_per_patch <= side * side:
+        return config
+    values = {name: getattr(config, name) for name in config.__dataclass_fields__}
+    return BlendConfig(**{**values, "rays_per_patch": side * side})
+
+
+def _depth_maps(
+    gaussians: Gaussians, views: Views, view: int, visibility: VisibilityConfig, config: BlendConfig, b: Blend | None
+) -> list[Float32[np.ndarray, "H W"]]:
+    maps = []
+    for source in visibility.against:
+        if source == "sensor":
+            if views.depths is None:
+                raise InputError("visibility: the scene has no sensor depth; test against rendered depth instead")
+            maps.append(views.depths[view])
+        else:
+            size = int(views.cameras.heights[view]), int(views.cameras.widths[view])
+            pixels = b if b is not None and b.lattice.side == 1 and b.shape == size else None
+            pixels = pixels or blend(gaussians, views.cameras, view, config=config)
+            maps.append(depth_image(pixels))
+    return maps
+
+
+def center_matrix(
+    gaussians: Gaussians,
+    views: Views,
+    view: int,
+    feature_map: FeatureMap,
+    depths: list[np.ndarray],
+    visibility: VisibilityConfig,
+    config: BlendConfig,
+) -> Blend:
+    """The paper's lift as a matrix: one entry of weight 1 for each visible centre, in the cell that it falls into."""
+    cameras = views.cameras
+    pose, K = torch.from_numpy(cameras.cam_from_world[view]), cameras.Ks[view]
+    points = transform(pose, torch.from_numpy(gaussians.means)).numpy()
+    z = points[:, 2]
+    safe = np.where(z > config.near, z, 1)
+    x = K[0, 0] * points[:, 0] / safe + K[0, 2]
+    y = K[1, 1] * points[:, 1] / safe + K[1, 2]
+    width, height = int(cameras.widths[view]), int(cameras.heights[view])
+    rows = np.flatnonzero((z > config.near) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+    pixels = np.stack((x[rows], y[rows]), axis=1).astype(np.int64)
+    for depth in depths:
+        kept = visible_points(z[rows], pixels, depth, visibility)
+        rows, pixels = rows[kept], pixels[kept]
+    affine = feature_map.grid_from_image
+    column = np.floor(affine[0, 0] * x[rows] + affine[0, 2]).astype(np.int64)
+    line = np.floor(affine[1, 1] * y[rows] + affine[1, 2]).astype(np.int64)
+    inside = (column >= 0) & (column < feature_map.width) & (line >= 0) & (line < feature_map.height)
+    rows, cell = rows[inside], (line * feature_map.width + column)[inside]
+    order = np.argsort(cell, kind="stable")
+    crow = np.concatenate(([0], np.bincount(cell, minlength=feature_map.height * feature_map.width).cumsum()))
+    lattice = grid_lattice(affine, feature_map.width, feature_map.height, 1)
+    return Blend(
+        torch.from_numpy(crow.astype(np.int64)),
+        torch.from_numpy(rows[order].astype(np.int32)),
+        torch.ones(len(rows)),
+        torch.from_numpy(z.copy()),
+        lattice,
+        config,
+    )
