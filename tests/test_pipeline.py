@@ -94,6 +94,30 @@ def test_evaluate_scores_the_demo_room(demo: Path, tmp_path: Path) -> None:
     assert len((out / "hits.csv").read_text().splitlines()) == 7
 
 
+def test_a_room_a_million_metres_away_gives_the_same_boxes_there(demo: Path, tmp_path: Path) -> None:
+    shift = np.array([1e6, -2e6, 3e5])
+    far = tmp_path / "far"
+    shutil.copytree(demo / "room", far)
+    transforms = json.loads((far / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += shift
+        frame["transform_matrix"] = pose.tolist()
+    (far / "transforms.json").write_text(json.dumps(transforms))
+    boxes = {}
+    for name, room in (("near", demo / "room"), ("far", far)):
+        features, found = tmp_path / f"{name} features", tmp_path / f"{name} boxes"
+        assert cli.main(["fuse", str(room), "teacher=palette", f"out={features}", "quiet=true"]) == 0
+        words = ["query=red,orange", "pictures=0", "quiet=true"]
+        assert cli.main(["localize", str(features), *words, f"out={found}"]) == 0
+        boxes[name] = summary_of(found)["results"]["boxes"]
+    assert len(boxes["far"]) == len(boxes["near"]) > 0
+    best = [next(box for box in boxes[name] if box["query"] == "red") for name in ("near", "far")]
+    corners = [np.array([box["aabb_min"], box["aabb_max"]]) for box in best]
+    # Seeds fall into other cells of the grid, so boxes agree to a part of a cell and not to the bit.
+    np.testing.assert_allclose(corners[1] - shift, corners[0], atol=0.01)
+
+
 def test_a_splat_without_views_is_fused_from_orbits(demo: Path, tmp_path: Path) -> None:
     out = tmp_path / "features"
     fused = ["fuse", str(demo / "splat.ply"), "teacher=palette", "orbits=6", f"out={out}", "quiet=true"]
