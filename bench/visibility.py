@@ -26,7 +26,7 @@ from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.relevancy import ThresholdConfig
 
 VISIBILITIES = {
-    "none": VisibilityConfig(),
+    "none": VisibilityConfig(against=()),
     **{
         f"{source} {kind} {size}": VisibilityConfig(
             against=(source,),
@@ -45,11 +45,12 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--voxels", default="0.02,0.01")
     parser.add_argument("--thresholds", default="0.4")
+    parser.add_argument("--cell", type=int, default=1, help="pixels along a cell of the labels teacher")
     parser.add_argument("--only", default="", help="names of visibility tests, separated by commas")
     parser.add_argument("--out", type=Path, default=Path("visibility.csv"))
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
-    teacher = LabelsConfig()
+    teacher = LabelsConfig(cell=options.cell)
     words = text_table_of(teacher)
     assert words is not None
     tests = {name: VISIBILITIES[name] for name in options.only.split(",") if name} or VISIBILITIES

@@ -117,6 +117,7 @@ def write_features(
         gaussians=len(features),
         seen=int(features.seen.sum()),
         views=len(fusion.views),
+        visibility=list(fusion.tested),
         channels=features.space.channels,
         rank=features.features.shape[1],
         energy_kept=features.basis.energy_kept if features.basis is not None else 1.0,

@@ -6,22 +6,24 @@ Views stream one at a time; sums are kept in the coordinates of a basis, so that
 of views or with the teacher's width.
 """
 
+import hashlib
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.lift import Clock, Sums, map_rows, view_matrix
-from gsencoder.fusion.store import PartialFusion
+from gsencoder.fusion.partial import PartialFusion
 from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import BlendConfig
-from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Scene, Views
+from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Scene, Views
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +59,7 @@ class Fusion:
     Attributes:
         features: on the scene's Gaussians.
         views: row numbers of the views that were used.
+        tested: the depth maps that visibility was tested against.
         seconds: by step.
         truncation: 1 − centred cosine between teacher vectors and their projections on the basis, averaged over the
             cells of all views with each cell weighted by its distance from the mean; 0 without a basis.
@@ -64,6 +67,7 @@ class Fusion:
 
     features: GaussianFeatures
     views: tuple[int, ...]
+    tested: tuple[str, ...]
     seconds: dict[str, float]
     truncation: float
 
@@ -105,10 +109,13 @@ def fuse(
         raise InputError(f"fuse: scene {scene.name} has no views to fuse from")
     if len(scene.views) == 0:
         raise InputError(f"fuse: scene {scene.name} has no views left")
+    config = replace(config, visibility=resolve(config.visibility, scene.views, config.lift))
     chosen = _choose(len(scene.views), config.views)
     clock = Clock()
-    settings = {"fuse": asdict(config), "teacher": teacher.settings(), "views": list(chosen)}
-    kept = PartialFusion(work, settings) if work is not None else None
+    kept = None
+    if work is not None:
+        settings = {"fuse": asdict(config), "teacher": teacher.settings(), "views": list(chosen)}
+        kept = PartialFusion(work, settings | {"scene": _identity(scene.gaussians, scene.views)})
     maps = _Maps(teacher, scene.views, kept, clock)
     basis, mean, truncation = _find_basis(maps, chosen, config, clock, track)
     # Where the mean alone is missing, it is found on the way; a run that may be resumed has its maps on disk.
@@ -143,12 +150,22 @@ def fuse(
         assert moments is not None
         mean = moments.mean.astype(np.float32)
     fused = GaussianFeatures(features=features, weights=weights, mean=mean, space=teacher.space, basis=basis)
-    return Fusion(features=fused, views=chosen, seconds=clock.seconds, truncation=truncation)
+    return Fusion(
+        features=fused, views=chosen, tested=config.visibility.against, seconds=clock.seconds, truncation=truncation
+    )
 
 
 def _choose(available: int, wanted: int) -> tuple[int, ...]:
     count = min(wanted or available, available)
     return tuple(int(view) for view in np.unique(np.linspace(0, available - 1, count).round().astype(int)))
+
+
+def _identity(gaussians: Gaussians, views: Views) -> dict[str, str]:
+    """What maps and sums of one scene are told from another's by; pictures count by their names alone."""
+    digest = hashlib.sha256(repr(views.names).encode("utf-8", "backslashreplace"))
+    for name in ("cam_from_world", "Ks", "widths", "heights"):
+        digest.update(np.ascontiguousarray(getattr(views.cameras, name)).tobytes())
+    return {"gaussians": fingerprint(gaussians)[:16], "views": digest.hexdigest()[:16]}
 
 
 class _Maps:

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 
-from gsencoder.errors import InputError
 from gsencoder.fusion.basis import encode
-from gsencoder.fusion.store import PartialFusion
+from gsencoder.fusion.partial import PartialFusion
 from gsencoder.fusion.visibility import VisibilityConfig, row_mask, visible_entries, visible_points
 from gsencoder.geometry import transform
 from gsencoder.render import Blend, BlendConfig, blend
@@ -57,7 +56,7 @@ class Sums:
 
     def restore(self, kept: PartialFusion | None) -> int:
         """Takes up the sums of an earlier run; returns how many views they hold."""
-        found = kept.load_sums() if kept is not None else None
+        found = kept.load_sums(*self.sums.shape) if kept is not None else None
         if found is None:
             return 0
         done, self.sums, self.weights = found
@@ -118,11 +117,8 @@ def view_matrix(
         feature_map: its cells are the rows.
         clock: takes the seconds of each step.
         lift: blend or center.
-        visibility: what hides an entry.
+        visibility: what hides an entry, resolved (`visibility.resolve`).
         config: knobs of B.
-
-    Raises:
-        InputError: a test against sensor depth in a scene without.
     """
     if lift == "center":
         with clock("blend"):
@@ -152,8 +148,7 @@ def _depth_maps(
     maps = []
     for source in visibility.against:
         if source == "sensor":
-            if views.depths is None:
-                raise InputError("visibility: the scene has no sensor depth; test against rendered depth instead")
+            assert views.depths is not None
             maps.append(views.depths[view])
         else:
             size = int(views.cameras.heights[view]), int(views.cameras.widths[view])

@@ -1,6 +1,6 @@
 """Occlusion tests: is a Gaussian at the depth that a depth map says, or behind what is there?"""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -10,16 +10,22 @@ from jaxtyping import Bool, Float32, Int32, Int64
 from gsencoder.errors import InputError
 from gsencoder.render import Blend
 from gsencoder.render.lattice import Lattice
+from gsencoder.types import Views
+
+Source = Literal["auto", "sensor", "rendered"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VisibilityConfig:
     """Which depth maps a Gaussian is held against, and how near it must be; all chosen tests must pass."""
 
-    against: tuple[Literal["sensor", "rendered"], ...] = field(
-        default=(), metadata={"help": "depth maps to test against: sensor, rendered, both, or none"}
+    against: tuple[Source, ...] = field(
+        default=("auto",),
+        metadata={
+            "help": "depth maps to test against: sensor, rendered; auto = sensor if there, else rendered if lift=center"
+        },
     )
-    relative: float = field(default=0.05, metadata={"help": "largest |d − z| as a share of d; 0 = not tested"})
+    relative: float = field(default=0.02, metadata={"help": "largest |d − z| as a share of d; 0 = not tested"})
     absolute: float = field(default=0.0, metadata={"help": "largest |d − z| in world units; 0 = not tested"})
 
     def __post_init__(self) -> None:
@@ -27,6 +33,21 @@ class VisibilityConfig:
             raise InputError(f"visibility: expected tolerances ≥ 0, got {self.relative} and {self.absolute}")
         if self.against and not (self.relative or self.absolute):
             raise InputError("visibility: a test against a depth map needs relative or absolute above 0")
+
+
+def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConfig:
+    """The same with "auto" replaced: sensor depth where there is one; else rendered depth for centres, which see
+    through walls without a test, and none for B, whose weights are what is left behind other Gaussians.
+
+    Raises:
+        InputError: a test against sensor depth in a scene without.
+    """
+    has_depth = views.depths is not None
+    if "sensor" in config.against and not has_depth:
+        raise InputError("visibility: the scene has no sensor depth; test against rendered depth instead")
+    automatic: tuple[Source, ...] = ("sensor",) if has_depth else ("rendered",) if lift == "center" else ()
+    against = [name for source in config.against for name in (automatic if source == "auto" else (source,))]
+    return replace(config, against=tuple(dict.fromkeys(against)))
 
 
 def _near(z: np.ndarray, low: np.ndarray, high: np.ndarray, config: VisibilityConfig) -> Bool[np.ndarray, " n"]:

@@ -16,7 +16,7 @@ from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=6)
-EXACT = FuseConfig(energy=1.0, narrow=0)
+EXACT = FuseConfig(energy=1.0, narrow=0, visibility=VisibilityConfig(against=()))
 
 
 class FixedTeacher:
@@ -189,6 +189,29 @@ def test_the_center_lift_sees_a_hidden_wall_unless_an_occlusion_test_hides_it(ag
 
 
 @pytest.mark.parametrize(
+    ("lift", "sensor", "tested"),
+    [
+        ("blend", True, ("sensor",)),
+        ("center", True, ("sensor",)),
+        ("blend", False, ()),
+        ("center", False, ("rendered",)),
+    ],
+)
+def test_the_automatic_test_takes_the_depth_that_there_is(
+    lift: str, sensor: bool, tested: tuple[str, ...], rng: np.random.Generator
+) -> None:
+    depths = {"depths": [np.full((24, 32), 2.0, np.float32)]} if sensor else {}
+    scene = make_scene(count=1, gaussians=two_walls(), **depths)
+    config = FuseConfig(lift=lift, energy=1.0, narrow=0)  # type: ignore[arg-type]
+    fusion = fuse(scene, FixedTeacher(random_maps(rng)[:1]), config)
+    assert fusion.tested == tested
+    named = fuse(
+        scene, FixedTeacher(random_maps(rng)[:1]), replace(config, visibility=VisibilityConfig(against=tested))
+    )
+    assert (fusion.features.weights == named.features.weights).all()
+
+
+@pytest.mark.parametrize(
     ("relative", "absolute", "passes"), [(0.1, 0.0, True), (0.01, 0.0, False), (0.0, 0.2, True), (0.1, 0.05, False)]
 )
 def test_tolerances_combine(relative: float, absolute: float, passes: bool) -> None:
@@ -234,7 +257,7 @@ def test_sums_of_an_interrupted_lift_are_taken_up(
 
     scene, maps = make_scene(), random_maps(rng)
     module = sys.modules["gsencoder.fusion.fuse"]
-    monkeypatch.setattr("gsencoder.fusion.store.PartialFusion.due", lambda _: True)
+    monkeypatch.setattr("gsencoder.fusion.partial.PartialFusion.due", lambda _: True)
     whole = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "whole")
     lifted: list[int] = []
 
