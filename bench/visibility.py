@@ -46,6 +46,7 @@ def main() -> None:
     parser.add_argument("--voxels", default="0.02,0.01")
     parser.add_argument("--thresholds", default="0.4")
     parser.add_argument("--cell", type=int, default=1, help="pixels along a cell of the labels teacher")
+    parser.add_argument("--lifts", default="blend,center")
     parser.add_argument("--only", default="", help="names of visibility tests, separated by commas")
     parser.add_argument("--out", type=Path, default=Path("visibility.csv"))
     options = parser.parse_args()
@@ -63,7 +64,7 @@ def main() -> None:
             scene = load_scene(path)
             scene = dataclasses.replace(scene, gaussians=seed(scene, SeedConfig(voxel=voxel)))
             labels = build_teacher(teacher, scene, words)
-            for lift in ("blend", "center"):
+            for lift in options.lifts.split(","):
                 for name, visibility in tests.items():
                     config = FuseConfig(lift=lift, visibility=visibility)  # type: ignore[arg-type]
                     features = fuse(scene, labels, config).features

@@ -74,16 +74,31 @@ def orbit_cameras(
     north = np.cross(vertical, east)
     level = np.sqrt(1 - sines**2)[:, None] * (np.cos(turns)[:, None] * east + np.sin(turns)[:, None] * north)
     outward = level + sines[:, None] * vertical
-    forward = -outward
-    right = np.cross(forward, vertical)
+    return looking_cameras(centre + distance * outward, -outward, vertical, focal, width, height)
+
+
+def looking_cameras(
+    centers: Float64[np.ndarray, "V 3"],
+    forward: Float64[np.ndarray, "V 3"],
+    up: Float64[np.ndarray, "3"],
+    focal: float,
+    width: int,
+    height: int,
+) -> Cameras:
+    """Cameras at `centers` that look along unit vectors, level with `up`, which must not be parallel to any of them.
+
+    They share a focal length and a size in pixels; the principal point is the middle.
+    """
+    right = np.cross(forward, up)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
+    count = len(centers)
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    poses[:, :3, 3] = -np.einsum("vij,vj->vi", poses[:, :3, :3], centre + distance * outward)
-    k = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
+    poses[:, :3, 3] = -np.einsum("vij,vj->vi", poses[:, :3, :3], centers)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
     return Cameras(
         cam_from_world=poses.astype(np.float32),
-        Ks=np.tile(k, (count, 1, 1)),
+        Ks=np.tile(K, (count, 1, 1)),
         widths=np.full(count, width, np.int32),
         heights=np.full(count, height, np.int32),
     )

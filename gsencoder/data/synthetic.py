@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
+from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.seeds_flat import OPACITY, SH_C0, SIZE, THICKNESS, quats_from_normals
 from gsencoder.data.synthetic_plan import COLORS, HALF_ROOM, TABLE, PlannedObject, plan_room
 from gsencoder.data.synthetic_shapes import Solid
@@ -116,19 +117,7 @@ def _cameras(seed: int, views: int, width: int, height: int) -> Cameras:
     targets = np.array([0, 0.1, TABLE[2] - 0.1]) + rng.uniform(-1, 1, (views, 3)) * [0.15, 0.15, 0.05]
     forward = targets - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    pose = np.tile(np.eye(4), (views, 1, 1))
-    pose[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:, :3, 3] = -np.einsum("vij,vj->vi", pose[:, :3, :3], centers)
-    focal = FOCAL * width
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
-    return Cameras(
-        cam_from_world=pose.astype(np.float32),
-        Ks=np.tile(K, (views, 1, 1)),
-        widths=np.full(views, width, np.int32),
-        heights=np.full(views, height, np.int32),
-    )
+    return looking_cameras(centers, forward, np.array([0.0, 0.0, 1.0]), FOCAL * width, width, height)
 
 
 def _cast(
