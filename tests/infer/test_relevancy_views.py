@@ -1,0 +1,76 @@
+"""Which views are drawn for a word, and what the pictures are called."""
+
+import numpy as np
+from splats import random_gaussians
+
+from gsencoder.data.orbits import looking_cameras
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.relevancy_views import best_views, relevancy_pictures
+from gsencoder.types import Cameras, Gaussians, Localization, Scene, Views
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def wall(x: float, half: float = 1.0, step: float = 0.1) -> np.ndarray:
+    """Points of a square wall across the x axis."""
+    side = np.arange(-half, half + step / 2, step)
+    y, z = np.meshgrid(side, side)
+    return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1)
+
+
+def splat_of(means: np.ndarray) -> Gaussians:
+    n = len(means)
+    return Gaussians(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        scales=np.full((n, 3), 0.05, np.float32),
+        opacities=np.full(n, 0.99, np.float32),
+        sh=np.zeros((n, 1, 3), np.float32),
+    )
+
+
+def facing(*sides: float) -> Cameras:
+    """One camera on the x axis for each side, looking at the origin."""
+    centers = np.array([[3.0 * side, 0, 0] for side in sides])
+    return looking_cameras(centers, -np.sign(centers), UP, 40.0, 64, 48)
+
+
+def test_a_wall_is_best_seen_from_its_own_side() -> None:
+    left, right = wall(-0.5), wall(0.5)
+    splat = splat_of(np.concatenate([left, right]))
+    groups = [np.arange(len(left)), np.arange(len(left), len(splat))]
+    assert best_views(splat, facing(1.0, -1.0), groups, 2) == [[1, 0], [0, 1]]
+
+
+def test_many_groups_at_once_are_as_one_by_one(rng: np.random.Generator) -> None:
+    splat = random_gaussians(60)
+    cameras = facing(1.0, -1.0, 0.7, -1.3)
+    groups = [rng.choice(60, size, replace=False) for size in (1, 7, 30)]
+    together = best_views(splat, cameras, groups, 3)
+    assert together == [best_views(splat, cameras, [group], 3)[0] for group in groups]
+
+
+def test_views_that_show_nothing_come_in_their_own_order() -> None:
+    splat = splat_of(wall(50.0))
+    cameras = looking_cameras(np.zeros((3, 3)), np.tile([-1.0, 0, 0], (3, 1)), UP, 40.0, 64, 48)
+    assert best_views(splat, cameras, [np.arange(5)], 3) == [[0, 1, 2]]
+
+
+def test_every_word_gets_its_pictures_with_names_that_any_disk_takes() -> None:
+    splat = splat_of(wall(0.0))
+    cameras = facing(1.0, -1.0)
+    scene = Scene(name="wall", gaussians=splat, views=Views(cameras=cameras, names=("a", "b")))
+    scores = np.linspace(0, 1, len(splat), dtype=np.float32)
+    scores[3] = np.nan
+    words = ("a/b\\c", "é?", "x" * 500)
+    found = Localization(
+        queries=words,
+        relevancy=np.tile(scores, (3, 1)),
+        thresholds=np.full(3, LocalizeConfig().threshold.fixed, np.float32),
+        boxes=(),
+    )
+    pictures = dict(relevancy_pictures(scene, found, per_word=2))
+    assert list(pictures) == [
+        f"{index:02d}_{word}_view{view:03d}" for index, word in enumerate(("a_b_c", "é_", "x" * 60)) for view in (0, 1)
+    ]
+    assert all(picture.width >= 64 for picture in pictures.values())
