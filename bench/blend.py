@@ -18,6 +18,9 @@ from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras
 
+RANK = 128
+"""The largest rank that fusion takes by default."""
+
 
 def timed(work: Callable[[], Any], runs: int = 5) -> tuple[float, Any]:
     work()
@@ -56,15 +59,18 @@ def main() -> None:
     slow, _ = timed(lambda: blend(gaussians, cameras, options.view, config=reference), runs=1)
     print(f"torch reference, pixels:  {slow:.3f} s, ratio {slow / seconds:.1f}")
     values = torch.from_numpy(np.random.default_rng(0).normal(size=(len(gaussians), 768)).astype(np.float32))
-    for rays in (1, 4, 196):
+    coordinates, components = values[:, :RANK].contiguous(), values[:RANK].contiguous()
+    for rays in (1, 4, 64, 196):
         config = BlendConfig(rays_per_patch=rays)
         made, p = timed(lambda config=config: blend(gaussians, cameras, options.view, patch=14, config=config))
         product, _ = timed(lambda p=p: p.render(values))
+        decoded, _ = timed(lambda p=p: p.render(coordinates) @ components)
         transposing, _ = timed(lambda p=p: Blend.transposed.func(p))  # type: ignore[attr-defined]
         print(
             f"patches of 14, {rays:3d} rays:  {made:.3f} s, {len(p.col) / p.rows:.0f} entries a row; transpose "
             f"{transposing:.4f} s; 768 channels {product:.4f} s = {product / made:.0%} of making it, "
-            f"{product / seconds:.0%} of the pixel blend"
+            f"{product / seconds:.0%} of the pixel blend; through a basis of rank {RANK} {decoded:.4f} s = "
+            f"{decoded / made:.0%} of making it"
         )
 
 

@@ -105,8 +105,12 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
 
 
 def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
-    if not os.path.lexists(target):
+    try:
+        os.lstat(target)
+    except (FileNotFoundError, NotADirectoryError):
         return
+    except OSError as error:
+        raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
     if not target.is_dir():
         raise InputError(f"{path}: is a file, and the results are a folder; give another out=")
     with suppress(OSError):
@@ -138,7 +142,7 @@ def refuse_to_replace_inputs(out: Path | None, inputs: Sequence[str]) -> None:
     Raises:
         InputError: it does.
     """
-    if out is None or not out.is_dir():
+    if out is None or not os.path.isdir(out):
         return
     folder = os.path.realpath(out)
     for name in inputs:
@@ -248,6 +252,8 @@ def is_full_disk(error: BaseException) -> bool:
 
 def _refusal(error: Exception, partial: Path, path: str | Path) -> str | None:
     """What to tell the user if it was the system that refused to write, or None."""
+    if isinstance(error, OSError) and error.errno == errno.EFBIG:
+        return f"{path}: a file would grow larger than this system or shell allows (ulimit -f); nothing was kept"
     if is_full_disk(error):
         return f"{path}: no space left on the device; nothing was kept"
     if isinstance(error, InputError):

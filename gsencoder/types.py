@@ -82,7 +82,8 @@ class Gaussians:
             _fail("Gaussians", "sh", "1, 4, 9 or 16 coefficients (SH degree 0 to 3)", str(self.sh.shape[1]))
         for name in ("means", "quats", "scales", "opacities", "sh"):
             _check_finite("Gaussians", name, getattr(self, name))
-        norms = np.linalg.norm(self.quats, axis=1)
+        with np.errstate(over="ignore"):  # A norm beyond float32 is infinite, and refused.
+            norms = np.linalg.norm(self.quats, axis=1)
         _check_rows(
             "Gaussians", "quats", np.asarray(np.abs(norms - 1) <= UNIT_TOLERANCE), "unit quaternions", self.quats
         )
@@ -221,6 +222,13 @@ class FeatureSpace:
     preprocessing: str = ""
     text_encoder: str = ""
 
+    def __post_init__(self) -> None:
+        if type(self.channels) is not int or self.channels < 1:
+            _fail("FeatureSpace", "channels", "a whole number from 1", repr(self.channels)[:60])
+        for name in ("name", "teacher", "weights", "layer", "preprocessing", "text_encoder"):
+            if not isinstance(getattr(self, name), str):
+                _fail("FeatureSpace", name, "text", repr(getattr(self, name))[:60])
+
     def describe(self) -> str:
         """One line for error messages and reports."""
         parts = [self.name, f"{self.channels} channels", self.teacher, self.weights, self.layer, self.text_encoder]
@@ -293,6 +301,8 @@ class FeatureBasis:
         d = self.space.channels
         _check_array("FeatureBasis", "mean", self.mean, "float32", (d,))
         _check_array("FeatureBasis", "components", self.components, "float32", ("R", d))
+        _check_finite("FeatureBasis", "mean", self.mean)
+        _check_finite("FeatureBasis", "components", self.components)
         if not 0 <= self.energy_kept <= 1 + 1e-6:
             _fail("FeatureBasis", "energy_kept", "a share in [0, 1]", str(self.energy_kept))
 
@@ -324,6 +334,10 @@ class GaussianFeatures:
         _check_array("GaussianFeatures", "features", self.features, "float32", ("N", columns))
         _check_array("GaussianFeatures", "weights", self.weights, "float32", (len(self.features),))
         _check_array("GaussianFeatures", "mean", self.mean, "float32", (self.space.channels,))
+        _check_finite("GaussianFeatures", "features", self.features)
+        _check_finite("GaussianFeatures", "mean", self.mean)
+        good = np.asarray((self.weights >= 0) & (self.weights < np.inf))
+        _check_rows("GaussianFeatures", "weights", good, "finite weights from 0", self.weights)
         if self.basis is not None and self.basis.space != self.space:
             _fail("GaussianFeatures", "basis", self.space.describe(), self.basis.space.describe())
 
@@ -392,11 +406,17 @@ class Scene:
     sfm_colors: UInt8[np.ndarray, "P 3"] | None = None
 
     def __post_init__(self) -> None:
+        if self.name in ("", ".", "..") or "/" in self.name or "\0" in self.name:
+            _fail("Scene", "name", "a name that a folder can have", repr(self.name[:60]))
         _check_array("Scene", "origin", self.origin, "float64", (3,))
         if not np.isfinite(self.origin).all():
             _fail("Scene", "origin", "finite values", str(self.origin.tolist()))
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < math.inf:
             _fail("Scene", "metres_per_unit", "a positive number or None", str(self.metres_per_unit))
+        if self.up is not None:
+            _check_array("Scene", "up", self.up, "float64", (3,))
+            if not abs(float(np.linalg.norm(self.up)) - 1) <= UNIT_TOLERANCE:
+                _fail("Scene", "up", "a unit vector or None", str(self.up.tolist()))
         for name, features in self.features.items():
             if self.gaussians is None or len(features) != len(self.gaussians):
                 got = "no Gaussians" if self.gaussians is None else f"{len(self.gaussians)} Gaussians"

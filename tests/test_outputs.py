@@ -197,6 +197,12 @@ def test_a_full_disk_is_one_line_that_names_the_folder(tmp_path: Path, error: Ex
     assert names(tmp_path) == []
 
 
+def test_a_file_beyond_the_shells_limit_is_one_line_that_names_the_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"out: a file would grow larger than .* \(ulimit -f\); nothing was kept"):
+        write_and_raise(tmp_path / "out", OSError(errno.EFBIG, "File too large"))
+    assert names(tmp_path) == []
+
+
 def test_a_full_disk_at_the_last_moment_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -226,6 +232,15 @@ def test_a_place_that_cannot_be_written_is_a_named_error(tmp_path: Path) -> None
         fill(tmp_path / "file" / "deep" / "out", "x")
     with pytest.raises(InputError, match="cannot write here: File name too long"):
         fill(tmp_path / ("a" * 300) / "out", "x")
+
+
+def test_a_name_longer_than_the_system_allows_is_refused_before_the_work(tmp_path: Path) -> None:
+    refuse_to_replace_inputs(tmp_path / ("x" * 300), ["scene"])
+    with (
+        pytest.raises(InputError, match="cannot write here: File name too long"),
+        output_folder(tmp_path / ("x" * 300)),
+    ):
+        raise AssertionError("the block must not begin")
 
 
 def test_names_as_long_as_the_system_allows_work(tmp_path: Path) -> None:

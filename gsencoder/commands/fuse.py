@@ -12,6 +12,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
+from gsencoder.errors import InputError
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.store import WORDS_FILE, save_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
@@ -23,6 +24,8 @@ from gsencoder.progress import Progress, console
 from gsencoder.render.rgb import RenderedImages
 from gsencoder.summary import Summary
 from gsencoder.types import Scene, Views
+
+MOST_ORBITS = 10_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +42,10 @@ class FuseCommandConfig(CommonConfig):
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     teacher: LabelsConfig | PaletteConfig | OnnxConfig = field(default_factory=LabelsConfig)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.orbits <= MOST_ORBITS:
+            raise InputError(f"orbits: expected 1 to {MOST_ORBITS} cameras, got {self.orbits}")
 
 
 def run(config: FuseCommandConfig, summary: Summary) -> None:

@@ -17,6 +17,9 @@ from gsencoder.progress import console
 from gsencoder.summary import Summary
 from gsencoder.types import Localization
 
+LARGEST_QUERIES = 1 << 20
+"""Bytes of a file of queries."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizeCommandConfig(CommonConfig):
@@ -69,14 +72,25 @@ def asked_words(config: LocalizeCommandConfig) -> list[str]:
     """The words of query= and of the file queries=, blanks stripped, each once, in order."""
     lines = list(config.query)
     if config.queries:
-        try:
-            lines += Path(config.queries).read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"queries: {config.queries} cannot be read as text: {error}") from error
+        lines += _lines_of(Path(config.queries))
     words = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
     if not words:
         raise InputError("query= is missing: one or several words, separated by commas (or queries=FILE)")
     return words
+
+
+def _lines_of(file: Path) -> list[str]:
+    """The lines of a text file, which may begin with a byte order mark."""
+    if not file.is_file():
+        raise InputError(f"queries: {file} is no file; expected a text file with one query a line")
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(LARGEST_QUERIES + 1)
+        if len(data) > LARGEST_QUERIES:
+            raise InputError(f"queries: {file} holds more than {LARGEST_QUERIES:,} bytes; expected one word a line")
+        return data.decode("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"queries: {file} cannot be read as text: {error}") from error
 
 
 def words_of(folder: Path, given: str) -> TextTable:

@@ -15,6 +15,8 @@ from gsencoder.types import SceneObject
 def read_objects(path: Path) -> tuple[SceneObject, ...]:
     """Reads a list of {id, name or null, aabb_min, aabb_max, placed, views, max_pixels}; boxes in world coordinates.
 
+    Ids begin at 1, as 0 stands for no object in an instance map.
+
     Raises:
         InputError: not such a list, a repeated id, a box whose lower corner is not below the upper one.
     """
@@ -37,7 +39,7 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
             raise InputError(f"{where}: placed must be true or false, got {str(placed)[:40]!r}")
         objects.append(
             SceneObject(
-                id=_count(row, "id", where, None),
+                id=_count(row, "id", where, None, least=1),
                 name=name,
                 aabb_min=lower,
                 aabb_max=upper,
@@ -46,17 +48,18 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
                 max_pixels=_count(row, "max_pixels", where, 0),
             )
         )
-    ids = [found.id for found in objects]
-    if len(set(ids)) != len(ids):
-        repeated = next(i for i in ids if ids.count(i) > 1)
-        raise InputError(f"{path}: id {repeated} belongs to several objects")
+    seen: set[int] = set()
+    for found in objects:
+        if found.id in seen:
+            raise InputError(f"{path}: id {found.id} belongs to several objects")
+        seen.add(found.id)
     return tuple(objects)
 
 
-def _count(row: dict[str, Any], key: str, where: str, default: int | None) -> int:
+def _count(row: dict[str, Any], key: str, where: str, default: int | None, least: int = 0) -> int:
     value = row.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**31:
-        raise InputError(f"{where}: {key} must be a whole number from 0, got {str(value)[:40]!r}")
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
+        raise InputError(f"{where}: {key} must be a whole number from {least}, got {str(value)[:40]!r}")
     return value
 
 

@@ -97,7 +97,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     if posed is None:
         if splat is not None:
             raise InputError(f"{given}: splat= is for scenes with views, and here there are none; give one splat only")
-        return _bare_splat(_find_splat(root), root.name if root.is_dir() else root.stem, options)
+        return _bare_splat(_find_splat(root), _name_of(root) if root.is_dir() else root.stem, options)
     views, origin = make_views(posed, max_views=options.max_views, image_scale=options.image_scale)
     gaussians = None
     if splat is not None:
@@ -108,7 +108,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     beside_transforms = root.suffix.lower() == ".json" or any((folder / file).is_file() for file in TRANSFORMS)
     points = posed.points
     return Scene(
-        name=folder.name,
+        name=_name_of(folder),
         gaussians=gaussians,
         views=views,
         origin=origin,
@@ -118,6 +118,11 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         sfm_points=(points - origin).astype(np.float32) if len(points) else None,
         sfm_colors=posed.colors if len(points) else None,
     )
+
+
+def _name_of(folder: Path) -> str:
+    """What a scene and its output folders are called; of "..", the name of the folder that it leads to."""
+    return (folder if folder.name not in ("", "..") else folder.resolve()).name or "scene"
 
 
 def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:

@@ -32,6 +32,9 @@ EXTENT_IN_VOXELS = 300
 SAMPLED_VIEWS = 8
 """So many depth images are read for that estimate."""
 
+SMALLEST_VOXEL, LARGEST_VOXEL = 1e-12, 1e12
+"""In units of the scene."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeedConfig:
@@ -142,7 +145,21 @@ def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_dep
 
 
 def _voxel(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:
-    """The voxel in scene units."""
+    """The voxel in scene units.
+
+    Raises:
+        InputError: it is so small or large that float32 cannot count in it: a wrong unit.
+    """
+    voxel = _voxel_in_units(scene, config, estimate, how)
+    if not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
+        raise InputError(
+            f"seeds: a voxel of {voxel:g} units of scene {scene.name!r} is outside {SMALLEST_VOXEL:g} to "
+            f"{LARGEST_VOXEL:g}; check voxel, voxel_units and metres_per_unit"
+        )
+    return voxel
+
+
+def _voxel_in_units(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:
     if config.voxel_units is not None:
         return config.voxel_units
     if scene.metres_per_unit is not None:
@@ -152,7 +169,7 @@ def _voxel(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how:
         f"seeds: the unit of scene {scene.name!r} is unknown, so the voxel is {voxel:.4g} of its units, {how}; "
         "give metres_per_unit= or voxel_units= to choose",
         SceneWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
     return voxel
 

@@ -25,6 +25,9 @@ BETWEEN = 0.3
 OCCLUSION = 0.01
 """A pixel lies behind its neighbour's outline if that is nearer by this share of its depth, 15 mm at 1.5 m."""
 
+SMALLEST_DEPTH, LARGEST_DEPTH = 1e-9, 1e12
+"""Depths outside are taken for a wrong scale, world units."""
+
 
 class SurfacePixels(NamedTuple):
     """What one depth image says about the surfaces in it.
@@ -113,6 +116,13 @@ def read_rgbd(views: Views, view: int) -> tuple[Float32[np.ndarray, "H W"], UInt
         raise InputError(
             f"view {views.names[view]!r}: {bad} of {depth.size} depths are NaN, infinite or negative; "
             "write 0 where there is no depth"
+        )
+    # Beyond this their inverses, and lengths in voxels, leave float32.
+    far = np.count_nonzero((depth > 0) & ~((depth >= SMALLEST_DEPTH) & (depth <= LARGEST_DEPTH)))
+    if far:
+        raise InputError(
+            f"view {views.names[view]!r}: {far} of {depth.size} depths lie outside {SMALLEST_DEPTH:g} to "
+            f"{LARGEST_DEPTH:g} world units; check the depth scale"
         )
     return depth, image
 

@@ -66,9 +66,11 @@ class SurfaceGrid:
         """Adds samples. Raises InputError where one lies outside the grid's reach."""
         if not len(points):
             return
-        cells = np.floor(points / np.float32(self.voxel))
+        # Numbers that no integer holds are out of reach too, and must not be cast.
+        countable = float(np.abs(points).max()) < 2.0**62 * self.voxel
+        cells = np.floor(points / np.float32(self.voxel)) if countable else np.zeros_like(points)
         local = (cells.astype(np.int64) - self._base).T
-        if ((local < 0) | (local >= 1 << AXIS_BITS)).any():
+        if not countable or ((local < 0) | (local >= 1 << AXIS_BITS)).any():
             reach = self.voxel * (1 << (AXIS_BITS - 1))
             raise InputError(
                 f"seeds: a sample lies further than {reach:.6g} units ({1 << (AXIS_BITS - 1)} voxels) from the "

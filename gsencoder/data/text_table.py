@@ -4,8 +4,6 @@ import difflib
 import json
 import re
 import unicodedata
-import zipfile
-import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -14,14 +12,15 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.data.atomic import atomic_file
+from gsencoder.data.npz import read_npz
 from gsencoder.errors import InputError
 from gsencoder.types import FeatureSpace
 
 UNIT_TOLERANCE = 1e-2
 """How far from 1 the norm of a stored embedding may be: float16 rounding is about 1e-3."""
-LARGEST_TABLE = 1 << 30
-"""Bytes that an array of a table file may claim."""
 FORMAT = "gsencoder text table 1"
+LONGEST_SHOWN = 80
+"""Characters of an unknown word that its error repeats."""
 
 
 def normalise(word: str) -> str:
@@ -111,7 +110,7 @@ class TextTable:
         rows = [self.find(word) for word in words]
         unknown = [word for word, row in zip(words, rows, strict=True) if row is None]
         if unknown:
-            parts = [f"{word!r}{_did_you_mean(self.near(word))}" for word in unknown[:3]]
+            parts = [f"{word[:LONGEST_SHOWN]!r}{_did_you_mean(self.near(word))}" for word in unknown[:3]]
             more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
             raise InputError(f"not among the {len(self)} words of {self.space.name}: {'; '.join(parts)}{more}")
         return self.embeddings[np.array(rows, np.int64)]
@@ -190,7 +189,7 @@ def _read_safetensors(file: Path) -> TextTable:
         names, space = header["names"], FeatureSpace(**header["space"])
         good = all(isinstance(name, str) for name in names) and isinstance(space.channels, int)
         good &= all(isinstance(getattr(space, item.name), str) for item in fields(space) if item.name != "channels")
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
@@ -204,46 +203,12 @@ def _read_safetensors(file: Path) -> TextTable:
 
 
 def _read_npz(file: Path, encoder: str) -> TextTable:
+    arrays = read_npz(file, {"names": ("U", 1), "embeddings": ("f", 2)}, {"encoder": ("U", 0)})
+    made_by = encoder or str(arrays.get("encoder", "")) or file.stem.removesuffix("_names")
     try:
-        with zipfile.ZipFile(file) as archive:
-            present = set(archive.namelist())
-            missing = {"names.npy", "embeddings.npy"} - present
-            if missing:
-                raise InputError(
-                    f"{file}: expected the arrays names and embeddings, {sorted(missing)[0][:-4]} is missing"
-                )
-            names = _read_member(archive, "names.npy", "U", 1)
-            embeddings = _read_member(archive, "embeddings.npy", "f", 2)
-            if not encoder and "encoder.npy" in present:
-                encoder = str(_read_member(archive, "encoder.npy", "U", 0))
-        return make_text_table([str(name) for name in names], embeddings, encoder or file.stem.removesuffix("_names"))
+        return make_text_table([str(name) for name in arrays["names"]], arrays["embeddings"], made_by)
     except InputError as error:
-        raise error if str(error).startswith(str(file)) else InputError(f"{file}: {error}") from error
-    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, MemoryError) as error:
-        raise InputError(f"{file}: cannot be read as .npz: {_one_line(error)}") from error
-
-
-def _read_member(archive: zipfile.ZipFile, name: str, kind: str, ndim: int) -> np.ndarray:
-    """One array of an .npz, whose header must agree with the size that the archive states, before memory is taken."""
-    size = archive.getinfo(name).file_size
-    if size > LARGEST_TABLE:
-        raise InputError(f"{name[:-4]} claims {size:,} bytes; a text table has at most {LARGEST_TABLE:,}")
-    with archive.open(name) as stream:
-        version = np.lib.format.read_magic(stream)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-        if read is None:
-            raise InputError(f"{name[:-4]}: unknown .npy version {version}")
-        shape, fortran, dtype = read(stream)
-        count = int(np.prod(shape, dtype=object))
-        if dtype.kind != kind or len(shape) != ndim:
-            raise InputError(f"{name[:-4]}: expected {ndim} axes of type {kind!r}, got {dtype}{list(shape)}")
-        wanted = size - stream.tell()
-        if count * dtype.itemsize != wanted:
-            raise InputError(f"{name[:-4]}: header claims {count * dtype.itemsize:,} bytes, the file holds {wanted:,}")
-        data = stream.read(wanted)
-    if len(data) != wanted:
-        raise InputError(f"{name[:-4]}: truncated, {wanted - len(data):,} of {wanted:,} bytes are missing")
-    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+        raise InputError(f"{file}: {error}") from error
 
 
 def _one_line(error: BaseException) -> str:

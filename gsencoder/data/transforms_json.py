@@ -102,7 +102,7 @@ def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: flo
             stated = number(data | frame, "integer_depth_scale", where) if frame.get("depth_path") else None
         elif stated is not None:
             metric_depth = True
-        scale = depth_scale or stated or NERFSTUDIO_DEPTH_SCALE
+        scale = next(value for value in (depth_scale, stated, NERFSTUDIO_DEPTH_SCALE) if value is not None)
         if not 0 < scale < math.inf:
             raise InputError(f"{where}: the depth scale must be positive, got {scale}")
         pose = rigid_pose(_matrix(frame.get("transform_matrix"), where), where)

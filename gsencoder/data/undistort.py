@@ -99,7 +99,10 @@ def check_camera(camera: CameraModel, where: str) -> None:
     fx, fy, cx, cy = camera.pinhole_params()
     side = max(camera.width, camera.height)
     if not (0 < fx <= 1e4 * side and 0 < fy <= 1e4 * side and max(abs(cx), abs(cy)) <= 1e4 * side):
-        raise InputError(f"{where}: focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is not a camera's")
+        raise InputError(
+            f"{where}: focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is not a camera's; "
+            f"expected pixels, focal lengths above 0 and none beyond {1e4 * side:g}"
+        )
     if camera.is_pinhole:
         half = max(abs(side_x) / fx for side_x in (cx, camera.width - cx))
         half = max(half, max(abs(side_y) / fy for side_y in (cy, camera.height - cy)))

@@ -1,23 +1,21 @@
-"""Features on disk: a folder that holds the Gaussians, the cameras and their features, and a half-done fusion.
+"""Features on disk: a folder that holds the Gaussians, the cameras and their features.
 
 Arrays are safetensors files, memory-mapped on load; features are float16 for seen rows only. The folder is all that
 localisation needs: no photographs, no teacher.
 """
 
-import json
-import os
-import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 
+from gsencoder.data.images import PIXEL_LIMIT
 from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
-from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
+from gsencoder.fusion.archive import Archive, open_archive, write_archive
+from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
 
-VERSION = 1
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 WORDS_FILE = "words.safetensors"
 """The text table whose words lead into the features, beside them where there is one."""
@@ -42,7 +40,7 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
         cameras = scene.views.cameras
         arrays |= {name: getattr(cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights")}
         header["views"] = list(scene.views.names)
-    _save(folder / SCENE_FILE, arrays, header)
+    write_archive(folder / SCENE_FILE, arrays, header)
     rows = np.flatnonzero(features.weights > 0)
     kept = features.features[rows]
     if not np.isfinite(kept).all():
@@ -61,7 +59,7 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
     if features.basis is not None:
         arrays["components"] = features.basis.components
         header["energy_kept"] = features.basis.energy_kept
-    _save(folder / FEATURES_FILE, arrays, header)
+    write_archive(folder / FEATURES_FILE, arrays, header)
 
 
 def load_features(folder: Path) -> Scene:
@@ -72,152 +70,87 @@ def load_features(folder: Path) -> Scene:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of features made by `gsencoder fuse` or `encode`")
-    arrays, header = _load(folder / SCENE_FILE)
-    gaussians = Gaussians(**{name: arrays[name] for name in ("means", "quats", "scales", "opacities", "sh")})
-    views = None
-    if "views" in header:
-        names = ("cam_from_world", "Ks", "widths", "heights")
-        views = Views(cameras=Cameras(**{name: arrays[name] for name in names}), names=tuple(header["views"]))
+    with open_archive(folder / SCENE_FILE) as file:
+        gaussians = Gaussians(
+            means=file.array("means", "float32", ("N", 3)),
+            quats=file.array("quats", "float32", ("N", 4)),
+            scales=file.array("scales", "float32", ("N", 3)),
+            opacities=file.array("opacities", "float32", ("N",)),
+            sh=file.array("sh", "float32", ("N", "K", 3)),
+        )
+        up = file.value("up", list, None)
+        if up is not None and not (len(up) == 3 and all(type(part) in (int, float) for part in up)):
+            raise InputError(f"expected three numbers for up in the header, got {str(up)[:60]}")
+        scene = Scene(
+            name=file.value("name", str),
+            gaussians=gaussians,
+            views=_load_views(file) if "views" in file else None,
+            origin=file.array("origin", "float64", (3,)),
+            metres_per_unit=file.value("metres_per_unit", float, int, None),
+            up=None if up is None else np.array(up, np.float64),
+        )
     features = _load_rows(folder, gaussians)
-    return Scene(
-        name=header["name"],
-        gaussians=gaussians,
-        views=views,
-        features={features.space.name: features},
-        origin=arrays["origin"],
-        metres_per_unit=header["metres_per_unit"],
-        up=None if header["up"] is None else np.array(header["up"], np.float64),
-    )
+    return replace(scene, features={features.space.name: features})
 
 
 def load_settings(folder: Path) -> dict[str, Any]:
-    """The settings that made the features of a folder."""
-    return _load(folder / FEATURES_FILE)[1]["settings"]
+    """The settings that made the features of a folder.
+
+    Raises:
+        InputError: not such a folder, or damaged.
+    """
+    with open_archive(folder / FEATURES_FILE) as file:
+        found: dict[str, Any] = file.value("settings", dict)
+        return found
+
+
+def _load_views(file: Archive) -> Views:
+    names = file.value("views", list)
+    if not all(isinstance(name, str) for name in names):
+        raise InputError("expected the names of views to be text")
+    cameras = Cameras(
+        cam_from_world=file.array("cam_from_world", "float32", ("V", 4, 4)),
+        Ks=file.array("Ks", "float32", ("V", 3, 3)),
+        widths=file.array("widths", "int32", ("V",)),
+        heights=file.array("heights", "int32", ("V",)),
+    )
+    pixels = cameras.widths.astype(np.int64) * cameras.heights
+    if len(pixels) and pixels.max() > PIXEL_LIMIT:
+        raise InputError(f"expected views of at most {PIXEL_LIMIT:,} pixels, got one of {pixels.max():,}")
+    return Views(cameras=cameras, names=tuple(names))
 
 
 def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:
-    arrays, header = _load(folder / FEATURES_FILE)
-    if header["fingerprint"] != fingerprint(gaussians):
-        raise InputError(
-            f"{folder}: the features belong to splat {header['fingerprint'][:8]}…, the folder holds "
-            f"{fingerprint(gaussians)[:8]}…; fuse or encode this splat again"
-        )
-    rows, n = arrays["rows"], len(gaussians)
-    if len(rows) and (rows.min() < 0 or rows.max() >= n):
-        raise InputError(f"{folder}: features for Gaussian {int(rows.max())} of a splat with {n}")
-    values = np.zeros((n, arrays["features"].shape[1]), np.float32)
-    values[rows] = arrays["features"].astype(np.float32) * arrays["channel_scale"]
-    weights = np.zeros(n, np.float32)
-    weights[rows] = arrays["weights"]
-    space = FeatureSpace(**header["space"])
-    basis = None
-    if "components" in arrays:
-        basis = FeatureBasis(
-            mean=arrays["mean"], components=arrays["components"], energy_kept=header["energy_kept"], space=space
-        )
-    return GaussianFeatures(features=values, weights=weights, mean=arrays["mean"], space=space, basis=basis)
+    with open_archive(folder / FEATURES_FILE) as file:
+        belongs, actual = file.value("fingerprint", str), fingerprint(gaussians)
+        if belongs != actual:
+            raise InputError(
+                f"the features belong to splat {belongs[:8]}…, the folder holds {actual[:8]}…; "
+                "fuse or encode this splat again"
+            )
+        rows, n = file.array("rows", "int32", ("n",)), len(gaussians)
+        if len(rows) and (rows[0] < 0 or rows[-1] >= n or (np.diff(rows) <= 0).any()):
+            raise InputError(f"expected row numbers that rise from 0 to at most {n - 1}")
+        scale = file.array("channel_scale", "float32", ("R",))
+        seen = file.array("weights", "float32", ("n",))
+        if (scale <= 0).any() or (seen <= 0).any():
+            raise InputError("expected channel_scale and weights above 0")
+        values, weights = np.zeros((n, len(scale)), np.float32), np.zeros(n, np.float32)
+        values[rows] = file.array("features", "float16", ("n", "R")).astype(np.float32) * scale
+        weights[rows] = seen
+        space, mean = _space_from_json(file.value("space", dict)), file.array("mean", "float32", ("D",))
+        basis = None
+        if "components" in file or "energy_kept" in file:
+            components, kept = file.array("components", "float32", ("R", "D")), file.value("energy_kept", float, int)
+            basis = FeatureBasis(mean=mean, components=components, energy_kept=kept, space=space)
+        return GaussianFeatures(features=values, weights=weights, mean=mean, space=space, basis=basis)
+
+
+def _space_from_json(values: dict[str, Any]) -> FeatureSpace:
+    if set(values) != set(FeatureSpace.__dataclass_fields__):
+        raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
+    return FeatureSpace(**values)
 
 
 def _space_to_json(space: FeatureSpace) -> dict[str, Any]:
     return {name: getattr(space, name) for name in space.__dataclass_fields__}
-
-
-def _save(path: Path, arrays: dict[str, np.ndarray], header: dict[str, Any]) -> None:
-    """One safetensors file with a JSON header, whole or not at all."""
-    from safetensors.numpy import save_file
-
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    metadata = {"gsencoder": json.dumps({"version": VERSION, **header})}
-    try:
-        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, metadata)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    from safetensors import SafetensorError, safe_open
-
-    if not path.is_file():
-        raise InputError(f"{path.parent}: {path.name} is missing; this is no folder of gsencoder features")
-    try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"{path}: damaged or no safetensors file: {error}") from error
-    if header.get("version") != VERSION:
-        raise InputError(f"{path}: expected version {VERSION} of the format, got {header.get('version')}")
-    return arrays, header
-
-
-class PartialFusion:
-    """A fusion under way: the teacher's maps and the sums so far, in a folder that a later run takes up."""
-
-    def __init__(self, folder: Path, settings: dict[str, Any], every_seconds: float = 20.0) -> None:
-        """Opens or makes the folder.
-
-        Raises:
-            InputError: the folder holds a fusion with other settings; both are named.
-        """
-        self.folder, self._every = folder, every_seconds
-        self._last = time.monotonic()
-        settings = json.loads(json.dumps(settings))
-        path = folder / "settings.json"
-        if path.is_file():
-            found = json.loads(path.read_text())
-            if found != settings:
-                difference = _difference(found, settings)
-                raise InputError(f"{folder}: holds a fusion begun with {difference}; delete it to start anew")
-        else:
-            folder.mkdir(parents=True, exist_ok=True)
-            temporary = path.with_suffix(".tmp")
-            temporary.write_text(json.dumps(settings))
-            os.replace(temporary, path)
-
-    def due(self) -> bool:
-        """Whether the sums are old enough to be worth saving again."""
-        return time.monotonic() - self._last >= self._every
-
-    def save_map(self, view: int, feature_map: FeatureMap) -> None:
-        """Keeps a dense map as float16, scaled by its largest magnitude."""
-        values = feature_map.features
-        assert values is not None, "coded maps are cheap and not kept"
-        scale = max(float(np.abs(values).max(initial=0)), 1e-30)
-        arrays = {"features": (values / np.float32(scale)).astype(np.float16), "grid": feature_map.grid_from_image}
-        _save(self.folder / f"map_{view:05d}.safetensors", arrays, {"scale": scale})
-
-    def load_map(self, view: int, space: FeatureSpace) -> FeatureMap | None:
-        """A map of an earlier run or pass, or None."""
-        path = self.folder / f"map_{view:05d}.safetensors"
-        if not path.is_file():
-            return None
-        arrays, header = _load(path)
-        features = arrays["features"].astype(np.float32) * np.float32(header["scale"])
-        return FeatureMap(features=features, grid_from_image=arrays["grid"], space=space)
-
-    def save_sums(self, done: int, sums: Float32[np.ndarray, "N columns"], weights: Float32[np.ndarray, " N"]) -> None:
-        """Keeps the sums over the first `done` views."""
-        _save(self.folder / "sums.safetensors", {"sums": sums, "weights": weights}, {"done": done})
-        self._last = time.monotonic()
-
-    def load_sums(self) -> tuple[int, Float32[np.ndarray, "N columns"], Float32[np.ndarray, " N"]] | None:
-        """(views done, sums, weights) of an earlier run, or None."""
-        path = self.folder / "sums.safetensors"
-        if not path.is_file():
-            return None
-        arrays, header = _load(path)
-        return header["done"], arrays["sums"], arrays["weights"]
-
-
-def _difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:
-    for key in sorted({*found, *wanted}):
-        old, new = found.get(key), wanted.get(key)
-        if old == new:
-            continue
-        if isinstance(old, dict) and isinstance(new, dict):
-            return _difference(old, new, f"{prefix}{key}.")
-        return f"{prefix}{key}={old}, and this run asks {prefix}{key}={new}"
-    return "other settings"

@@ -29,8 +29,8 @@ class VisibilityConfig:
     absolute: float = field(default=0.0, metadata={"help": "largest |d − z| in world units; 0 = not tested"})
 
     def __post_init__(self) -> None:
-        if self.relative < 0 or self.absolute < 0:
-            raise InputError(f"visibility: expected tolerances ≥ 0, got {self.relative} and {self.absolute}")
+        if not (0 <= self.relative <= 1e12 and 0 <= self.absolute <= 1e12):
+            raise InputError(f"visibility: expected tolerances from 0 to 1e12, got {self.relative} and {self.absolute}")
         if self.against and not (self.relative or self.absolute):
             raise InputError("visibility: a test against a depth map needs relative or absolute above 0")
 

@@ -154,8 +154,10 @@ def _project_edges(
             cut = start + (NEAR - start[2]) / (end[2] - start[2]) * (end - start)
             start, end = (cut, end) if start[2] < NEAR else (start, cut)
         ends = np.stack([start, end]) @ intrinsics.T
-        inside = _clip_to_picture(ends[:, :2] / ends[:, 2:], width, height)
-        if inside is not None:
+        # A box of 1e20 units may be cut so near its end that rounding leaves nothing to divide by.
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            inside = _clip_to_picture(ends[:, :2] / ends[:, 2:], width, height)
+        if inside is not None and np.isfinite(inside).all():
             segments.append(inside)
     return segments
 

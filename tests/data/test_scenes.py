@@ -168,6 +168,7 @@ def test_objects_come_with_the_scene(tmp_path: Path) -> None:
     assert found.aabb_max.tolist() == [1, 2, 3]
     for change, message in (
         ({"id": -1}, "id must be"),
+        ({"id": 0}, "id must be a whole number from 1"),
         ({"aabb_min": [2, 0, 0]}, "is not below"),
         ({"aabb_max": [0, float("nan"), 1]}, "three finite numbers"),
         ({"name": 3}, "name must be"),
@@ -245,3 +246,11 @@ def test_images_of_two_sizes_live_in_one_scene(tmp_path: Path, no_jaxtyping: Non
     assert views.images is not None
     assert [image.shape[:2] for image in views.images] == [(24, 32), (12, 16), (24, 32)]
     assert views.cameras.widths.tolist() == [32, 16, 32]
+
+
+def test_a_scene_given_as_the_folder_above_has_that_folders_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_transforms(tmp_path / "kitchen")
+    monkeypatch.chdir(tmp_path / "kitchen" / "images")
+    assert load_scene("..").name == "kitchen"

@@ -591,3 +591,26 @@ class TestSeed:
         assert 0.7 * len(scene.sfm_points) < len(g) <= len(scene.sfm_points)
         spread = np.ptp(np.quantile(g.means, [0.05, 0.95], axis=0), axis=0)
         assert g.scales.max() < 0.1 * np.linalg.norm(spread)
+
+
+@pytest.mark.parametrize("depth", [1e-42, 1e-20, 1e20, 3e38])
+def test_depth_that_no_sensor_gives_is_taken_for_a_wrong_scale(depth):
+    view = camera()
+    with pytest.raises(InputError, match="76800 of 76800 depths lie outside .* check the depth scale"):
+        seed_from_depth(frames((view, np.full((240, 320), depth, np.float32))), voxel=0.02)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"voxel_units": 1e-300}, {"voxel_units": 1e300}, {"voxel": 1e300}, {"voxel": 1e-300}]
+)
+def test_a_voxel_that_float32_cannot_count_in_is_refused(wrong):
+    views = frames((camera(), np.ones((240, 320), np.float32)))
+    with pytest.raises(InputError, match="is outside 1e-12 to 1e\\+12; check voxel"):
+        seed(Scene(name="s", views=views, metres_per_unit=1.0), SeedConfig(**wrong))
+
+
+def test_samples_out_of_the_grids_reach_are_told_without_a_cast_that_overflows():
+    grid = SurfaceGrid(1e-12, np.zeros(3))
+    far = np.full((1, 3), 1e12, np.float32)
+    with pytest.raises(InputError, match="a sample lies further than"):
+        grid.add(far, np.array([[0, 0, 1]], np.float32), np.zeros((1, 3), np.uint8))

@@ -171,7 +171,7 @@ def test_a_header_that_claims_another_size_is_refused_before_memory_is_taken(
 def test_a_bomb_is_refused_by_the_size_that_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "bomb.npz"
     np.savez_compressed(path, names=np.array(["x"]), embeddings=np.zeros((1, 100_000), np.float32))
-    monkeypatch.setattr("gsencoder.data.text_table.LARGEST_TABLE", 100_000)
+    monkeypatch.setattr("gsencoder.data.npz.LARGEST_ARRAY", 100_000)
     with pytest.raises(InputError, match="claims 400,128 bytes"):
         load_text_table(path)
 
@@ -248,3 +248,18 @@ def test_the_real_table_knows_what_its_names_say(shared: Path) -> None:
     centred /= np.linalg.norm(centred, axis=1, keepdims=True)
     assert np.median(raw) > 0.65
     assert abs(np.median(centred @ centred.T)) < 0.1
+
+
+def test_a_header_nested_without_end_is_refused(tmp_path: Path) -> None:
+    from safetensors.numpy import save_file
+
+    arrays = {"embeddings": np.eye(2, dtype=np.float32), "mean": np.zeros(2, np.float32)}
+    save_file(arrays, tmp_path / "t.safetensors", {"format": "gsencoder text table 1", "table": "[" * 100_000})
+    with pytest.raises(InputError, match="cannot be read as a text table"):
+        load_text_table(tmp_path / "t.safetensors")
+
+
+def test_a_page_of_text_taken_for_a_word_is_not_repeated_whole(table: TextTable) -> None:
+    with pytest.raises(InputError) as caught:
+        table.encode(["x" * 100_000])
+    assert len(str(caught.value)) < 300

@@ -194,6 +194,7 @@ def matrix(scale: float = 1.0, **entries: float) -> list[list[float]]:
         ({"file_path": "x" * 5000}, "not a path"),
         ({"mask_path": 3}, "mask_path must be a path"),
         ({"depth_file_path": "images/000.png", "depth_unit_scale_factor": -1}, "depth scale must be positive"),
+        ({"depth_file_path": "images/000.png", "depth_unit_scale_factor": 0}, "depth scale must be positive"),
     ],
 )
 def test_a_frame_that_cannot_be_used_is_named(tmp_path: Path, values: dict[str, Any], said: str) -> None:

@@ -289,6 +289,17 @@ def test_a_folder_of_another_run_is_refused_with_both_settings_named(tmp_path: P
         fuse(scene, FixedTeacher(maps), replace(EXACT, lift="center"), work=tmp_path)
 
 
+def test_maps_of_another_scene_are_never_taken_up(tmp_path: Path, rng: np.random.Generator) -> None:
+    scene, maps = make_scene(), random_maps(rng)
+    fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path)
+    with pytest.raises(InputError, match=r"begun with scene\.gaussians="):
+        fuse(make_scene(gaussians=random_gaussians(20, 3)), FixedTeacher(maps), EXACT, work=tmp_path)
+    assert scene.views is not None
+    renamed = replace(scene, views=replace(scene.views, names=tuple(f"other {name}" for name in scene.views.names)))
+    with pytest.raises(InputError, match=r"begun with scene\.views="):
+        fuse(renamed, FixedTeacher(maps), EXACT, work=tmp_path)
+
+
 def test_fewer_views_are_spread_evenly(rng: np.random.Generator) -> None:
     fusion = fuse(make_scene(), FixedTeacher(random_maps(rng)), replace(EXACT, views=3))
     assert fusion.views == (0, 2, 4)

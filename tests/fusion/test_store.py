@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import save_file
 from splats import front_camera, random_gaussians
 
 from gsencoder.errors import InputError
@@ -105,3 +107,46 @@ def test_features_that_are_not_finite_are_not_stored(tmp_path: Path) -> None:
         save_features(tmp_path, make_scene(), features, {})
     with pytest.raises(InputError, match="need as many Gaussians"):
         save_features(tmp_path, make_scene(39), make_features(), {})
+
+
+def changed(path: Path, **arrays: np.ndarray) -> None:
+    """Writes a file again with some of its arrays replaced."""
+    with safe_open(path, framework="numpy") as file:
+        metadata, found = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    save_file(found | arrays, path, metadata)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "said"),
+    [
+        ("rows", np.zeros(30, np.int32), "row numbers that rise"),
+        ("rows", np.arange(11, 41, dtype=np.int32), "row numbers that rise from 0 to at most 39"),
+        ("rows", np.arange(29, dtype=np.int32), r"expected features float16|expected weights float32\[29\]"),
+        ("weights", np.zeros(30, np.float32), "weights above 0"),
+        ("weights", np.full(30, np.nan, np.float32), "not finite"),
+        ("channel_scale", np.ones(1, np.float32), r"expected features float16\[30, 1\], got float16\[30, 3\]"),
+        ("channel_scale", -np.ones(3, np.float32), "channel_scale and weights above 0"),
+        ("mean", np.zeros(7, np.float32), r"expected components float32\[3, 7\]"),
+        ("components", np.full((3, 8), np.inf, np.float32), "24 of 24 values of components are not finite"),
+    ],
+)
+def test_features_that_do_not_belong_together_are_named(
+    tmp_path: Path, name: str, values: np.ndarray, said: str
+) -> None:
+    save_features(tmp_path, make_scene(), make_features(), {})
+    changed(tmp_path / FEATURES_FILE, **{name: values})
+    with pytest.raises(InputError, match=f"{FEATURES_FILE}: .*({said})"):
+        load_features(tmp_path)
+
+
+def test_views_too_large_to_be_drawn_are_refused(tmp_path: Path) -> None:
+    save_features(tmp_path, make_scene(), make_features(), {})
+    changed(tmp_path / SCENE_FILE, widths=np.array([2**31 - 1], np.int32))
+    with pytest.raises(InputError, match="expected views of at most 80,000,000 pixels"):
+        load_features(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["", "..", "../elsewhere", "/tmp"])
+def test_a_scene_cannot_be_called_so_that_its_output_lands_elsewhere(name: str) -> None:
+    with pytest.raises(InputError, match=r"Scene\.name: expected a name that a folder can have"):
+        replace(make_scene(), name=name)

@@ -9,7 +9,7 @@ from splats import front_camera
 from gsencoder.errors import InputError
 from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
-from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteTeacher, lab_from_rgb
+from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteConfig, PaletteTeacher, lab_from_rgb
 from gsencoder.types import SceneObject, Views
 
 
@@ -75,7 +75,7 @@ def test_labels_without_objects_names_or_maps_say_so() -> None:
     embeddings = np.eye(4, 8, dtype=np.float32)
     with pytest.raises(InputError, match="lists no objects"):
         LabelsTeacher((), ("a",), embeddings[:1], text_encoder="t")
-    with pytest.raises(InputError, match="not in the table, first 'mug'"):
+    with pytest.raises(InputError, match="not among the 2 words of t, first 'mug'"):
         LabelsTeacher(label_objects(), ("ball", "cup"), embeddings[:2], text_encoder="t")
     teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, text_encoder="t")
     with pytest.raises(InputError, match="no instance maps"):
@@ -189,3 +189,68 @@ def test_labels_on_cells_are_the_means_of_their_pixels() -> None:
     assert coarse.grid_from_image[0, 0] == pytest.approx(1 / 3)
     with pytest.raises(InputError, match="smaller than a cell of 3"):
         teacher.feature_map(views_of(instances=instances[:2]), 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("patch", 0), ("patch", -14), ("size", 0), ("size", 10**9), ("skip_tokens", -1), ("top_k", 0), ("threads", -1),
+        ("threads", 10**20), ("scale", 0.0), ("scale", float("nan")), ("temperature", 0.0), ("temperature", -1.0),
+        ("mean", (0.5,)), ("mean", (0.0, 0.0, float("nan"))), ("std", (1.0, 0.0, 1.0)), ("std", ()),
+    ],
+)  # fmt: skip
+def test_settings_that_no_backbone_can_have_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"^{name}: expected"):
+        onnx_config(Path("m.onnx"), **{name: value})
+
+
+def write_pooling_model(path: Path, factor: float, inputs: tuple[int | str, ...], outputs: tuple[str, ...]) -> None:
+    """A grid backbone: each patch's mean colour times `factor`."""
+    onnx = pytest.importorskip("onnx")
+    helper, F = onnx.helper, onnx.TensorProto.FLOAT
+    nodes = [
+        helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[4, 4], strides=[4, 4]),
+        helper.make_node("Mul", ["pooled", "factor"], ["out"]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "pool",
+        [helper.make_tensor_value_info("image", F, list(inputs))],
+        [helper.make_tensor_value_info("out", F, list(outputs))],
+        [onnx.numpy_helper.from_array(np.array(factor, np.float32), "factor")],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), path)
+
+
+def test_values_that_are_not_finite_are_told_with_model_and_view(tmp_path: Path) -> None:
+    write_pooling_model(tmp_path / "m.onnx", float("nan"), (1, 3, "H", "W"), ("B", "D", "h", "w"))
+    teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx", layout="grid"))
+    with pytest.raises(InputError, match=r"144 of 144 values of m\.onnx for view 'a' are not finite"):
+        teacher.feature_map(views_of(np.ones((24, 32, 3), np.uint8)), 0)
+
+
+def test_a_model_that_cannot_take_a_picture_is_told_with_the_pictures_size(tmp_path: Path) -> None:
+    write_pooling_model(tmp_path / "m.onnx", 1.0, (1, 1, 99, 99), ("B", "D", "h", "w"))
+    teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx", layout="grid"))
+    with pytest.raises(InputError, match=r"m\.onnx does not run on a picture \[1, 3, 24, 32\]"):
+        teacher.feature_map(views_of(np.ones((24, 32, 3), np.uint8)), 0)
+
+
+def test_an_output_with_other_axes_than_the_layouts_is_refused(tmp_path: Path) -> None:
+    write_pooling_model(tmp_path / "m.onnx", 1.0, (1, 3, "H", "W"), ("B", "D", "h", "w"))
+    with pytest.raises(InputError, match=r"of shape \[1, 3, 2, 2\], expected \[1, tokens, channels\]"):
+        OnnxTeacher(onnx_config(tmp_path / "m.onnx", layout="tokens"))
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\3\4 and no more", b"\x93NUMPY"])
+def test_class_vectors_from_a_damaged_file_are_refused(tmp_path: Path, content: bytes) -> None:
+    write_mean_model(tmp_path / "m.onnx")
+    (tmp_path / "classes.npz").write_bytes(content)
+    with pytest.raises(InputError, match=r"classes\.npz: cannot be read as \.npz"):
+        OnnxTeacher(onnx_config(tmp_path / "m.onnx", classes=str(tmp_path / "classes.npz")))
+
+
+@pytest.mark.parametrize("softness", [0.0, -1.0, 1e-300, 1e300, float("nan")])
+def test_a_palette_without_a_usable_softness_is_refused(softness: float) -> None:
+    with pytest.raises(InputError, match="softness: expected a distance"):
+        PaletteConfig(softness=softness)

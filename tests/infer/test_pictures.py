@@ -115,6 +115,11 @@ def test_any_box_and_any_word_can_be_drawn_on_any_picture(
     assert drawn.shape == (height * factor, width * factor, 3)
 
 
+@pytest.mark.parametrize("size", [1e12, 1e20, 1e38, 1e300])
+def test_a_box_larger_than_numbers_can_place_does_not_stop_the_picture(size: float) -> None:
+    draw_boxes(np.zeros((48, 64, 3), np.uint8), [make_box((0.1, 0.2, 4.0), (size, size, size))], POSE, K)
+
+
 def test_labels_of_boxes_in_one_place_do_not_cover_each_other() -> None:
     grey = np.full((480, 640, 3), 90, np.uint8)
     boxes = [make_box((0, 0, 6.0), query=word) for word in ("one", "two", "three", "four")]

@@ -72,7 +72,11 @@ class LabelsTeacher:
         used = sorted({o.name for o in objects if o.name is not None})
         missing = [name for name in used if name not in row_of]
         if missing:
-            raise InputError(f"teacher labels: {len(missing)} object names are not in the table, first {missing[0]!r}")
+            raise InputError(
+                f"teacher labels: {len(missing)} object names are not among the {len(names)} words of {text_encoder}, "
+                f"first {missing[0]!r}; change them or set them to null in objects.json, or give a table that has them "
+                "(teacher.words=)"
+            )
         mean = embeddings.mean(axis=0, dtype=np.float64)
         other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)
         self.names = ("other", *used)

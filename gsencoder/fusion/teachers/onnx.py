@@ -1,7 +1,6 @@
 """The `onnx` teacher: any dense ONNX backbone under onnxruntime, its outputs as they are or as word mixtures."""
 
 import hashlib
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -11,8 +10,12 @@ from jaxtyping import Float32
 from PIL import Image
 
 from gsencoder.data.model_files import find_file
+from gsencoder.data.npz import read_npz
 from gsencoder.errors import InputError
 from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+LARGEST_SIDE = 8192
+"""Pixels along a resized picture: beyond this the backbone's own maps no longer fit into memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +41,24 @@ class OnnxConfig:
     temperature: float = field(default=1.0, metadata={"help": "softmax temperature of the posteriors"})
     words: str = field(default="", metadata={"help": "text table that leads into the space; empty if none"})
     threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("patch", 1, LARGEST_SIDE),
+            ("size", 1, LARGEST_SIDE),
+            ("skip_tokens", 0, 1_000_000),
+            ("top_k", 1, 1_000_000),
+            ("threads", 0, 1024),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name}: expected a whole number from {low} to {high}, got {getattr(self, name)}")
+        for name in ("scale", "temperature"):
+            if not 1e-6 <= getattr(self, name) <= 1e6:
+                raise InputError(f"{name}: expected a number from 1e-6 to 1e6, got {getattr(self, name)}")
+        if len(self.mean) != 3 or not all(abs(value) <= 1e6 for value in self.mean):
+            raise InputError(f"mean: expected three numbers, one a channel, got {list(self.mean)}")
+        if len(self.std) != 3 or not all(1e-6 <= value <= 1e6 for value in self.std):
+            raise InputError(f"std: expected three numbers from 1e-6 to 1e6, one a channel, got {list(self.std)}")
 
 
 class OnnxTeacher:
@@ -72,9 +93,11 @@ class OnnxTeacher:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises its own classes, which share only this base
             raise InputError(f"teacher onnx: {path} is no model that onnxruntime reads: {str(error)[:120]}") from error
+        self._path = path
         inputs = [tensor.name for tensor in self._session.get_inputs()]
         outputs = [tensor.name for tensor in self._session.get_outputs()]
-        self._input, self._output = config.input or inputs[0], config.output or outputs[0]
+        self._input = config.input or (inputs[0] if inputs else "")
+        self._output = config.output or (outputs[0] if outputs else "")
         if self._input not in inputs or self._output not in outputs:
             raise InputError(
                 f"teacher onnx: {path.name} has inputs {inputs} and outputs {outputs}, "
@@ -83,11 +106,11 @@ class OnnxTeacher:
         self._digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
         self._classes = _load_classes(find_file(config.classes, "teacher.classes")) if config.classes else None
         shape = self._session.get_outputs()[outputs.index(self._output)].shape
-        channels = shape[-1] if config.layout == "tokens" else shape[1]
+        stated = shape[-1 if config.layout == "tokens" else 1] if len(shape) == self._axes else None
         if self._classes is not None:
-            channels = self._classes.shape[1]
-        if not isinstance(channels, int):
-            channels = self._probe()
+            stated = self._classes.shape[1]
+        # What a model states of its output may be a name, or nothing at all; then it is run to see.
+        channels = stated if isinstance(stated, int) and stated > 0 else self._probe()
         self.space = FeatureSpace(
             name=config.space or path.stem,
             channels=channels,
@@ -97,6 +120,10 @@ class OnnxTeacher:
             preprocessing=f"resized to {config.size} px in multiples of {config.patch}",
             text_encoder=text_encoder,
         )
+
+    @property
+    def _axes(self) -> int:
+        return 3 if self.config.layout == "tokens" else 4
 
     def _probe(self) -> int:
         side = self.config.patch * 2
@@ -121,6 +148,12 @@ class OnnxTeacher:
                 f"teacher onnx: expected {rows}×{columns} cells of {patch} pixels, the model gave "
                 f"{features.shape[0]}×{features.shape[1]}; check teacher.patch and teacher.skip_tokens"
             )
+        bad = int(np.count_nonzero(~np.isfinite(features)))
+        if bad:
+            raise InputError(
+                f"teacher onnx: {bad} of {features.size} values of {self._path.name} for view {views.names[view]!r} "
+                "are not finite; check teacher.scale, teacher.mean and teacher.std, or the model"
+            )
         return FeatureMap(
             features=features,
             grid_from_image=np.array([[columns / width, 0, 0], [0, rows / height, 0]]),
@@ -131,7 +164,7 @@ class OnnxTeacher:
         config = self.config
         mean, std = np.array(config.mean, np.float32), np.array(config.std, np.float32)
         tensor = ((image.astype(np.float32) / config.scale - mean) / std).transpose(2, 0, 1)[None]
-        result = self._session.run([self._output], {self._input: np.ascontiguousarray(tensor)})[0][0]
+        result = self._output_of(np.ascontiguousarray(tensor))
         if config.layout == "grid":
             result = result.transpose(1, 2, 0)
         else:
@@ -146,6 +179,22 @@ class OnnxTeacher:
         if self._classes is not None:
             result = self._mix(result.reshape(-1, result.shape[-1])).reshape(*result.shape[:2], -1)
         return np.ascontiguousarray(result, np.float32)
+
+    def _output_of(self, tensor: Float32[np.ndarray, "1 3 H W"]) -> np.ndarray:
+        """The model's output for one picture, without the batch axis."""
+        where = f"teacher onnx: {self._path.name}"
+        try:
+            output = self._session.run([self._output], {self._input: tensor})[0]
+        except Exception as error:  # onnxruntime raises its own classes, which share only this base
+            message = " ".join(str(error).split())[:200]
+            raise InputError(f"{where} does not run on a picture {list(tensor.shape)}: {message}") from error
+        if not isinstance(output, np.ndarray) or output.ndim != self._axes or len(output) != 1:
+            wanted = "[1, tokens, channels]" if self.config.layout == "tokens" else "[1, channels, rows, columns]"
+            raise InputError(
+                f"{where} gave {self._output!r} of shape {list(np.shape(output))}, expected {wanted}; "
+                "check teacher.layout and teacher.output"
+            )
+        return output[0]
 
     def _mix(self, logits: Float32[np.ndarray, "n classes"]) -> Float32[np.ndarray, "n D"]:
         """Unit-norm mixture of the word vectors of the most probable classes, weighted by their probabilities."""
@@ -175,11 +224,8 @@ def _load_classes(path: Path) -> Float32[np.ndarray, "classes D"]:
     Raises:
         InputError: no such file, or one without `embeddings` and `known`.
     """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            vectors, known = data["embeddings"].astype(np.float32), data["known"].astype(bool)
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"teacher.classes: {path} is no .npz with embeddings and known: {error}") from error
-    if vectors.ndim != 2 or known.shape != (len(vectors),) or not math.isfinite(float(vectors[known].sum())):
+    arrays = read_npz(path, {"embeddings": ("f", 2), "known": ("b", 1)})
+    vectors, known = arrays["embeddings"].astype(np.float32), arrays["known"]
+    if known.shape != (len(vectors),) or not known.any() or not np.isfinite(vectors[known]).all():
         raise InputError(f"teacher.classes: {path}: expected embeddings [C, D] and known [C], finite where known")
     return np.where(known[:, None], vectors, np.nan).astype(np.float32)

@@ -38,8 +38,8 @@ class PaletteConfig:
     def __post_init__(self) -> None:
         if self.cell < 1:
             raise InputError(f"cell: expected at least 1 pixel, got {self.cell}")
-        if not self.softness > 0:
-            raise InputError(f"softness: expected a number above 0, got {self.softness}")
+        if not 1e-3 <= self.softness <= 1e6:
+            raise InputError(f"softness: expected a distance from 0.001 to 1e6, got {self.softness}")
 
 
 def lab_from_rgb(rgb: UInt8[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:

@@ -1,0 +1,126 @@
+"""One safetensors file with a JSON header: written whole or not at all, and on load checked against what it must hold.
+
+A file comes from anywhere: an array of another size would otherwise be broadcast, or end the run far from its cause.
+"""
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsencoder.errors import InputError
+
+VERSION = 1
+DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32"}
+"""safetensors' names of the number types that are written here."""
+
+
+class Archive:
+    """An open file; arrays and header values are checked as they are taken out.
+
+    Attributes:
+        path: of the file, for messages.
+        sizes: what the letters of shapes stand for, as the arrays taken so far have fixed it.
+    """
+
+    def __init__(self, path: Path, file: Any, header: dict[str, Any]) -> None:
+        self.path, self.sizes = path, dict[str, int]()
+        self._file, self._header, self._names = file, header, frozenset(file.keys())
+
+    def array(self, name: str, dtype: str, shape: tuple[int | str, ...]) -> np.ndarray:
+        """An array; a letter in its shape means the same size in all arrays of the file.
+
+        Raises:
+            InputError: missing, of another type or size, or not finite.
+        """
+        if name not in self._names:
+            raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
+        stored = self._file.get_slice(name)
+        got_dtype, got = DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
+        wanted = tuple(self.sizes.get(side, side) if isinstance(side, str) else side for side in shape)
+        same = len(got) == len(wanted) and all(isinstance(w, str) or w == g for w, g in zip(wanted, got, strict=True))
+        if got_dtype != dtype or not same:
+            raise InputError(
+                f"{self.path}: expected {name} {dtype}[{_listed(wanted)}], got {got_dtype}[{_listed(got)}]; "
+                "the file is damaged or from another program"
+            )
+        self.sizes |= {side: size for side, size in zip(wanted, got, strict=True) if isinstance(side, str)}
+        values: np.ndarray = self._file.get_tensor(name)
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            bad = values.size - int(np.count_nonzero(np.isfinite(values)))
+            raise InputError(f"{self.path}: {bad} of {values.size} values of {name} are not finite")
+        return values
+
+    def value(self, key: str, *kinds: type | None) -> Any:
+        """A value of the header, of one of these types.
+
+        Raises:
+            InputError: missing or of another type.
+        """
+        value = self._header.get(key)
+        # JSON's true is a Python int, and no number here is meant to be one.
+        good = (value is None and None in kinds) or isinstance(value, tuple(kind for kind in kinds if kind is not None))
+        if key not in self._header or not good or (isinstance(value, bool) and bool not in kinds):
+            names = " or ".join("null" if kind is None else kind.__name__ for kind in kinds)
+            got = f"{str(value)[:60]!r}" if key in self._header else "nothing"
+            raise InputError(f"{self.path}: expected {key} ({names}) in the header, got {got}")
+        return value
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._header or key in self._names
+
+
+def _listed(shape: tuple[int | str, ...]) -> str:
+    return ", ".join(map(str, shape))
+
+
+def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+    """Writes arrays and header; what had the name stays until the new file is whole.
+
+    Raises:
+        InputError: the disk is full, or the system refuses.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import save_file
+
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    metadata = {"gsencoder": json.dumps({"version": VERSION, **header})}
+    try:
+        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, metadata)
+        os.replace(temporary, path)
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def open_archive(path: Path) -> Iterator[Archive]:
+    """The file at `path`, open for the block. An `InputError` in the block that does not name the file is given its
+    name, so that what the types refuse is told with its place.
+
+    Raises:
+        InputError: missing, damaged, or of another version.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise InputError(f"{path.parent}: {path.name} is missing; this is no folder of gsencoder features")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
+            if not isinstance(header, dict) or header.get("version") != VERSION:
+                found = header.get("version") if isinstance(header, dict) else None
+                raise InputError(f"{path}: expected version {VERSION} of the format, got {found}")
+            yield Archive(path, file, header)
+    except InputError as error:
+        if str(path) in str(error):
+            raise
+        raise InputError(f"{path}: {error}") from error
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        message = " ".join(str(error).split())[:160]
+        raise InputError(f"{path}: damaged or no safetensors file: {message}") from error

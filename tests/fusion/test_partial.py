@@ -1,0 +1,66 @@
+"""A fusion under way: what is taken up belongs to this run, and a run that made nothing leaves nothing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsencoder.errors import InputError
+from gsencoder.fusion.partial import SETTINGS_FILE, SUMS_FILE, PartialFusion
+from gsencoder.types import FeatureMap, FeatureSpace
+
+SPACE = FeatureSpace(name="s", channels=3)
+
+
+def some_map() -> FeatureMap:
+    values = np.random.default_rng(0).normal(size=(2, 4, 3)).astype(np.float32)
+    return FeatureMap(features=values, grid_from_image=np.array([[0.5, 0, 0], [0, 0.5, 0]]), space=SPACE)
+
+
+def test_maps_and_sums_come_back(tmp_path: Path) -> None:
+    kept = PartialFusion(tmp_path / "work", {"a": 1})
+    kept.save_map(7, some_map())
+    kept.save_sums(2, np.ones((5, 3), np.float32), np.full(5, 2, np.float32))
+    again = PartialFusion(tmp_path / "work", {"a": 1})
+    found = again.load_map(7, SPACE)
+    assert found is not None
+    np.testing.assert_allclose(found.features, some_map().features, atol=2e-3)
+    assert again.load_map(6, SPACE) is None
+    sums = again.load_sums(5, 3)
+    assert sums is not None
+    assert sums[0] == 2
+    assert (sums[2] == 2).all()
+
+
+def test_a_run_that_kept_nothing_leaves_no_folder_to_refuse_the_next(tmp_path: Path) -> None:
+    PartialFusion(tmp_path / "work", {"patch": 13})
+    assert not (tmp_path / "work").exists()
+    PartialFusion(tmp_path / "work", {"patch": 14}).save_map(0, some_map())
+    with pytest.raises(InputError, match="begun with patch=14, and this run asks patch=13; delete it"):
+        PartialFusion(tmp_path / "work", {"patch": 13})
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff", b"[" * 100_000])
+def test_settings_that_cannot_be_read_say_what_to_delete(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / SETTINGS_FILE).write_bytes(content)
+    with pytest.raises(InputError, match=f"delete {tmp_path} to start anew"):
+        PartialFusion(tmp_path, {})
+
+
+@pytest.mark.parametrize("kept_bytes", [0, 7, 100, 200])
+def test_damaged_maps_and_sums_are_named(tmp_path: Path, kept_bytes: int) -> None:
+    kept = PartialFusion(tmp_path, {})
+    kept.save_map(0, some_map())
+    kept.save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
+    for file in ("map_00000.safetensors", SUMS_FILE):
+        (tmp_path / file).write_bytes((tmp_path / file).read_bytes()[:kept_bytes])
+    with pytest.raises(InputError, match=r"map_00000\.safetensors"):
+        kept.load_map(0, SPACE)
+    with pytest.raises(InputError, match=r"sums\.safetensors"):
+        kept.load_sums(5, 3)
+
+
+def test_sums_of_another_size_are_refused(tmp_path: Path) -> None:
+    PartialFusion(tmp_path, {}).save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
+    with pytest.raises(InputError, match=r"expected sums float32\[6, 3\], got float32\[5, 3\]"):
+        PartialFusion(tmp_path, {}).load_sums(6, 3)
