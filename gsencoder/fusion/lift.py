@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32
 
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.partial import PartialFusion
-from gsencoder.fusion.visibility import VisibilityConfig, row_mask, visible_entries, visible_points
+from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
 from gsencoder.geometry import transform
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.lattice import grid_lattice
@@ -129,7 +129,7 @@ def view_matrix(
         b = blend(gaussians, views.cameras, view, like=feature_map, config=_capped(config, feature_map))
     with clock("visibility"):
         for depth in _depth_maps(gaussians, views, view, visibility, config, b):
-            b = b.keep(visible_entries(b, depth, visibility))
+            b = keep_visible(b, depth, visibility)
     return b
 
 

@@ -50,14 +50,20 @@ def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConf
     return replace(config, against=tuple(dict.fromkeys(against)))
 
 
-def _near(z: np.ndarray, low: np.ndarray, high: np.ndarray, config: VisibilityConfig) -> Bool[np.ndarray, " n"]:
-    """Depth 0 means none: such rays say nothing was measured there, and nothing passes (as in OpenScene)."""
-    passed = high > 0
+def _interval(
+    low: np.ndarray, high: np.ndarray, config: VisibilityConfig
+) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+    """The depths that pass beside measured ones from `low` to `high`.
+
+    Depth 0 means none: such rays say nothing was measured there, and nothing passes (as in OpenScene).
+    """
+    least, most = np.zeros(low.shape), np.full(low.shape, np.inf)
     if config.relative:
-        passed &= (z >= low * (1 - config.relative)) & (z <= high * (1 + config.relative))
+        least, most = low * (1.0 - config.relative), high * (1.0 + config.relative)
     if config.absolute:
-        passed &= (z >= low - config.absolute) & (z <= high + config.absolute)
-    return passed
+        least, most = np.maximum(least, low - config.absolute), np.minimum(most, high + config.absolute)
+    most = np.where(high > 0, most, -np.inf)
+    return least.astype(np.float32), most.astype(np.float32)
 
 
 def visible_points(
@@ -68,17 +74,15 @@ def visible_points(
 ) -> Bool[np.ndarray, " n"]:
     """Tests Gaussians' centres at their own pixel (x, y), which must lie inside the map."""
     d = depth[pixels[:, 1], pixels[:, 0]]
-    return _near(z, d, d, config)
+    least, most = _interval(d, d, config)
+    return (z >= least) & (z <= most)
 
 
-def visible_entries(
-    b: Blend, depth: Float32[np.ndarray, "H W"], config: VisibilityConfig
-) -> Bool[torch.Tensor, " nnz"]:
-    """Tests each entry of B against the depths that its row's rays meet, from the nearest to the farthest of them."""
-    low, high = _row_range(depth, b.lattice)
-    row = torch.repeat_interleave(torch.arange(b.rows), b.crow.diff()).numpy()
-    z = b.depths[b.col.long()].numpy()
-    return torch.from_numpy(_near(z, low[row], high[row], config))
+def keep_visible(b: Blend, depth: Float32[np.ndarray, "H W"], config: VisibilityConfig) -> Blend:
+    """B without the entries that fail: each is held against the depths that its row's rays meet, from the nearest to
+    the farthest of them."""
+    least, most = _interval(*_row_range(depth, b.lattice), config)
+    return b.keep_between(torch.from_numpy(least), torch.from_numpy(most))
 
 
 def ray_pixels(lattice: Lattice, width: int, height: int) -> tuple[Int32[np.ndarray, " j"], Int32[np.ndarray, " i"]]:

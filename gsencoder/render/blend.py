@@ -173,6 +173,19 @@ class Blend:
         crow[1:] = torch.bincount(row, minlength=self.rows).cumsum(0)
         return Blend(crow, self.col[entries], self.weight[entries], self.depths, self.lattice, self.config)
 
+    def keep_between(self, least: Float[Tensor, " P"], most: Float[Tensor, " P"]) -> "Blend":
+        """The same blend with only the Gaussians whose depth lies from `least` to `most` of their row."""
+        if self.crow.device.type == "cpu":
+            from gsencoder.render import products
+
+            arrays = (self.crow, self.col, self.weight, self.depths, least, most)
+            kept = products.keep_between(*(array.numpy() for array in arrays))
+            crow, col, weight = (torch.from_numpy(array) for array in kept)
+            return Blend(crow, col, weight, self.depths, self.lattice, self.config)
+        row = torch.repeat_interleave(torch.arange(self.rows, device=self.crow.device), self.crow.diff())
+        z = self.depths[self.col.long()]
+        return self.keep((z >= least[row]) & (z <= most[row]))
+
 
 def _multiply_into(crow: Tensor, col: Tensor, weight: Tensor, values: Tensor, targets: Tensor, out: Tensor) -> None:
     if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):

@@ -84,3 +84,48 @@ def count_codes(
         lambda piece: _count_codes(cuts[piece], cuts[piece + 1], crow, cols, weights, codes, targets, out),
         range(PIECES),
     )
+
+
+@kernel
+@no_type_check
+def _count_between(first, last, crow, cols, depths, least, most, counts):
+    for row in range(first, last):
+        kept = 0
+        for e in range(crow[row], crow[row + 1]):
+            z = depths[cols[e]]
+            kept += (z >= least[row]) & (z <= most[row])
+        counts[row] = kept
+
+
+@kernel
+@no_type_check
+def _copy_between(first, last, crow, cols, weights, depths, least, most, starts, out_cols, out_weights):
+    for row in range(first, last):
+        at = starts[row]
+        for e in range(crow[row], crow[row + 1]):
+            z = depths[cols[e]]
+            if z >= least[row] and z <= most[row]:
+                out_cols[at] = cols[e]
+                out_weights[at] = weights[e]
+                at += 1
+
+
+def keep_between(
+    crow: np.ndarray, cols: np.ndarray, weights: np.ndarray, depths: np.ndarray, least: np.ndarray, most: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """CSR with only the entries whose column's depth lies from least[row] to most[row]: (crow, cols, weights)."""
+    cuts = even_cuts(crow)
+    starts = np.zeros(len(crow), np.int64)
+    parallel(
+        lambda piece: _count_between(cuts[piece], cuts[piece + 1], crow, cols, depths, least, most, starts[1:]),
+        range(PIECES),
+    )
+    np.cumsum(starts, out=starts)
+    out_cols, out_weights = np.empty(starts[-1], cols.dtype), np.empty(starts[-1], weights.dtype)
+    parallel(
+        lambda piece: _copy_between(
+            cuts[piece], cuts[piece + 1], crow, cols, weights, depths, least, most, starts, out_cols, out_weights
+        ),
+        range(PIECES),
+    )
+    return starts, out_cols, out_weights

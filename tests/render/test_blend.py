@@ -320,3 +320,18 @@ def test_a_white_wall_renders_white_and_the_background_shows_beside_it() -> None
     assert picture[20, 30].tolist() == [255, 255, 255]
     empty = render_image(EXTREMES["an empty view"], front_camera(), 0, background=(0.0, 1.0, 0.0))
     assert (empty == [0, 255, 0]).all()
+
+
+def test_keeping_a_range_of_depths_is_keeping_the_entries_inside_it(rng: np.random.Generator) -> None:
+    b = blend(random_gaussians(200), front_camera(), 0)
+    least = torch.from_numpy(rng.uniform(1, 4, b.rows).astype(np.float32))
+    most = least + torch.from_numpy(rng.uniform(-0.5, 2, b.rows).astype(np.float32))
+    row = torch.repeat_interleave(torch.arange(b.rows), b.crow.diff())
+    z = b.depths[b.col.long()]
+    expected, kept = b.keep((z >= least[row]) & (z <= most[row])), b.keep_between(least, most)
+    assert 0 < len(kept.col) < len(b.col)
+    for name in ("crow", "col", "weight"):
+        assert torch.equal(getattr(kept, name), getattr(expected, name))
+    nothing = b.keep_between(torch.full((b.rows,), torch.inf), torch.zeros(b.rows))
+    assert len(nothing.col) == 0
+    assert nothing.crow.tolist() == [0] * (b.rows + 1)
