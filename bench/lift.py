@@ -2,7 +2,7 @@
 
     python bench/lift.py SCENE [--voxel 0.02] [--views 0] [--runs 5] [--quick]
 
-Maps: `SyntheticTeacher` (rank 32 plus noise of about 10 % of the energy, seed 0) on 24 × 32 cells, which is what a
+Maps: `SyntheticTeacher` (rank 32 plus noise of 10 % of the energy, seed 0) on 24 × 32 cells, which is what a
 teacher with patches of 14 pixels sees of a picture resized to 336 × 448. Blending weights with their transposes, and
 the visibility of Gaussians' centres, are made beforehand and timed apart; so is finding the basis. Timed as the lift:
 allocating the sums, projecting the maps onto the basis (for lifts in a basis), adding up all views, and dividing.
@@ -41,6 +41,7 @@ from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Views
 
 RANK = 32
+NOISE = 0.1
 VISIBILITY = VisibilityConfig(against=("sensor",), relative=0.02)
 
 
@@ -65,10 +66,12 @@ def prepare(path: str, voxel: float, count: int) -> Problem:
     assert views is not None
     assert views.depths is not None
     chosen = range(len(views) if not count else min(count, len(views)))
-    teacher = SyntheticTeacher(rank=RANK)
-    maps = [teacher.feature_map(views, view) for view in chosen]
     quiet = SyntheticTeacher(rank=RANK, noise=0.0)
     clean = [quiet.feature_map(views, view) for view in chosen]
+    # Averaging over a cell takes energy off the signal, so less noise than its nominal share makes NOISE of the whole.
+    energy = float(np.concatenate([rows_of(one) for one in clean]).var(axis=0, dtype=np.float64).sum())
+    teacher = SyntheticTeacher(rank=RANK, noise=NOISE * energy / (1 - NOISE + NOISE * energy))
+    maps = [teacher.feature_map(views, view) for view in chosen]
     seconds: dict[str, float] = {}
     blends = timed_list(seconds, "blending weights", lambda view: build(gaussians, views, view, maps[view]), chosen)
     centers = timed_list(seconds, "visible centres", lambda view: visible(gaussians, views, view, maps[view]), chosen)
