@@ -2,6 +2,8 @@
 
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ from jaxtyping import Float32
 
 from gsencoder.data.atomic import atomic_file
 from gsencoder.errors import InputError
-from gsencoder.fusion.archive import open_archive, write_archive
+from gsencoder.fusion.archive import Archive, open_archive, write_archive
 from gsencoder.types import FeatureMap, FeatureSpace
 
 SETTINGS_FILE, SUMS_FILE = "settings.json", "sums.safetensors"
@@ -74,7 +76,7 @@ class PartialFusion:
         """
         if not self._map(view).is_file():
             return None
-        with open_archive(self._map(view)) as file:
+        with self._open(self._map(view)) as file:
             features = file.array("features", "float16", ("h", "w", space.channels)).astype(np.float32)
             return FeatureMap(
                 features=features * np.float32(file.value("scale", float)),
@@ -98,9 +100,17 @@ class PartialFusion:
         """
         if not (self.folder / SUMS_FILE).is_file():
             return None
-        with open_archive(self.folder / SUMS_FILE) as file:
+        with self._open(self.folder / SUMS_FILE) as file:
             sums = file.array("sums", "float32", (gaussians, columns))
             return file.value("done", int), sums, file.array("weights", "float32", (gaussians,))
+
+    @contextmanager
+    def _open(self, path: Path) -> Iterator[Archive]:
+        try:
+            with open_archive(path) as file:
+                yield file
+        except InputError as error:
+            raise InputError(f"{error}; delete {self.folder} to start anew") from error
 
     def _map(self, view: int) -> Path:
         return self.folder / f"map_{view:05d}.safetensors"
