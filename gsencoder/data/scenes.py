@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,15 +22,14 @@ from gsencoder.data.images import (
 from gsencoder.data.objects_json import read_objects
 from gsencoder.data.posed import PosedImage, PosedImages, choose_origin, inverse_rigid
 from gsencoder.data.scannet import is_scannet_export, read_scannet
-from gsencoder.data.transforms_json import read_transforms
+from gsencoder.data.scene_splat import SPLAT_SUFFIXES, find_splat, read_bare_splat, splat_beside, warn_of_unused_splat
+from gsencoder.data.splats import load_splat
+from gsencoder.data.transforms_json import TRANSFORMS, read_transforms
 from gsencoder.data.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.errors import InputError, SceneWarning
-from gsencoder.types import Cameras, Gaussians, Scene, Views
+from gsencoder.types import Cameras, Scene, Views
 
-SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog")
-TRANSFORMS = ("transforms.json", "transforms_train.json")
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
-SPLAT_NAMES = ("splat.ply", "point_cloud.ply")
 FEW_CAMERAS = 8
 
 
@@ -97,13 +96,13 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     if posed is None:
         if splat is not None:
             raise InputError(f"{given}: splat= is for scenes with views, and here there are none; give one splat only")
-        return _bare_splat(_find_splat(root), _name_of(root) if root.is_dir() else root.stem, options)
+        name = _name_of(root) if root.is_dir() else root.stem
+        bare, origin = read_bare_splat(find_splat(root))
+        return Scene(name=name, gaussians=bare, origin=origin, metres_per_unit=options.metres_per_unit)
     views, origin = make_views(posed, max_views=options.max_views, image_scale=options.image_scale)
-    gaussians = None
-    if splat is not None:
-        gaussians = _load_splat(_existing(splat, folder), origin)
-    else:
-        _warn_unused_splat(folder)
+    gaussians = load_splat(splat_beside(splat, folder), origin=origin) if splat is not None else None
+    if splat is None:
+        warn_of_unused_splat(folder)
     objects = folder / "objects.json"
     beside_transforms = root.suffix.lower() == ".json" or any((folder / file).is_file() for file in TRANSFORMS)
     points = posed.points
@@ -302,56 +301,6 @@ def _have_empty_pixels(cameras: list[tuple[Pinhole, CameraModel]], remaps: Remap
         return True
     found = [remaps.get(*camera) for camera in distorted]
     return any(remap is not None and not remap.valid.all() for remap in found)
-
-
-def _find_splat(root: Path) -> Path:
-    """The splat that `root` is or holds."""
-    if root.is_file():
-        if root.suffix.lower() in SPLAT_SUFFIXES or root.name == "meta.json":
-            return root
-        raise InputError(f"{root}: expected a transforms.json or a splat ({', '.join(SPLAT_SUFFIXES)})")
-    if (root / "meta.json").is_file():
-        return root
-    found = sorted(path for path in root.iterdir() if path.is_file() and path.suffix.lower() in SPLAT_SUFFIXES)
-    if len(found) == 1:
-        return found[0]
-    if found:
-        names = ", ".join(path.name for path in found[:5])
-        raise InputError(f"{root}: holds {len(found)} splats ({names}) and no views; give one of them")
-    raise InputError(
-        f"{root}: not a scene; looked for {' or '.join(TRANSFORMS)}, a COLMAP model (sparse/0, sparse, cameras.bin or "
-        f"cameras.txt), a ScanNet export (color/, pose/) and a splat ({', '.join(SPLAT_SUFFIXES)}, meta.json)"
-    )
-
-
-def _existing(splat: str | Path, folder: Path) -> Path:
-    for path in (Path(splat), folder / splat):
-        if path.exists():
-            return path
-    raise InputError(f"splat={splat}: no such file (looked from here and in {folder})")
-
-
-def _load_splat(path: Path, origin: Float64[np.ndarray, "3"] | None) -> Gaussians:
-    from gsencoder.data.splats import load_splat
-
-    return load_splat(path, origin=origin)
-
-
-def _bare_splat(path: Path, name: str, options: SceneConfig) -> Scene:
-    gaussians = _load_splat(path, None)
-    origin = choose_origin(np.median(gaussians.means.astype(np.float64), axis=0, keepdims=True)[: len(gaussians)])
-    if origin.any():
-        # The file's float32 coordinates are exact in float64; what they had lost before stays lost.
-        gaussians = replace(gaussians, means=(gaussians.means.astype(np.float64) - origin).astype(np.float32))
-    return Scene(name=name, gaussians=gaussians, origin=origin, metres_per_unit=options.metres_per_unit)
-
-
-def _warn_unused_splat(folder: Path) -> None:
-    beside = [name for name in SPLAT_NAMES if (folder / name).is_file()]
-    if beside:
-        _warn(
-            f"{folder}: {beside[0]} lies beside the views and is not used; say splat={beside[0]} if it belongs to them"
-        )
 
 
 def _warn(message: str) -> None:

@@ -28,6 +28,9 @@ NERFSTUDIO_DEPTH_SCALE = 1e-3
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
+TRANSFORMS = ("transforms.json", "transforms_train.json")
+"""The names that such files have."""
+
 
 def read_json(path: Path) -> Any:
     """The content of a JSON file.

@@ -17,8 +17,9 @@ from scene_files import (
 
 from gsencoder.data.posed import choose_origin
 from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.splats import save_splat
 from gsencoder.errors import InputError, SceneWarning
-from gsencoder.types import Gaussians, Scene
+from gsencoder.types import Scene
 
 
 def world_centers(scene: Scene) -> np.ndarray:
@@ -115,36 +116,28 @@ def test_a_splat_beside_the_views_is_not_taken_silently(tmp_path: Path) -> None:
         load_scene(tmp_path, splat="other.ply")
 
 
-def test_a_given_splat_shares_the_origin_of_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_given_splat_shares_the_origin_of_the_cameras(tmp_path: Path) -> None:
     write_transforms(tmp_path, offset=(5000.0, 0.0, 0.0))
-    (tmp_path / "mine.ply").write_bytes(b"")
-    asked = []
-
-    def loader(path: Path, origin: np.ndarray | None) -> Gaussians:
-        asked.append((path, origin))
-        return some_gaussians(np.zeros((2, 3), np.float32))
-
-    monkeypatch.setattr("gsencoder.data.scenes._load_splat", loader)
+    means = np.array([[1.0, 2, 3], [2, 3, 4]], np.float32)
+    save_splat(tmp_path / "mine.ply", some_gaussians(means), origin=np.array([5000.0, 0, 0]))
     scene = load_scene(tmp_path, splat="mine.ply")
-    assert asked[0][0] == tmp_path / "mine.ply"
-    assert asked[0][1].tolist() == scene.origin.tolist() == [5000.0, 0.0, 0.0]
+    assert scene.origin.tolist() == [5000.0, 0.0, 0.0]
     assert scene.gaussians is not None
+    np.testing.assert_allclose(scene.gaussians.means, means, atol=1e-6)
     with pytest.raises(InputError, match="splat= is for scenes with views"):
         load_scene(tmp_path / "mine.ply", splat="mine.ply")
 
 
-def test_a_bare_splat_has_no_views_and_a_far_one_gets_an_origin(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    means = np.array([[1e6, 0, 0], [1e6 + 4, 8, 0], [1e6 + 8, 4, 1]], np.float32)
-    monkeypatch.setattr("gsencoder.data.scenes._load_splat", lambda *_: some_gaussians(means))
-    (tmp_path / "only.ply").write_bytes(b"")
+def test_a_bare_splat_has_no_views_and_a_far_one_keeps_its_digits(tmp_path: Path) -> None:
+    near = np.array([[0.001, 0, 0], [4.002, 8, 0], [8.003, 4, 1]], np.float32)
+    save_splat(tmp_path / "only.ply", some_gaussians(near), origin=np.array([1e6, 0, 0]))
     for path in (tmp_path, tmp_path / "only.ply"):
         scene = load_scene(path)
         assert scene.views is None
         assert scene.gaussians is not None
         assert scene.origin.tolist() == [1e6, 0, 0]
-        assert (scene.gaussians.means + scene.origin == means).all()
+        # float32 columns would have rounded to 0.06.
+        np.testing.assert_allclose(scene.gaussians.means, near, atol=1e-6)
     (tmp_path / "second.spz").write_bytes(b"")
     with pytest.raises(InputError, match=r"holds 2 splats \(only\.ply, second\.spz\)"):
         load_scene(tmp_path)
