@@ -6,7 +6,6 @@ what is timed is what the knobs change: blending, visibility, basis and lift. Ro
 """
 
 import itertools
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,12 +17,12 @@ from jaxtyping import Float32
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.data.text_table import TextTable
-from gsencoder.errors import InputError, SceneWarning
+from gsencoder.errors import InputError
 from gsencoder.evaluate.boxes import Hit, accuracy
 from gsencoder.evaluate.cosine import FieldError, field_error
 from gsencoder.evaluate.localization import LocalizationProtocol, ask
 from gsencoder.evaluate.memory import memory_growth
-from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
+from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.infer.localize import LocalizeConfig
@@ -217,8 +216,8 @@ def _measure(
             reference = fusion.features if reference is None else reference
             if round_number == 0:
                 error = field_error(fusion.features, reference)
-                hits = _hits(scene, fusion, words, protocol, localization)
-                done.append((growth.mib, fusion.features.features.shape[1], error, hits))
+                hits = ask(scene, fusion.features, words, protocol, localization)[0] if words is not None else []
+                done.append((growth.mib, fusion.features.features.shape[1], error, tuple(hits)))
     return [
         Trade(
             label=", ".join(f"{name}={value}" for name, value in knobs.items()) or "defaults",
@@ -233,16 +232,6 @@ def _measure(
         )
         for (knobs, _), times, (mib, rank, error, hits) in zip(settings, seconds, done, strict=True)
     ]
-
-
-def _hits(
-    scene: Scene, fusion: Fusion, words: TextTable | None, protocol: LocalizationProtocol, localization: LocalizeConfig
-) -> tuple[Hit, ...]:
-    if words is None or not scene.objects:
-        return ()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SceneWarning)
-        return tuple(ask(scene, fusion.features, words, protocol, localization)[0])
 
 
 def _over_scenes(trades: list[Trade]) -> Trade:

@@ -117,8 +117,8 @@ def fuse(
         settings = {"fuse": asdict(config), "teacher": teacher.settings(), "views": list(chosen)}
         kept = PartialFusion(work, settings | {"scene": _identity(scene.gaussians, scene.views)})
     maps = _Maps(teacher, scene.views, kept, clock)
-    basis, mean, truncation = _find_basis(maps, chosen, config, clock, track)
-    # Where the mean alone is missing, it is found on the way; a run that may be resumed has its maps on disk.
+    basis, mean, truncation = _find_basis(maps, chosen, config, clock, track, resumable=kept is not None)
+    # Where the mean alone is missing, it is found on the way; not so in a run that may start in the middle.
     moments = Moments(teacher.space.channels, second=False) if mean is None else None
     with clock("lift"):
         columns = basis.rank if basis is not None else teacher.space.channels
@@ -190,7 +190,7 @@ class _Maps:
 
 
 def _find_basis(
-    maps: _Maps, chosen: tuple[int, ...], config: FuseConfig, clock: Clock, track: Track
+    maps: _Maps, chosen: tuple[int, ...], config: FuseConfig, clock: Clock, track: Track, *, resumable: bool
 ) -> tuple[FeatureBasis | None, Float32[np.ndarray, " D"] | None, float]:
     """The basis, the space's mean (None: not known without a pass of its own), and what the basis costs."""
     teacher, space = maps.teacher, maps.teacher.space
@@ -201,7 +201,7 @@ def _find_basis(
             return None, mean, 0.0
         basis = table_basis(teacher.table, mean, space, energy=config.table_energy)
         return basis, mean, _truncation(basis, teacher.table)
-    if not wanted and (teacher.mean is not None or maps.kept is None):
+    if not wanted and (teacher.mean is not None or not resumable):
         return None, teacher.mean, 0.0
     moments = Moments(space.channels, second=wanted)
     for view in track(chosen, "finding the basis"):

@@ -282,6 +282,23 @@ def test_sums_of_an_interrupted_lift_are_taken_up(
     np.testing.assert_allclose(decoded(resumed), decoded(whole), atol=1e-6)
 
 
+def test_a_resumed_run_of_a_cheap_narrow_teacher_keeps_the_mean_of_all_views(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, teacher = make_scene(), FixedTeacher(random_maps(rng))
+    teacher.cheap = True
+    config = replace(EXACT, narrow=SPACE.channels)
+    monkeypatch.setattr("gsencoder.fusion.partial.PartialFusion.due", lambda _: True)
+    whole = fuse(scene, teacher, config, work=tmp_path)
+    # The sums of all views are there now: nothing is left to lift, and the mean must not be that of nothing.
+    again = fuse(scene, teacher, config, work=tmp_path)
+    np.testing.assert_allclose(again.features.mean, whole.features.mean, atol=1e-7)
+    np.testing.assert_allclose(
+        whole.features.mean, np.mean([m.mean(axis=(0, 1)) for m in teacher.maps], axis=0), atol=1e-6
+    )
+    assert (again.features.features == whole.features.features).all()
+
+
 def test_a_folder_of_another_run_is_refused_with_both_settings_named(tmp_path: Path, rng: np.random.Generator) -> None:
     scene, maps = make_scene(), random_maps(rng)
     fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path)
