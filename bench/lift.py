@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from synthetic_teacher import SyntheticTeacher
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeds import SeedConfig, seed
@@ -35,7 +36,6 @@ from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.memory import memory_growth
 from gsencoder.fusion.basis import Moments, encode, fit_basis
 from gsencoder.fusion.lift import center_matrix
-from gsencoder.fusion.teachers.synthetic import SyntheticTeacher
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Views
