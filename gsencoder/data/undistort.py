@@ -98,10 +98,11 @@ def check_camera(camera: CameraModel, where: str) -> None:
         raise InputError(f"{where}: intrinsics of {camera.model} must be finite numbers, got {list(camera.params)}")
     fx, fy, cx, cy = camera.pinhole_params()
     side = max(camera.width, camera.height)
-    if not (0 < fx <= 1e4 * side and 0 < fy <= 1e4 * side and max(abs(cx), abs(cy)) <= 1e4 * side):
+    # A fisheye lens that sees half of the world has a focal length of a third of its picture.
+    if not (min(fx, fy) >= 1e-4 * side and max(fx, fy, abs(cx), abs(cy)) <= 1e4 * side):
         raise InputError(
             f"{where}: focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is not a camera's; "
-            f"expected pixels, focal lengths above 0 and none beyond {1e4 * side:g}"
+            f"expected pixels, focal lengths of at least {1e-4 * side:g} and none beyond {1e4 * side:g}"
         )
     if camera.is_pinhole:
         half = max(abs(side_x) / fx for side_x in (cx, camera.width - cx))

@@ -171,3 +171,10 @@ def test_pictures_of_one_pixel_can_be_resampled(shape: tuple[int, int]) -> None:
     remap = build_remap(pinhole_for(camera, "test"), camera)
     assert (remap.bilinear(picture)[remap.valid] == 77).all()
     assert remap.valid.any()
+
+
+@pytest.mark.parametrize("focal", [1.3e-312, 1e-300, 1e-4, -1.0, 0.0, 1e7])
+def test_a_focal_length_that_no_lens_has_is_refused(focal: float) -> None:
+    camera = CameraModel(model="OPENCV", width=32, height=24, params=(focal, 31.0, 16.0, 12.0, 0.01, 0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="is not a camera's"):
+        pinhole_for(camera, "here")
