@@ -135,7 +135,8 @@ def project(
     return Projected(means2d, conics, z, mahalanobis2, extents, front & visible & inside)
 
 
-_SH_C0 = 0.5 / math.sqrt(math.pi)
+SH_C0 = 0.5 / math.sqrt(math.pi)
+"""A colour is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction."""
 
 
 def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n K"]:
@@ -147,7 +148,7 @@ def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n 
     """
     x, y, z = directions.unbind(dim=-1)
     pi = math.pi
-    columns = [torch.full_like(x, _SH_C0)]
+    columns = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         c = math.sqrt(3 / (4 * pi))
         columns += [-c * y, c * z, -c * x]
@@ -182,4 +183,4 @@ def colors_from_sh(
 
 def sh_from_colors(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
     """Degree-0 coefficients that show `colors` (0 to 1) from everywhere."""
-    return ((colors - 0.5) / _SH_C0).unsqueeze(1)
+    return ((colors - 0.5) / SH_C0).unsqueeze(1)

@@ -36,7 +36,7 @@ TORCH_FREE = [
     "gsencoder.data.splats",
     "gsencoder.data.repair",
     "gsencoder.data.text_table",
-    "gsencoder.fusion.archive",
+    "gsencoder.data.archive",
     "gsencoder.fusion.basis",
     "gsencoder.fusion.partial",
     "gsencoder.fusion.store",

@@ -84,6 +84,7 @@ def fuse(
     teacher: Teacher,
     config: FuseConfig = FuseConfig(),
     *,
+    basis: FeatureBasis | None = None,
     work: Path | None = None,
     track: Track = _silent,
 ) -> Fusion:
@@ -97,12 +98,17 @@ def fuse(
         scene: with Gaussians and views.
         teacher: what to lift.
         config: knobs.
+        basis: fuse in the coordinates of this basis, as scenes that are trained on together are; without it the scene
+            gets one of its own where `config` asks for one.
         work: folder for maps and running sums; a run that finds its own there goes on where it stopped.
         track: wraps the loop over views to show progress.
 
     Raises:
-        InputError: nothing to lift or to lift onto, no view sees anything, or `work` holds another run.
+        InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, or `work` holds
+            another run.
     """
+    if basis is not None and basis.space != teacher.space:
+        raise InputError(f"fuse: the basis is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
     if scene.gaussians is None or len(scene.gaussians) == 0:
         raise InputError(f"fuse: scene {scene.name} has no Gaussians; make some from its depth or points (seeds)")
     if scene.views is None:
@@ -115,9 +121,15 @@ def fuse(
     kept = None
     if work is not None:
         settings = {"fuse": asdict(config), "teacher": teacher.settings(), "views": list(chosen)}
+        if basis is not None:
+            settings["basis"] = hashlib.sha256(basis.mean.tobytes() + basis.components.tobytes()).hexdigest()[:16]
         kept = PartialFusion(work, settings | {"scene": _identity(scene.gaussians, scene.views)})
     maps = _Maps(teacher, scene.views, kept, clock)
-    basis, mean, truncation = _find_basis(maps, chosen, config, clock, track, resumable=kept is not None)
+    if basis is not None:
+        mean: np.ndarray | None = basis.mean
+        truncation = 1 - float(np.sqrt(basis.energy_kept))
+    else:
+        basis, mean, truncation = _find_basis(maps, chosen, config, clock, track, resumable=kept is not None)
     # Where the mean alone is missing, it is found on the way; not so in a run that may start in the middle.
     moments = Moments(teacher.space.channels, second=False) if mean is None else None
     with clock("lift"):

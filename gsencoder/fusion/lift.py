@@ -126,14 +126,14 @@ def view_matrix(
         with clock("lift"):
             return center_matrix(gaussians, views, view, feature_map, depths, visibility, config)
     with clock("blend"):
-        b = blend(gaussians, views.cameras, view, like=feature_map, config=_capped(config, feature_map))
+        b = blend(gaussians, views.cameras, view, like=feature_map, config=capped(config, feature_map))
     with clock("visibility"):
         for depth in _depth_maps(gaussians, views, view, visibility, config, b):
             b = keep_visible(b, depth, visibility)
     return b
 
 
-def _capped(config: BlendConfig, feature_map: FeatureMap) -> BlendConfig:
+def capped(config: BlendConfig, feature_map: FeatureMap) -> BlendConfig:
     """No more rays than pixels: the map of a labels teacher has one cell a pixel, and one ray is enough for it."""
     side = max(1, round(1 / float(np.sqrt(feature_map.grid_from_image[0, 0] * feature_map.grid_from_image[1, 1]))))
     if config.rays_per_patch <= side * side:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.data.archive import Archive, open_archive, write_archive
 from gsencoder.data.atomic import atomic_file
 from gsencoder.errors import InputError
-from gsencoder.fusion.archive import Archive, open_archive, write_archive
 from gsencoder.types import FeatureMap, FeatureSpace
 
 SETTINGS_FILE, SUMS_FILE = "settings.json", "sums.safetensors"

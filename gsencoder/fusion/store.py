@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.data.archive import Archive, open_archive, space_from_json, space_to_json, write_archive
 from gsencoder.data.images import PIXEL_LIMIT
 from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
-from gsencoder.fusion.archive import Archive, open_archive, write_archive
-from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
+from gsencoder.types import Cameras, FeatureBasis, GaussianFeatures, Gaussians, Scene, Views
 
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 WORDS_FILE = "words.safetensors"
@@ -55,7 +55,7 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
         "weights": features.weights[rows],
         "mean": features.mean,
     }
-    header = {"space": _space_to_json(features.space), "settings": settings, "fingerprint": fingerprint(gaussians)}
+    header = {"space": space_to_json(features.space), "settings": settings, "fingerprint": fingerprint(gaussians)}
     if features.basis is not None:
         arrays["components"] = features.basis.components
         header["energy_kept"] = features.basis.energy_kept
@@ -138,19 +138,9 @@ def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:
         values, weights = np.zeros((n, len(scale)), np.float32), np.zeros(n, np.float32)
         values[rows] = file.array("features", "float16", ("n", "R")).astype(np.float32) * scale
         weights[rows] = seen
-        space, mean = _space_from_json(file.value("space", dict)), file.array("mean", "float32", ("D",))
+        space, mean = space_from_json(file.value("space", dict)), file.array("mean", "float32", ("D",))
         basis = None
         if "components" in file or "energy_kept" in file:
             components, kept = file.array("components", "float32", ("R", "D")), file.value("energy_kept", float, int)
             basis = FeatureBasis(mean=mean, components=components, energy_kept=kept, space=space)
         return GaussianFeatures(features=values, weights=weights, mean=mean, space=space, basis=basis)
-
-
-def _space_from_json(values: dict[str, Any]) -> FeatureSpace:
-    if set(values) != set(FeatureSpace.__dataclass_fields__):
-        raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
-    return FeatureSpace(**values)
-
-
-def _space_to_json(space: FeatureSpace) -> dict[str, Any]:
-    return {name: getattr(space, name) for name in space.__dataclass_fields__}

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from gsencoder.errors import InputError
+from gsencoder.types import FeatureSpace
 
 VERSION = 1
-DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32"}
+DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", "I64": "int64", "U8": "uint8"}
 """safetensors' names of the number types that are written here."""
 
 
@@ -53,6 +54,26 @@ class Archive:
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             bad = values.size - int(np.count_nonzero(np.isfinite(values)))
             raise InputError(f"{self.path}: {bad} of {values.size} values of {name} are not finite")
+        return values
+
+    def part(self, name: str, dtype: str, start: int, stop: int) -> np.ndarray:
+        """Rows `start` to `stop` of an array, the only ones that are read.
+
+        Raises:
+            InputError: missing, of another type, shorter, or not finite.
+        """
+        if name not in self._names:
+            raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
+        stored = self._file.get_slice(name)
+        got_dtype, shape = DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
+        if got_dtype != dtype or not shape or not 0 <= start <= stop <= shape[0]:
+            raise InputError(
+                f"{self.path}: expected {dtype} rows {start} to {stop} of {name}, got {got_dtype}[{_listed(shape)}]; "
+                "the file is damaged or from another program"
+            )
+        values: np.ndarray = stored[start:stop]
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise InputError(f"{self.path}: values of {name} in rows {start} to {stop} are not finite")
         return values
 
     def value(self, key: str, *kinds: type | None) -> Any:
@@ -109,7 +130,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
-        raise InputError(f"{path.parent}: {path.name} is missing; this is no folder of gsencoder features")
+        raise InputError(f"{path}: no such file; expected one that gsencoder wrote")
     try:
         with safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
@@ -124,3 +145,19 @@ def open_archive(path: Path) -> Iterator[Archive]:
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged or no safetensors file: {message}") from error
+
+
+def space_to_json(space: FeatureSpace) -> dict[str, Any]:
+    """A feature space as the header of a file holds it."""
+    return {name: getattr(space, name) for name in space.__dataclass_fields__}
+
+
+def space_from_json(values: dict[str, Any]) -> FeatureSpace:
+    """The feature space that a header holds.
+
+    Raises:
+        InputError: other fields than a feature space has.
+    """
+    if set(values) != set(FeatureSpace.__dataclass_fields__):
+        raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
+    return FeatureSpace(**values)

@@ -1,0 +1,116 @@
+"""The parts of the point transformer: patch attention, block, pooling and unpooling (PTv3, Wu et al. 2024, sec. 4)."""
+
+import torch
+from jaxtyping import Bool, Float, Int32, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gsencoder.models.neighbors import NeighborConv
+
+
+class PatchAttention(nn.Module):
+    """Multi-head self-attention among the tokens of a patch."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.project = nn.Linear(channels, channels)
+
+    def forward(
+        self,
+        x: Float[Tensor, "T C"],
+        gather: Int64[Tensor, " places"],
+        scatter: Int64[Tensor, " T"],
+        padding: Bool[Tensor, "patches 1 1 width"] | None,
+        width: int,
+    ) -> Float[Tensor, "T C"]:
+        """Tokens are put into patches, attend within them, and are put back; see `plan.Level`."""
+        channels = x.shape[1]
+        placed = self.qkv(x.index_select(0, gather))
+        # torch's backward of attention in bfloat16 on a CPU is five times slower than in float32.
+        slow = placed.device.type == "cpu" and torch.is_grad_enabled()
+        qkv = (placed.float() if slow else placed).view(-1, width, 3, self.heads, channels // self.heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)
+        with torch.autocast(placed.device.type, enabled=False):
+            attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=padding)
+        flat = attended.transpose(1, 2).reshape(-1, channels)
+        out: Tensor = self.project(flat.index_select(0, scatter))
+        return out
+
+
+class DropPath(nn.Module):
+    """Leaves out a residual branch for a random share of tokens in training, and scales up the others."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+
+    def forward(self, x: Float[Tensor, "T C"]) -> Float[Tensor, "T C"]:
+        if not self.training or self.share == 0:
+            return x
+        kept = torch.rand(len(x), 1, device=x.device) >= self.share
+        return x * (kept / (1 - self.share)).to(x.dtype)
+
+
+class Block(nn.Module):
+    """x + position; x + attention(norm x); x + mlp(norm x), the position encoding being a 3³ convolution."""
+
+    def __init__(self, channels: int, heads: int, *, mlp_ratio: float, drop_path: float) -> None:
+        super().__init__()
+        hidden = int(channels * mlp_ratio)
+        self.position = NeighborConv(channels, channels)
+        self.mix = nn.Linear(channels, channels)
+        self.norm_position = nn.LayerNorm(channels)
+        self.norm_attention = nn.LayerNorm(channels)
+        self.attention = PatchAttention(channels, heads)
+        self.norm_mlp = nn.LayerNorm(channels)
+        self.expand = nn.Linear(channels, hidden)
+        self.contract = nn.Linear(hidden, channels)
+        self.drop_path = DropPath(drop_path)
+
+    def forward(
+        self,
+        x: Float[Tensor, "T C"],
+        neighbors: Int32[Tensor, "T 27"],
+        gather: Int64[Tensor, " places"],
+        scatter: Int64[Tensor, " T"],
+        padding: Bool[Tensor, "patches 1 1 width"] | None,
+        width: int,
+    ) -> Float[Tensor, "T C"]:
+        x = x + self.norm_position(self.mix(self.position(x, neighbors)))
+        x = x + self.drop_path(self.attention(self.norm_attention(x), gather, scatter, padding, width))
+        hidden = functional.gelu(self.expand(self.norm_mlp(x)))
+        out: Tensor = x + self.drop_path(self.contract(hidden))
+        return out
+
+
+class Pool(nn.Module):
+    """Tokens of a cell twice as large become one: the largest of each projected channel."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(channels_in, channels_out)
+        self.norm = nn.LayerNorm(channels_out)
+
+    def forward(self, x: Float[Tensor, "T C"], children: Int64[Tensor, "M 8"]) -> Float[Tensor, "M D"]:
+        projected = self.project(x)
+        gathered = projected.index_select(0, children.flatten()).view(-1, 8, projected.shape[1])
+        return functional.gelu(self.norm(gathered.amax(dim=1)))
+
+
+class Unpool(nn.Module):
+    """Each token takes what its parent found out and adds what it knew itself."""
+
+    def __init__(self, channels_in: int, channels_skip: int, channels_out: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(channels_in, channels_out)
+        self.norm = nn.LayerNorm(channels_out)
+        self.project_skip = nn.Linear(channels_skip, channels_out)
+        self.norm_skip = nn.LayerNorm(channels_out)
+
+    def forward(
+        self, x: Float[Tensor, "M C"], skip: Float[Tensor, "T S"], parents: Int64[Tensor, " T"]
+    ) -> Float[Tensor, "T D"]:
+        down = functional.gelu(self.norm(self.project(x)))
+        return functional.gelu(self.norm_skip(self.project_skip(skip))) + down.index_select(0, parents)

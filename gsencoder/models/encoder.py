@@ -1,0 +1,87 @@
+"""The Gaussian encoder: raw attributes of a splat in, one feature a Gaussian out (SplatDistill sec. 3.3)."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gsencoder.errors import InputError
+from gsencoder.models.embed import CHANNELS, Attribute, channels_of
+from gsencoder.models.neighbors import NeighborConv
+from gsencoder.models.plan import CloudPlan, Plan, join_plans, plan_cloud
+from gsencoder.models.point_transformer import PointTransformer, TransformerConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncoderConfig:
+    """What goes in, what happens to it."""
+
+    voxel: float = field(default=0.02, metadata={"help": "edge of the finest grid in metres; its cells are the tokens"})
+    inputs: tuple[Attribute, ...] = field(
+        default=("offset", "color", "opacity", "scale", "rotation"), metadata={"help": "attributes that are looked at"}
+    )
+    transformer: TransformerConfig = field(default_factory=TransformerConfig)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.voxel < math.inf:
+            raise InputError(f"voxel: expected a positive length in metres, got {self.voxel}")
+        unknown = [name for name in self.inputs if name not in CHANNELS]
+        if not self.inputs or unknown or len(set(self.inputs)) < len(self.inputs):
+            raise InputError(f"inputs: expected some of {', '.join(CHANNELS)}, each once, got {', '.join(self.inputs)}")
+
+
+class GaussianEncoder(nn.Module):
+    """Merges Gaussians into tokens, runs the transformer, and gives each Gaussian what its token found."""
+
+    def __init__(self, config: EncoderConfig, channels: int) -> None:
+        """Args:
+        config: see there.
+        channels: of the output: R coordinates in a basis, or all D of the space.
+        """
+        super().__init__()
+        self.config, self.channels = config, channels
+        width, out = config.transformer.encoder_channels[0], config.transformer.channels_out
+        self.stem = NeighborConv(channels_of(config.inputs), width)
+        self.stem_norm = nn.LayerNorm(width)
+        self.transformer = PointTransformer(config.transformer)
+        self.head_norm = nn.LayerNorm(out)
+        self.head = nn.Linear(out, channels)
+
+    def plan(self, means: Float[Tensor, "N 3"], voxel: float) -> CloudPlan:
+        """The plan of one cloud; `voxel` is the edge of the grid in the cloud's own units."""
+        shape = self.config.transformer
+        return plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders)
+
+    def join(self, clouds: list[CloudPlan], *, round_up: bool = False) -> Plan:
+        """The plan of a batch; see `plan.join_plans`."""
+        return join_plans(clouds, self.config.transformer.patch, round_up=round_up)
+
+    def forward(
+        self, attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan
+    ) -> Float[Tensor, "N channels"]:
+        """Features in standard units (see `TargetSpace`), float32 whatever the network computed in.
+
+        Args:
+            attributes: of `embed`, with the configuration's inputs.
+            weights: how much each Gaussian counts within its token, > 0: its opacity.
+            plan: of these Gaussians, in this order.
+        """
+        tokens = merge(attributes, weights, plan)
+        # Levels may end in tokens that stand for nothing.
+        tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
+        x = functional.gelu(self.stem_norm(self.stem(tokens, plan.levels[0].neighbors)))
+        x = self.transformer(x, plan)
+        features = self.head(self.head_norm(x)).float()
+        return features.index_select(0, plan.token_of)
+
+
+def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan) -> Float[Tensor, "T A"]:
+    """The weighted mean of each token's members, summed in the members' order, without atomics."""
+    if len(plan.counts) == len(attributes):
+        return attributes.index_select(0, plan.members)
+    weighted = torch.cat((attributes * weights.unsqueeze(1), weights.unsqueeze(1)), dim=1)
+    sums = torch.segment_reduce(weighted.index_select(0, plan.members), "sum", lengths=plan.counts)
+    return sums[:, :-1] / sums[:, -1:]

@@ -1,0 +1,96 @@
+"""What an encoder's numbers mean: standard units about the mean of a feature space, and the way back.
+
+CLIP-like spaces are narrow cones: vectors are nearly alike, and what tells names apart is what is left when the mean is
+taken off. A network therefore learns (feature − mean) / unit, in the coordinates of a basis where there is one, with
+the unit chosen so that each channel has a mean square of about one. Nothing is lost: magnitudes come back, as a
+teacher's own heads need them.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsencoder.data.archive import Archive, space_from_json, space_to_json
+from gsencoder.errors import InputError
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OutputSpace:
+    """The space that an encoder's outputs live in.
+
+    Attributes:
+        space: what decoded features are.
+        mean: the space's mean, which is taken off.
+        scale: root mean square distance of features from the mean.
+        basis: outputs are coordinates in it; None where they are all D channels.
+    """
+
+    space: FeatureSpace
+    mean: Float32[np.ndarray, " D"]
+    scale: float
+    basis: FeatureBasis | None = None
+
+    def __post_init__(self) -> None:
+        if self.mean.shape != (self.space.channels,):
+            raise InputError(f"OutputSpace.mean: expected {self.space.channels} channels, got {self.mean.shape}")
+        if not 0 < self.scale < math.inf:
+            raise InputError(f"OutputSpace.scale: expected a positive number, got {self.scale}")
+        if self.basis is not None and self.basis.space != self.space:
+            raise InputError(f"OutputSpace.basis: expected {self.space.describe()}, got {self.basis.space.describe()}")
+
+    @property
+    def channels(self) -> int:
+        """Columns of the outputs: R or D."""
+        return self.basis.rank if self.basis is not None else self.space.channels
+
+    @property
+    def unit(self) -> float:
+        """One standard unit, in the space's own."""
+        return self.scale / math.sqrt(self.channels)
+
+    def standardize(self, features: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
+        """Coordinates in the basis, or vectors of the space, as an encoder should give them."""
+        centred = features if self.basis is not None else features - self.mean
+        return np.asarray(centred / np.float32(self.unit), dtype=np.float32)
+
+    def restore(self, outputs: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
+        """The inverse of `standardize`."""
+        scaled = outputs * np.float32(self.unit)
+        return np.asarray(scaled if self.basis is not None else scaled + self.mean, dtype=np.float32)
+
+    def features(
+        self, outputs: Float32[np.ndarray, "N channels"], weights: Float32[np.ndarray, " N"]
+    ) -> GaussianFeatures:
+        """Outputs on Gaussians as features, in the form that fused ones have."""
+        return GaussianFeatures(
+            features=self.restore(outputs), weights=weights, mean=self.mean, space=self.space, basis=self.basis
+        )
+
+
+def write_outputs(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the header values that hold an output space in a file."""
+    arrays: dict[str, np.ndarray] = {"mean": outputs.mean}
+    header: dict[str, Any] = {"space": space_to_json(outputs.space), "scale": outputs.scale}
+    if outputs.basis is not None:
+        arrays["components"] = outputs.basis.components
+        header["energy_kept"] = outputs.basis.energy_kept
+    return arrays, header
+
+
+def read_outputs(file: Archive) -> OutputSpace:
+    """The output space that a file holds.
+
+    Raises:
+        InputError: damaged, or from another program.
+    """
+    space = space_from_json(file.value("space", dict))
+    mean, basis = file.array("mean", "float32", (space.channels,)), None
+    if "components" in file:
+        components = file.array("components", "float32", ("R", space.channels))
+        kept = file.value("energy_kept", float, int)
+        basis = FeatureBasis(mean=mean, components=components, energy_kept=kept, space=space)
+    return OutputSpace(space=space, mean=mean, scale=file.value("scale", float, int), basis=basis)

@@ -1,0 +1,241 @@
+"""Plans: everything about a cloud of Gaussians that does not depend on features, worked out once and then reused.
+
+Gaussians are merged on a grid into tokens. Each level of the network has its tokens' neighbours, the order in which
+attention cuts them into patches, and the way down to the next level and back. Tokens are kept in Morton order, so that
+whatever lies close in space lies close in memory.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int32, Int64
+from torch import Tensor
+
+from gsencoder.models.neighbors import neighbor_table
+from gsencoder.models.serialize import Order, bits_of, cells_of, encode_morton, morton_codes
+
+ORDERS: tuple[Order, ...] = ("z", "z-trans", "hilbert", "hilbert-trans")
+
+
+class Level(NamedTuple):
+    """One level of one or several clouds, T tokens in all, in O orders.
+
+    Attributes:
+        neighbors: the 27 cells around each token; T where there is none.
+        gathers: for each order the token at every place of every patch; padding repeats a token of its patch.
+        scatters: for each order the place of every token.
+        padding: False at places that attention must not look at, [patches, 1, 1, width]; None where no patch is padded.
+        width: places in a patch.
+        parents: each token's token one level below (coarser); empty at the last level.
+        children: each coarser token's tokens here, eight of them, the first repeated where there are fewer.
+    """
+
+    neighbors: Int32[Tensor, "T 27"]
+    gathers: Int64[Tensor, "O places"]
+    scatters: Int64[Tensor, "O T"]
+    padding: Bool[Tensor, "patches 1 1 width"] | None
+    width: int
+    parents: Int64[Tensor, " parents"]
+    children: Int64[Tensor, "M 8"]
+
+
+class Plan(NamedTuple):
+    """A batch of clouds, N Gaussians and T tokens in all.
+
+    Attributes:
+        token_of: each Gaussian's token.
+        members: the Gaussians sorted by token.
+        counts: how many of them each token has.
+        levels: finest first.
+        items: T of each cloud at the finest level.
+    """
+
+    token_of: Int64[Tensor, " N"]
+    members: Int64[Tensor, " N"]
+    counts: Int64[Tensor, " T"]
+    levels: tuple[Level, ...]
+    items: tuple[int, ...]
+
+    def to(self, device: str | torch.device) -> "Plan":
+        """The same on another device."""
+
+        def move(value: Tensor) -> Tensor:
+            return value.to(device, non_blocking=True)
+
+        levels = tuple(
+            level._replace(
+                neighbors=move(level.neighbors),
+                gathers=move(level.gathers),
+                scatters=move(level.scatters),
+                padding=move(level.padding) if level.padding is not None else None,
+                parents=move(level.parents),
+                children=move(level.children),
+            )
+            for level in self.levels
+        )
+        token_of, members, counts = map(move, (self.token_of, self.members, self.counts))
+        return self._replace(token_of=token_of, members=members, counts=counts, levels=levels)
+
+
+class CloudLevel(NamedTuple):
+    """One level of one cloud, before patches are cut."""
+
+    neighbors: Int32[Tensor, "T 27"]
+    orders: Int64[Tensor, "O T"]
+    parents: Int64[Tensor, " parents"]
+    children: Int64[Tensor, "M 8"]
+
+
+class CloudPlan(NamedTuple):
+    """One cloud, before clouds are put together."""
+
+    token_of: Int64[Tensor, " N"]
+    members: Int64[Tensor, " N"]
+    counts: Int64[Tensor, " T"]
+    levels: tuple[CloudLevel, ...]
+
+
+def plan_cloud(
+    means: Float[Tensor, "N 3"], voxel: float, *, levels: int, orders: Sequence[Order] = ORDERS
+) -> CloudPlan:
+    """The plan of one cloud.
+
+    Args:
+        means: centres in world units.
+        voxel: edge of the finest grid, world units; each level below doubles it.
+        levels: how many there are.
+        orders: the curves that attention follows, in turn.
+
+    Raises:
+        InputError: positions that are not finite, or spread over too many cells.
+    """
+    cells = cells_of(means, voxel)
+    codes, members = torch.sort(morton_codes(cells), stable=True)
+    _, token_of_member, counts = torch.unique_consecutive(codes, return_inverse=True, return_counts=True)
+    token_of = torch.empty_like(members)
+    token_of[members] = token_of_member
+    # The first member of each token stands for its cell; members are sorted, so tokens are in Morton order.
+    cells = cells[members[counts.cumsum(0) - counts]]
+    bits, morton = bits_of(cells), codes[counts.cumsum(0) - counts]
+    along = torch.stack([encode_morton(morton, order, bits) for order in orders])
+    found = []
+    for level in range(levels):
+        parents, children, first = _pool(morton) if level + 1 < levels else _no_pool(morton)
+        sorted_rows = torch.argsort(along, dim=1)
+        found.append(CloudLevel(neighbor_table(cells), sorted_rows, parents, children))
+        cells, morton, along = cells[first] >> 1, morton[first] >> 3, along[:, first] >> 3
+    return CloudPlan(token_of, members, counts, tuple(found))
+
+
+def _pool(morton: Int64[Tensor, " T"]) -> tuple[Int64[Tensor, " T"], Int64[Tensor, "M 8"], Int64[Tensor, " M"]]:
+    """Parents, children and first children of tokens in Morton order: siblings follow one another."""
+    _, parents, counts = torch.unique_consecutive(morton >> 3, return_inverse=True, return_counts=True)
+    first = counts.cumsum(0) - counts
+    step = torch.arange(8, device=morton.device)
+    children = first[:, None] + torch.where(step < counts[:, None], step, 0)
+    return parents, children, first
+
+
+def _no_pool(morton: Int64[Tensor, " T"]) -> tuple[Tensor, Tensor, Tensor]:
+    nothing = morton.new_zeros(0)
+    return nothing, nothing.view(0, 8), nothing
+
+
+def join_plans(clouds: Sequence[CloudPlan], patch: int, *, round_up: bool = False) -> Plan:
+    """Puts clouds side by side, without padding between them, and cuts each into patches of nearly equal size.
+
+    Args:
+        clouds: with equally many levels and orders.
+        patch: most tokens in a patch. A cloud of n tokens has ⌈n / patch⌉ patches of n // that or one more.
+        round_up: let every level end in tokens that stand for nothing, so that few different sizes occur: libraries
+            that compile a product for each size (oneDNN in bfloat16, torch.compile) then do so rarely.
+    """
+    tokens = [len(cloud.counts) for cloud in clouds]
+    gaussians = [len(cloud.members) for cloud in clouds]
+    levels = []
+    for level in range(len(clouds[0].levels)):
+        parts = [cloud.levels[level] for cloud in clouds]
+        levels.append(_join_levels(parts, patch, _rounded if round_up else int))
+    return Plan(
+        token_of=_shifted([cloud.token_of for cloud in clouds], tokens),
+        members=_shifted([cloud.members for cloud in clouds], gaussians),
+        counts=torch.cat([cloud.counts for cloud in clouds]),
+        levels=tuple(levels),
+        items=tuple(tokens),
+    )
+
+
+def _rounded(count: int) -> int:
+    """The next multiple of an eighth to a sixteenth of it."""
+    step = 1 << max(3, count.bit_length() - 4)
+    return -(-count // step) * step
+
+
+def _shifted(parts: Sequence[Tensor], sizes: Sequence[int], dim: int = 0) -> Tensor:
+    """Row numbers of several clouds as row numbers of all of them together."""
+    starts = [sum(sizes[:i]) for i in range(len(sizes))]
+    return torch.cat([part + start for part, start in zip(parts, starts, strict=True)], dim=dim)
+
+
+def _grown(rows: Tensor, size: int, value: int = 0, dim: int = 0) -> Tensor:
+    """The same with rows of `value` at the end, `size` in all."""
+    missing = size - rows.shape[dim]
+    if missing == 0:
+        return rows
+    shape = [missing if axis == dim else length for axis, length in enumerate(rows.shape)]
+    return torch.cat((rows, rows.new_full(shape, value)), dim=dim)
+
+
+def _join_levels(parts: Sequence[CloudLevel], patch: int, size: Callable[[int], int]) -> Level:
+    sizes = [len(part.neighbors) for part in parts]
+    total, coarser = size(sum(sizes)), [len(part.children) for part in parts]
+    neighbors = [
+        torch.where(part.neighbors < own, part.neighbors + sum(sizes[:i]), total).int()
+        if len(parts) > 1 or total != own
+        else part.neighbors
+        for i, (part, own) in enumerate(zip(parts, sizes, strict=True))
+    ]
+    orders = _shifted([part.orders for part in parts], sizes, dim=1)
+    places, slots, used = _patches(sizes, patch, size, orders.device)
+    scatters = torch.empty_like(orders).scatter_(1, orders, slots.expand_as(orders))
+    # Tokens that stand for nothing have no neighbours, are in no patch and no real token's children, and whatever is
+    # read for them is never used.
+    return Level(
+        neighbors=_grown(torch.cat(neighbors), total, total),
+        gathers=orders.index_select(1, places),
+        scatters=_grown(scatters, total, dim=1),
+        padding=None if bool(used.all()) else used[:, None, None, :],
+        width=used.shape[1],
+        parents=_grown(_shifted([part.parents for part in parts], coarser), total if sum(coarser) else 0),
+        children=_grown(_shifted([part.children for part in parts], sizes), size(sum(coarser))),
+    )
+
+
+def _patches(
+    sizes: Sequence[int], patch: int, size: Callable[[int], int], device: torch.device
+) -> tuple[Int64[Tensor, " places"], Int64[Tensor, " T"], Bool[Tensor, "patches width"]]:
+    """The position in the order at each place, the place of each position, and which places are more than padding."""
+    starts, lengths, begin = [], [], 0
+    for count in sizes:
+        patches = -(-count // patch)
+        bounds = torch.arange(patches + 1, device=device) * count // max(patches, 1)
+        starts.append(begin + bounds[:-1])
+        lengths.append(bounds.diff())
+        begin += count
+    start, length = torch.cat(starts), torch.cat(lengths)
+    width = int(length.max()) if len(length) else 0
+    step = torch.arange(width, device=device)
+    used = step < length[:, None]
+    places = start[:, None] + torch.where(used, step, 0)
+    slots = torch.nonzero(used.flatten()).squeeze(1)
+    # A patch of nothing attends to a token again and again, without a mask; nobody reads the result.
+    patches = size(len(used))
+    return _grown(places, patches).flatten(), slots, _grown(used, patches, 1)
+
+
+def make_plan(
+    means: Float[Tensor, "N 3"], voxel: float, *, levels: int, patch: int, orders: Sequence[Order] = ORDERS
+) -> Plan:
+    """The plan of one cloud on its own; see `plan_cloud` and `join_plans`."""
+    return join_plans([plan_cloud(means, voxel, levels=levels, orders=orders)], patch)

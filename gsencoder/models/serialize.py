@@ -1,0 +1,141 @@
+"""Space-filling orders of grid cells: Morton and Hilbert codes and their transposed forms (PTv3, Wu et al. 2024).
+
+A code is an int64 whose sorted order visits cells so that neighbours in the order are neighbours in space. Codes are
+hierarchical: `code >> 3` is the code of the cell twice as large, so one set of codes serves every level of pooling.
+"""
+
+from functools import cache
+from typing import Literal
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from gsencoder.errors import InputError
+
+Order = Literal["z", "z-trans", "hilbert", "hilbert-trans"]
+
+_EVERY_THIRD = 0x1249249249249249
+
+LARGEST_EXTENT = 2**20
+"""Cells along an axis, at most; with room for ALIGN, coordinates take 21 bits, and three of them fill an int64."""
+
+ALIGN = 64
+"""Cells are counted from a multiple of this, so that pooling pairs the same cells in a part of a scene as in all of it,
+through six levels."""
+
+
+def cells_of(points: Tensor, voxel: float) -> Int64[Tensor, "N 3"]:
+    """Grid cells of points [N, 3] in world units, counted on each axis from just below the lowest occupied one.
+
+    The grid is anchored at the world's zero and counted from a multiple of ALIGN cells, so that a part of a scene falls
+    into the same cells as the whole.
+
+    Raises:
+        InputError: points that are not finite, or that spread over 2²⁰ cells or more on an axis.
+    """
+    if not len(points):
+        return torch.zeros(0, 3, dtype=torch.int64, device=points.device)
+    scaled = torch.floor(points.double() / voxel)
+    low, high = scaled.aminmax(dim=0)
+    if not torch.isfinite(high - low).all():
+        bad = int((~torch.isfinite(scaled).all(dim=1)).sum())
+        raise InputError(f"grid: {bad} of {len(points)} positions are not finite")
+    extent = (high - low + 1).max().item()
+    if extent >= LARGEST_EXTENT:
+        raise InputError(
+            f"grid: the points spread over {extent:,.0f} cells of {voxel:g} units on an axis; the limit is 2²⁰; "
+            "take a larger voxel, or remove stray Gaussians (`gsencoder repair`)"
+        )
+    return (scaled - torch.floor(low / ALIGN) * ALIGN).long()
+
+
+def bits_of(cells: Int64[Tensor, "N 3"]) -> int:
+    """Bits that the largest coordinate needs, at least 1."""
+    return max(1, int(cells.max()).bit_length()) if len(cells) else 1
+
+
+def encode_cells(cells: Int64[Tensor, "N 3"], order: Order, bits: int) -> Int64[Tensor, " N"]:
+    """Codes of cells (each coordinate from 0 to 2^bits − 1) along a curve; the "-trans" ones swap x and y first."""
+    return encode_morton(morton_codes(cells), order, bits)
+
+
+def encode_morton(morton: Int64[Tensor, " N"], order: Order, bits: int) -> Int64[Tensor, " N"]:
+    """`encode_cells` for cells that are given by their Morton codes."""
+    if order.endswith("-trans"):
+        y = (morton & (_EVERY_THIRD << 1)) << 1
+        morton = (morton & _EVERY_THIRD) | y | ((morton >> 1) & (_EVERY_THIRD << 1))
+    return _hilbert_from_morton(morton, bits) if order.startswith("hilbert") else morton
+
+
+def morton_codes(cells: Int64[Tensor, "N 3"]) -> Int64[Tensor, " N"]:
+    """Z-order: the bits of x, y and z interleaved, x highest, for coordinates below 2²¹."""
+    spread = cells & (2**21 - 1)
+    # Each step moves the upper half of every group of bits away, until two zeros stand between any two bits.
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, _EVERY_THIRD),
+    ):
+        spread = (spread | (spread << shift)) & mask
+    return (spread[:, 0] << 2) | (spread[:, 1] << 1) | spread[:, 2]
+
+
+def hilbert_codes(cells: Int64[Tensor, "N 3"], bits: int) -> Int64[Tensor, " N"]:
+    """Positions along Hilbert's curve, which only ever steps to a face neighbour; for coordinates below 2^bits."""
+    return _hilbert_from_morton(morton_codes(cells), bits)
+
+
+def _hilbert_from_morton(morton: Int64[Tensor, " N"], bits: int) -> Int64[Tensor, " N"]:
+    """Hamilton 2006, "Compact Hilbert indices": the curve within a cell is one of 24 orientations, and a table gives,
+    for an orientation and the octants of the next two levels, their places on the curve and the orientation inside."""
+    table = _hilbert_table().to(morton.device)
+    code, state = torch.zeros_like(morton), torch.zeros_like(morton)
+    # Where levels are odd in number, an empty one is put on top, in the orientation whose first octant is as state 0.
+    levels = bits + bits % 2
+    if bits % 2:
+        state += next(outer for outer in range(24) if _hilbert_step(outer, 0) == (0, 0))
+    for level in range(levels - 2, -1, -2):
+        found = table.index_select(0, (state << 6) | ((morton >> (3 * level)) & 63))
+        code = (code << 6) | (found & 63)
+        state = found >> 6
+    return code
+
+
+@cache
+def _hilbert_table() -> Int64[Tensor, " 1536"]:
+    """For orientation·64 + two octants: the inner orientation·64 + two digits of the code."""
+    rows = []
+    for state in range(24):
+        for first in range(8):
+            digit, inside = _hilbert_step(state, first)
+            for second in range(8):
+                below, innermost = _hilbert_step(inside, second)
+                rows.append((innermost << 6) | (digit << 3) | below)
+    return torch.tensor(rows)
+
+
+def _hilbert_step(state: int, octant: int) -> tuple[int, int]:
+    """An octant's place on the curve of orientation 3·entry + direction, and the orientation of the curve in it."""
+    entry, direction = divmod(state, 3)
+    turned = _rotate_left(octant ^ entry, 3 - (direction + 1) % 3)
+    digit = turned ^ (turned >> 1) ^ (turned >> 2)
+    start = 0 if digit == 0 else _gray(2 * ((digit - 1) // 2))
+    step = 0 if digit == 0 else _trailing_ones(digit - 1 if digit % 2 == 0 else digit) % 3
+    inner = entry ^ _rotate_left(start, (direction + 1) % 3)
+    return digit, 3 * inner + (direction + step + 1) % 3
+
+
+def _gray(number: int) -> int:
+    return number ^ (number >> 1)
+
+
+def _rotate_left(octant: int, by: int) -> int:
+    by %= 3
+    return ((octant << by) | (octant >> (3 - by))) & 7
+
+
+def _trailing_ones(number: int) -> int:
+    return ((number ^ (number + 1)).bit_length()) - 1

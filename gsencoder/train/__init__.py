@@ -1,0 +1,1 @@
+"""Training: prepared scenes, samples, losses, and the loop over them."""

@@ -1,0 +1,248 @@
+"""Making scenes ready for training: everything that does not depend on the encoder is worked out once, and kept."""
+
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.data.atomic import atomic_file
+from gsencoder.errors import InputError
+from gsencoder.fusion.basis import encode
+from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.fusion.lift import capped
+from gsencoder.fusion.store import save_features
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.visibility import row_mask
+from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
+from gsencoder.render import blend
+from gsencoder.train.dataset_space import dataset_space
+from gsencoder.train.prepared import VIEWS_FILE, PreparedScene
+from gsencoder.train.rarity import Rarity, cluster_targets, count_targets
+from gsencoder.types import FeatureMap, Scene
+
+SPACE_FILE, SETTINGS_FILE, RARITY_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
+SAMPLED_TARGETS = 2048
+"""Targets of each scene that clusters are sought in."""
+
+Track = Callable[[Iterable[Any], str], Iterable[Any]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrepareConfig:
+    """How targets and the matrices of the render loss are made."""
+
+    fusion: FuseConfig = field(default_factory=FuseConfig)
+    render_cell: int = field(
+        default=8, metadata={"help": "smallest cell of the render loss, pixels; finer teacher maps are averaged"}
+    )
+    render_min_weight: float = field(
+        default=1e-3, metadata={"help": "smallest blending weight that is kept for the render loss"}
+    )
+    basis_views: int = field(default=256, metadata={"help": "maps of a dense teacher that its basis is found from"})
+
+    def __post_init__(self) -> None:
+        if self.render_cell < 1 or self.basis_views < 1:
+            raise InputError(
+                f"render_cell and basis_views: expected 1 or more, got {self.render_cell} and {self.basis_views}"
+            )
+        if not 0 <= self.render_min_weight < 1:
+            raise InputError(f"render_min_weight: expected a number in [0, 1), got {self.render_min_weight}")
+
+
+class PreparedDataset:
+    """A folder of prepared scenes that share an output space.
+
+    Scenes are prepared one by one and appear whole or not at all, so that a run that was cut off goes on where it
+    stopped, and several processes may share the work.
+    """
+
+    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+        """Args:
+        folder: made if it does not exist.
+        settings: all that the preparation depends on; what the folder holds must have been made with the same.
+
+        Raises:
+            InputError: it was made with others, or cannot be used.
+        """
+        self.folder = folder
+        wanted = json.loads(json.dumps(settings, default=str))
+        path = folder / SETTINGS_FILE
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            found = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        except (OSError, ValueError) as error:
+            raise InputError(f"{folder}: cannot be used for prepared scenes: {error}") from error
+        if found is not None and found != wanted:
+            different = [key for key in {*found, *wanted} if found.get(key) != wanted.get(key)]
+            raise InputError(
+                f"{folder}: was prepared with other settings ({', '.join(sorted(different))}); give another folder"
+            )
+        if found is None:
+            with atomic_file(path) as stream:
+                stream.write(json.dumps(wanted, indent=1).encode())
+
+    def find_space(
+        self, scenes: Sequence[Path], open_scene: Callable[[Path], tuple[Scene, Teacher]], config: PrepareConfig
+    ) -> None:
+        """Finds the output space of the training scenes, unless it has been found."""
+        if (self.folder / SPACE_FILE).is_file():
+            return
+        outputs, codebook = dataset_space(scenes, open_scene, config.fusion, views=config.basis_views)
+        arrays, header = write_outputs(outputs)
+        if codebook is not None:
+            arrays["codebook"] = codebook
+        write_archive(self.folder / SPACE_FILE, arrays, header)
+
+    def load_space(self) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
+        """The output space, and the vectors of a coded teacher's codes.
+
+        Raises:
+            InputError: missing or damaged.
+        """
+        with open_archive(self.folder / SPACE_FILE) as file:
+            outputs = read_outputs(file)
+            codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
+        return outputs, codebook
+
+    def is_ready(self, name: str) -> bool:
+        """Whether a scene has been prepared."""
+        return (self.folder / "scenes" / name / VIEWS_FILE).is_file()
+
+    def prepare(self, scene: Scene, teacher: Teacher, config: PrepareConfig) -> None:
+        """Fuses one scene and keeps its matrices; see `prepare_scene`."""
+        outputs, _ = self.load_space()
+        target = self.folder / "scenes" / scene.name
+        target.parent.mkdir(exist_ok=True)
+        partial = target.parent / f".{secrets.token_hex(6)}.partial"
+        partial.mkdir()
+        try:
+            prepare_scene(partial, scene, teacher, outputs, config)
+            os.rename(partial, target)
+        except OSError as error:
+            if not self.is_ready(scene.name):  # Another process may have been quicker; its result is the same.
+                raise InputError(f"{target}: cannot be written: {error.strerror or error}") from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+    def find_rarity(self, names: Sequence[str], track: Track) -> None:
+        """Counts how often each kind of target occurs in the training scenes, unless that has been done."""
+        if (self.folder / RARITY_FILE).is_file():
+            return
+        outputs, codebook = self.load_space()
+        scenes = [PreparedScene(self.folder / "scenes" / name, outputs) for name in names]
+
+        def seen_targets(scene: PreparedScene, most: int = 0) -> Float32[np.ndarray, "n channels"]:
+            rows = np.flatnonzero(scene.features.seen)
+            rows = rows[:: max(1, len(rows) // most)] if most else rows
+            targets = scene.targets(rows)
+            scene.forget()
+            return targets
+
+        if codebook is None:
+            codebook = cluster_targets(np.concatenate([seen_targets(scene, SAMPLED_TARGETS) for scene in scenes]))
+        rarity = count_targets((seen_targets(scene) for scene in track(scenes, "counting targets")), codebook)
+        write_archive(self.folder / RARITY_FILE, {"codebook": rarity.codebook, "counts": rarity.counts}, {})
+
+    def load_rarity(self) -> Rarity:
+        """What `find_rarity` found.
+
+        Raises:
+            InputError: missing or damaged.
+        """
+        with open_archive(self.folder / RARITY_FILE) as file:
+            return Rarity(
+                codebook=file.array("codebook", "float32", ("C", "channels")),
+                counts=file.array("counts", "float64", ("C",)),
+            )
+
+    def scenes(self, names: Sequence[str]) -> list[PreparedScene]:
+        """Prepared scenes by name."""
+        outputs, _ = self.load_space()
+        return [PreparedScene(self.folder / "scenes" / name, outputs) for name in names]
+
+
+def prepare_scene(folder: Path, scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig) -> None:
+    """Writes a scene's Gaussians, fused targets, and for every view the rows of its render loss.
+
+    Args:
+        folder: exists, and is empty.
+        scene: with Gaussians and views.
+        teacher: of the space of `outputs`.
+        outputs: the dataset's.
+        config: see there.
+
+    Raises:
+        InputError: whatever `fuse` refuses.
+    """
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    fusion = replace(config.fusion, basis=outputs.basis is not None)
+    fused = fuse(scene, teacher, fusion, basis=outputs.basis).features
+    save_features(folder, scene, fused, {"prepared": asdict(config), "teacher": teacher.settings()})
+    blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("crow", "col", "weight", "targets", "valid")}
+    rows, entries = [0], 0
+    for view in range(len(scene.views)):
+        targets, valid, grid = _pooled(teacher.feature_map(scene.views, view), outputs, config.render_cell)
+        b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid))
+        if scene.views.masks is not None:
+            valid &= row_mask(scene.views.masks[view], b.lattice) == 1
+        crow = b.crow.numpy()
+        parts["crow"].append(crow[:-1] + entries)
+        parts["col"].append(b.col.numpy())
+        parts["weight"].append(b.weight.numpy().astype(np.float16))
+        parts["targets"].append(targets.astype(np.float16))
+        parts["valid"].append(valid.astype(np.uint8))
+        entries += int(crow[-1])
+        rows.append(rows[-1] + len(valid))
+    arrays = {name: np.concatenate(part) for name, part in parts.items()}
+    arrays["crow"] = np.append(arrays["crow"], entries)
+    arrays["rows"] = np.array(rows, np.int64)
+    write_archive(folder / VIEWS_FILE, arrays, {})
+
+
+def _pooled(
+    feature_map: FeatureMap, outputs: OutputSpace, cell: int
+) -> tuple[Float32[np.ndarray, "P channels"], Bool[np.ndarray, " P"], FeatureMap]:
+    """A map in standard units on cells of at least `cell` pixels, which cells have a vector, and a map of that grid.
+
+    Cells over the right and lower border of the pooled grid are left out.
+    """
+    affine = feature_map.grid_from_image
+    side = 1 / float(np.sqrt(affine[0, 0] * affine[1, 1]))
+    factor = max(1, round(cell / side))
+    height, width = feature_map.height // factor, feature_map.width // factor
+    if not height or not width:
+        raise InputError(f"prepare: a map of {feature_map.width}×{feature_map.height} has no cell of {cell} pixels")
+    if feature_map.codes is not None:
+        assert feature_map.table is not None
+        codes = feature_map.codes
+        table = np.concatenate((_standard(feature_map.table, outputs), np.full((1, outputs.channels), np.nan)))
+        grid = table.astype(np.float32)[codes]
+    else:
+        assert feature_map.features is not None
+        grid = _standard(feature_map.features, outputs)
+    cells = grid[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
+    vectors = cells.mean(axis=(1, 3)).reshape(height * width, -1)
+    valid = np.isfinite(vectors).all(axis=1)
+    scaled: Float64[np.ndarray, "2 3"] = affine / factor
+    like = FeatureMap(
+        features=np.zeros((height, width, feature_map.space.channels), np.float32),
+        grid_from_image=scaled,
+        space=feature_map.space,
+    )
+    return np.where(valid[:, None], vectors, np.float32(0)), valid, like
+
+
+def _standard(vectors: np.ndarray, outputs: OutputSpace) -> np.ndarray:
+    flat = vectors.reshape(-1, vectors.shape[-1])
+    coordinates = encode(outputs.basis, flat) if outputs.basis is not None else flat
+    return outputs.standardize(coordinates).reshape(*vectors.shape[:-1], -1)
