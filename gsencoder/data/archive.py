@@ -56,25 +56,22 @@ class Archive:
             raise InputError(f"{self.path}: {bad} of {values.size} values of {name} are not finite")
         return values
 
-    def part(self, name: str, dtype: str, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` of an array, the only ones that are read.
+    def shape(self, name: str, dtype: str, axes: int) -> tuple[int, ...]:
+        """The size of an array, without reading it.
 
         Raises:
-            InputError: missing, of another type, shorter, or not finite.
+            InputError: missing, of another type, or with another number of axes.
         """
         if name not in self._names:
             raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
         stored = self._file.get_slice(name)
         got_dtype, shape = DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
-        if got_dtype != dtype or not shape or not 0 <= start <= stop <= shape[0]:
+        if got_dtype != dtype or len(shape) != axes:
             raise InputError(
-                f"{self.path}: expected {dtype} rows {start} to {stop} of {name}, got {got_dtype}[{_listed(shape)}]; "
+                f"{self.path}: expected {name} {dtype} with {axes} axes, got {got_dtype}[{_listed(shape)}]; "
                 "the file is damaged or from another program"
             )
-        values: np.ndarray = stored[start:stop]
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
-            raise InputError(f"{self.path}: values of {name} in rows {start} to {stop} are not finite")
-        return values
+        return shape
 
     def value(self, key: str, *kinds: type | None) -> Any:
         """A value of the header, of one of these types.
@@ -145,6 +142,30 @@ def open_archive(path: Path) -> Iterator[Archive]:
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged or no safetensors file: {message}") from error
+
+
+def map_arrays(path: Path, wanted: Mapping[str, tuple[str, int]]) -> dict[str, np.ndarray]:
+    """Arrays of a file as read-only memory maps: only what is looked at is read, and processes share it.
+
+    Values are not looked at, so the file must be one that this program wrote whole.
+
+    Args:
+        path: the file.
+        wanted: dtype and number of axes of each array.
+
+    Raises:
+        InputError: missing, damaged, or without these arrays.
+    """
+    with open_archive(path) as file:
+        sizes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in wanted.items()}
+    raw = np.memmap(path, dtype=np.uint8, mode="r")
+    begin = 8 + int.from_bytes(raw[:8].tobytes(), "little")
+    entries = json.loads(raw[8:begin].tobytes())
+    mapped = {}
+    for name, (dtype, _) in wanted.items():
+        first, last = entries[name]["data_offsets"]
+        mapped[name] = raw[begin + first : begin + last].view(dtype).reshape(sizes[name])
+    return mapped
 
 
 def space_to_json(space: FeatureSpace) -> dict[str, Any]:

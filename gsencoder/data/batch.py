@@ -71,8 +71,6 @@ def choose_rows(
     rarity: Float32[np.ndarray, " N"],
     config: SamplingConfig,
     rng: np.random.Generator,
-    *,
-    drop: float = 0.0,
 ) -> Int64[np.ndarray, " n"]:
     """Rows of a sample, ascending.
 
@@ -82,7 +80,6 @@ def choose_rows(
         rarity: how rare each Gaussian's target is; 0 = has none, and is never the centre of a crop.
         config: see there.
         rng: everything random comes from it.
-        drop: largest share that is left out at random.
 
     Raises:
         InputError: no Gaussian lies in any frustum.
@@ -97,7 +94,12 @@ def choose_rows(
         total = chances.sum()
         center = rng.choice(len(rows), p=chances / total) if 0 < total < math.inf else rng.integers(len(rows))
         rows = rows[nearest(means[rows], means[rows[center]], config.gaussians)]
-    if drop:
-        kept = rows[rng.random(len(rows)) >= rng.uniform(0, drop)]
-        rows = kept if len(kept) else rows
     return rows
+
+
+def thin_out(rows: Int64[np.ndarray, " n"], most: float, rng: np.random.Generator) -> Int64[np.ndarray, " m"]:
+    """Leaves out a random share of rows, at most `most` of them on average; never all."""
+    if not most:
+        return rows
+    kept = rows[rng.random(len(rows)) >= rng.uniform(0, most)]
+    return kept if len(kept) else rows

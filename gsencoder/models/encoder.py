@@ -3,16 +3,21 @@
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.errors import InputError
-from gsencoder.models.embed import CHANNELS, Attribute, channels_of
+from gsencoder.models.embed import CHANNELS, Attribute, channels_of, embed
 from gsencoder.models.neighbors import NeighborConv
 from gsencoder.models.plan import CloudPlan, Plan, join_plans, plan_cloud
 from gsencoder.models.point_transformer import PointTransformer, TransformerConfig
+from gsencoder.types import Gaussians
+
+FAINT = 1e-3
+"""A Gaussian of no opacity counts this much within its token, so that a token of such Gaussians has a mean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,26 +55,21 @@ class GaussianEncoder(nn.Module):
         self.head_norm = nn.LayerNorm(out)
         self.head = nn.Linear(out, channels)
 
-    def plan(self, means: Float[Tensor, "N 3"], voxel: float) -> CloudPlan:
-        """The plan of one cloud; `voxel` is the edge of the grid in the cloud's own units."""
-        shape = self.config.transformer
-        return plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders)
-
     def join(self, clouds: list[CloudPlan], *, round_up: bool = False) -> Plan:
         """The plan of a batch; see `plan.join_plans`."""
         return join_plans(clouds, self.config.transformer.patch, round_up=round_up)
 
     def forward(
-        self, attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan
+        self, attributes: Float[Tensor, "N A"], opacities: Float[Tensor, " N"], plan: Plan
     ) -> Float[Tensor, "N channels"]:
         """Features in standard units (see `TargetSpace`), float32 whatever the network computed in.
 
         Args:
             attributes: of `embed`, with the configuration's inputs.
-            weights: how much each Gaussian counts within its token, > 0: its opacity.
+            opacities: how much each Gaussian counts within its token.
             plan: of these Gaussians, in this order.
         """
-        tokens = merge(attributes, weights, plan)
+        tokens = merge(attributes, opacities.clamp(min=FAINT), plan)
         # Levels may end in tokens that stand for nothing.
         tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
         x = functional.gelu(self.stem_norm(self.stem(tokens, plan.levels[0].neighbors)))
@@ -79,9 +79,41 @@ class GaussianEncoder(nn.Module):
 
 
 def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan) -> Float[Tensor, "T A"]:
-    """The weighted mean of each token's members, summed in the members' order, without atomics."""
+    """The weighted mean (weights > 0) of each token's members, summed in the members' order, without atomics."""
     if len(plan.counts) == len(attributes):
         return attributes.index_select(0, plan.members)
     weighted = torch.cat((attributes * weights.unsqueeze(1), weights.unsqueeze(1)), dim=1)
     sums = torch.segment_reduce(weighted.index_select(0, plan.members), "sum", lengths=plan.counts)
     return sums[:, :-1] / sums[:, -1:]
+
+
+def encoder_inputs(
+    gaussians: Gaussians, config: EncoderConfig, voxel: float, device: str | torch.device = "cpu"
+) -> tuple[Float[Tensor, "N A"], Float[Tensor, " N"], CloudPlan]:
+    """What an encoder takes of one cloud: attributes, opacities, and its plan.
+
+    Args:
+        gaussians: the cloud.
+        config: of the encoder.
+        voxel: edge of the finest grid in the cloud's own units (`config.voxel` is in metres).
+        device: where the tensors are to be.
+
+    Raises:
+        InputError: the cloud spreads over too many cells.
+    """
+
+    def tensor(array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(device)
+
+    means, opacities = tensor(gaussians.means), tensor(gaussians.opacities)
+    attributes = embed(
+        means,
+        tensor(gaussians.quats),
+        tensor(gaussians.scales),
+        opacities,
+        tensor(gaussians.sh[:, 0]),
+        voxel=voxel,
+        attributes=config.inputs,
+    )
+    shape = config.transformer
+    return attributes, opacities, plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders)

@@ -1,11 +1,8 @@
 """Making scenes ready for training: everything that does not depend on the encoder is worked out once, and kept."""
 
 import json
-import os
-import secrets
-import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +15,12 @@ from gsencoder.errors import InputError
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import capped
-from gsencoder.fusion.store import save_features
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
 from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
 from gsencoder.render import blend
 from gsencoder.train.dataset_space import dataset_space
-from gsencoder.train.prepared import VIEWS_FILE, PreparedScene
+from gsencoder.train.prepared import PreparedScene, ViewRows, write_prepared
 from gsencoder.train.rarity import Rarity, cluster_targets, count_targets
 from gsencoder.types import FeatureMap, Scene
 
@@ -112,39 +108,31 @@ class PreparedDataset:
             codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
         return outputs, codebook
 
-    def is_ready(self, name: str) -> bool:
-        """Whether a scene has been prepared."""
-        return (self.folder / "scenes" / name / VIEWS_FILE).is_file()
+    def path_of(self, name: str) -> Path:
+        """The file of a scene; it is there once the scene has been prepared."""
+        return self.folder / "scenes" / f"{name}.safetensors"
 
     def prepare(self, scene: Scene, teacher: Teacher, config: PrepareConfig) -> None:
-        """Fuses one scene and keeps its matrices; see `prepare_scene`."""
+        """Fuses one scene and keeps its targets and matrices; the file appears whole or not at all.
+
+        Raises:
+            InputError: whatever `fuse` refuses, or the disk is full.
+        """
         outputs, _ = self.load_space()
-        target = self.folder / "scenes" / scene.name
-        target.parent.mkdir(exist_ok=True)
-        partial = target.parent / f".{secrets.token_hex(6)}.partial"
-        partial.mkdir()
-        try:
-            prepare_scene(partial, scene, teacher, outputs, config)
-            os.rename(partial, target)
-        except OSError as error:
-            if not self.is_ready(scene.name):  # Another process may have been quicker; its result is the same.
-                raise InputError(f"{target}: cannot be written: {error.strerror or error}") from error
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        path = self.path_of(scene.name)
+        path.parent.mkdir(exist_ok=True)
+        prepare_scene(path, scene, teacher, outputs, config)
 
     def find_rarity(self, names: Sequence[str], track: Track) -> None:
         """Counts how often each kind of target occurs in the training scenes, unless that has been done."""
         if (self.folder / RARITY_FILE).is_file():
             return
-        outputs, codebook = self.load_space()
-        scenes = [PreparedScene(self.folder / "scenes" / name, outputs) for name in names]
+        _, codebook = self.load_space()
+        scenes = self.scenes(names)
 
         def seen_targets(scene: PreparedScene, most: int = 0) -> Float32[np.ndarray, "n channels"]:
-            rows = np.flatnonzero(scene.features.seen)
-            rows = rows[:: max(1, len(rows) // most)] if most else rows
-            targets = scene.targets(rows)
-            scene.forget()
-            return targets
+            rows = np.flatnonzero(scene.weights)
+            return scene.targets(rows[:: max(1, len(rows) // most)] if most else rows)
 
         if codebook is None:
             codebook = cluster_targets(np.concatenate([seen_targets(scene, SAMPLED_TARGETS) for scene in scenes]))
@@ -165,15 +153,14 @@ class PreparedDataset:
 
     def scenes(self, names: Sequence[str]) -> list[PreparedScene]:
         """Prepared scenes by name."""
-        outputs, _ = self.load_space()
-        return [PreparedScene(self.folder / "scenes" / name, outputs) for name in names]
+        return [PreparedScene(self.path_of(name)) for name in names]
 
 
-def prepare_scene(folder: Path, scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig) -> None:
+def prepare_scene(path: Path, scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig) -> None:
     """Writes a scene's Gaussians, fused targets, and for every view the rows of its render loss.
 
     Args:
-        folder: exists, and is empty.
+        path: the file.
         scene: with Gaussians and views.
         teacher: of the space of `outputs`.
         outputs: the dataset's.
@@ -186,27 +173,16 @@ def prepare_scene(folder: Path, scene: Scene, teacher: Teacher, outputs: OutputS
     assert scene.views is not None
     fusion = replace(config.fusion, basis=outputs.basis is not None)
     fused = fuse(scene, teacher, fusion, basis=outputs.basis).features
-    save_features(folder, scene, fused, {"prepared": asdict(config), "teacher": teacher.settings()})
     blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("crow", "col", "weight", "targets", "valid")}
-    rows, entries = [0], 0
+    rows = []
     for view in range(len(scene.views)):
         targets, valid, grid = _pooled(teacher.feature_map(scene.views, view), outputs, config.render_cell)
         b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid))
         if scene.views.masks is not None:
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
-        crow = b.crow.numpy()
-        parts["crow"].append(crow[:-1] + entries)
-        parts["col"].append(b.col.numpy())
-        parts["weight"].append(b.weight.numpy().astype(np.float16))
-        parts["targets"].append(targets.astype(np.float16))
-        parts["valid"].append(valid.astype(np.uint8))
-        entries += int(crow[-1])
-        rows.append(rows[-1] + len(valid))
-    arrays = {name: np.concatenate(part) for name, part in parts.items()}
-    arrays["crow"] = np.append(arrays["crow"], entries)
-    arrays["rows"] = np.array(rows, np.int64)
-    write_archive(folder / VIEWS_FILE, arrays, {})
+        arrays = (b.crow.numpy(), b.col.numpy(), b.weight.numpy())
+        rows.append(ViewRows(crow=arrays[0], col=arrays[1], weight=arrays[2], targets=targets, valid=valid))
+    write_prepared(path, scene, fused, outputs, rows)
 
 
 def _pooled(

@@ -1,7 +1,8 @@
-"""A scene made ready for training, on disk: its Gaussians with their targets, and for every view the matrix B of the
-teacher's cells beside the teacher's vectors there. Read lazily: a sample touches the views that it was given.
+"""A scene made ready for training: one file with its Gaussians, their targets, and for every view the matrix B of the
+teacher's cells beside the teacher's vectors there.
 
-A folder holds what `fuse` writes (`localize` can be asked there) and `views.safetensors`.
+The file is memory-mapped: a sample reads the Gaussians and the views that it was given and nothing else, and the data
+workers of one machine share what was read.
 """
 
 from dataclasses import dataclass
@@ -9,15 +10,28 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from gsencoder.data.archive import open_archive
+from gsencoder.data.archive import map_arrays, open_archive, write_archive
 from gsencoder.errors import InputError
-from gsencoder.fusion.store import load_features
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene
 
-VIEWS_FILE = "views.safetensors"
+_ARRAYS = {
+    "means": ("float32", 2),
+    "quats": ("float32", 2),
+    "scales": ("float32", 2),
+    "opacities": ("float32", 1),
+    "sh_dc": ("float32", 2),
+    "targets": ("float16", 2),
+    "weights": ("float32", 1),
+    "rows": ("int64", 1),
+    "crow": ("int64", 1),
+    "col": ("int32", 1),
+    "weight": ("float16", 1),
+    "row_targets": ("float16", 2),
+    "row_valid": ("uint8", 1),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,65 +52,141 @@ class ViewRows:
 
 
 class PreparedScene:
-    """One folder; the Gaussians are read when they are first asked for, and forgotten by `forget`."""
+    """One prepared file. It is opened when something is first asked for, so that scenes can be sent to workers."""
 
-    def __init__(self, folder: Path, outputs: OutputSpace) -> None:
-        self.folder, self.outputs = folder, outputs
-        self.name = folder.name
+    def __init__(self, path: Path) -> None:
+        self.path, self.name = path, path.stem
+
+    def __reduce__(self) -> tuple[type["PreparedScene"], tuple[Path]]:
+        return PreparedScene, (self.path,)
 
     @cached_property
-    def scene(self) -> Scene:
-        """Gaussians, cameras and features; fused in the dataset's basis.
+    def _arrays(self) -> dict[str, np.ndarray]:
+        return map_arrays(self.path, _ARRAYS)
 
-        Raises:
-            InputError: damaged, or prepared for another space.
-        """
-        scene = load_features(self.folder)
-        features = next(iter(scene.features.values()))
-        same = features.space == self.outputs.space and (features.basis is None) == (self.outputs.basis is None)
-        if not same or features.features.shape[1] != self.outputs.channels:
-            raise InputError(f"{self.folder}: was prepared for another dataset; prepare it again")
-        if scene.views is None:
-            raise InputError(f"{self.folder}: holds no views; prepare it again")
-        return scene
+    @cached_property
+    def _header(self) -> tuple[Cameras, float | None, list[float] | None, tuple[str, ...]]:
+        with open_archive(self.path) as file:
+            cameras = Cameras(
+                cam_from_world=file.array("cam_from_world", "float32", ("V", 4, 4)),
+                Ks=file.array("Ks", "float32", ("V", 3, 3)),
+                widths=file.array("widths", "int32", ("V",)),
+                heights=file.array("heights", "int32", ("V",)),
+            )
+            names = tuple(str(name) for name in file.value("views", list))
+            return cameras, file.value("metres_per_unit", float, int, None), file.value("up", list, None), names
 
-    @property
-    def gaussians(self) -> Gaussians:
-        assert self.scene.gaussians is not None
-        return self.scene.gaussians
+    def __len__(self) -> int:
+        return len(self._arrays["means"])
 
     @property
     def cameras(self) -> Cameras:
-        assert self.scene.views is not None
-        return self.scene.views.cameras
+        return self._header[0]
 
     @property
-    def features(self) -> GaussianFeatures:
-        return next(iter(self.scene.features.values()))
+    def metres_per_unit(self) -> float | None:
+        return self._header[1]
+
+    @property
+    def up(self) -> Float64[np.ndarray, "3"] | None:
+        return None if self._header[2] is None else np.array(self._header[2], np.float64)
+
+    @property
+    def view_names(self) -> tuple[str, ...]:
+        return self._header[3]
+
+    @property
+    def channels(self) -> int:
+        """Columns of the targets."""
+        return int(self._arrays["targets"].shape[1])
+
+    @property
+    def means(self) -> Float32[np.ndarray, "N 3"]:
+        return self._arrays["means"]
+
+    @property
+    def weights(self) -> Float32[np.ndarray, " N"]:
+        """How much each Gaussian was seen; 0 = never, and it has no target."""
+        return self._arrays["weights"]
+
+    def gaussians(self, rows: np.ndarray) -> Gaussians:
+        """Some of the Gaussians, with degree-0 colours."""
+        arrays = self._arrays
+        return Gaussians(
+            means=arrays["means"][rows],
+            quats=arrays["quats"][rows],
+            scales=arrays["scales"][rows],
+            opacities=arrays["opacities"][rows],
+            sh=arrays["sh_dc"][rows][:, None],
+        )
 
     def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
-        """What the encoder should give for these Gaussians, standard units; meaningless where never seen."""
-        return self.outputs.standardize(self.features.features[rows])
+        """What the encoder should give for these Gaussians, standard units; zero where never seen."""
+        return self._arrays["targets"][rows].astype(np.float32)
 
     def view(self, view: int) -> ViewRows:
-        """One view's part of the file.
+        """One view's rows."""
+        arrays = self._arrays
+        first, last = int(arrays["rows"][view]), int(arrays["rows"][view + 1])
+        crow = np.array(arrays["crow"][first : last + 1])
+        start, end = int(crow[0]), int(crow[-1])
+        return ViewRows(
+            crow=crow - start,
+            col=np.array(arrays["col"][start:end]),
+            weight=arrays["weight"][start:end].astype(np.float32),
+            targets=arrays["row_targets"][first:last].astype(np.float32),
+            valid=arrays["row_valid"][first:last].astype(bool),
+        )
 
-        Raises:
-            InputError: missing or damaged.
-        """
-        with open_archive(self.folder / VIEWS_FILE) as file:
-            rows = file.part("rows", "int64", view, view + 2)
-            first, last = int(rows[0]), int(rows[-1])
-            crow = file.part("crow", "int64", first, last + 1)
-            start, end = int(crow[0]), int(crow[-1])
-            return ViewRows(
-                crow=crow - start,
-                col=file.part("col", "int32", start, end),
-                weight=file.part("weight", "float16", start, end).astype(np.float32),
-                targets=file.part("targets", "float16", first, last).astype(np.float32),
-                valid=file.part("valid", "uint8", first, last).astype(bool),
-            )
 
-    def forget(self) -> None:
-        """Frees the arrays; they are read again when asked for."""
-        self.__dict__.pop("scene", None)
+def write_prepared(
+    path: Path, scene: Scene, features: GaussianFeatures, outputs: OutputSpace, views: list[ViewRows]
+) -> None:
+    """Writes a scene with its fused targets and the rows of all its views.
+
+    Args:
+        path: of the file.
+        scene: with Gaussians and cameras.
+        features: fused, in the basis of `outputs`.
+        outputs: the dataset's.
+        views: one for each camera.
+
+    Raises:
+        InputError: features of another space, or the disk is full.
+    """
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    if features.space != outputs.space or features.features.shape[1] != outputs.channels:
+        raise InputError(
+            f"prepare: expected features of ({outputs.space.describe()}), got ({features.space.describe()})"
+        )
+    gaussians, cameras = scene.gaussians, scene.views.cameras
+    sizes = [len(view.valid) for view in views]
+    entries = np.cumsum([0, *(len(view.col) for view in views)])
+    arrays = {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": gaussians.scales,
+        "opacities": gaussians.opacities,
+        "sh_dc": gaussians.sh[:, 0],
+        "targets": np.where(features.seen[:, None], outputs.standardize(features.features), 0).astype(np.float16),
+        "weights": features.weights,
+        "rows": np.cumsum([0, *sizes]).astype(np.int64),
+        "crow": np.concatenate(
+            [view.crow[:-1] + start for view, start in zip(views, entries[:-1], strict=True)] + [entries[-1:]]
+        ).astype(np.int64),
+        "col": np.concatenate([view.col for view in views]),
+        "weight": np.concatenate([view.weight for view in views]).astype(np.float16),
+        "row_targets": np.concatenate([view.targets for view in views]).astype(np.float16),
+        "row_valid": np.concatenate([view.valid for view in views]).astype(np.uint8),
+        "cam_from_world": cameras.cam_from_world,
+        "Ks": cameras.Ks,
+        "widths": cameras.widths,
+        "heights": cameras.heights,
+    }
+    header = {
+        "views": list(scene.views.names),
+        "metres_per_unit": scene.metres_per_unit,
+        "up": None if scene.up is None else scene.up.tolist(),
+    }
+    write_archive(path, arrays, header)

@@ -26,12 +26,15 @@ class Rarity:
     codebook: Float32[np.ndarray, "C channels"]
     counts: Float64[np.ndarray, " C"]
 
+    def each(self, power: float) -> Float32[np.ndarray, " C"]:
+        """n^−power for each vector of the codebook, scaled so that the mean over the dataset's targets is 1."""
+        weights = np.maximum(self.counts, 1.0) ** -power
+        weights *= self.counts.sum() / max(float((weights * self.counts).sum()), 1e-30)
+        return weights.astype(np.float32)
+
     def weights(self, targets: Float32[np.ndarray, "n channels"], power: float) -> Float32[np.ndarray, " n"]:
-        """n^−power for each target, scaled so that their mean over the dataset is 1."""
-        counts = np.maximum(self.counts, 1.0)
-        each = counts**-power
-        each *= self.counts.sum() / max(float((each * self.counts).sum()), 1e-30)
-        return np.asarray(each[nearest_codes(self.codebook, targets)], dtype=np.float32)
+        """`each`, for targets by their nearest vector."""
+        return self.each(power)[nearest_codes(self.codebook, targets)]
 
 
 def nearest_codes(

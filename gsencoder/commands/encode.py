@@ -1,0 +1,127 @@
+"""`gsencoder encode SPLAT weights=FILE`: features on every Gaussian in one pass, without photographs or teacher."""
+
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from gsencoder.config import CommonConfig, settings
+from gsencoder.data.model_files import find_file
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.splats import READABLE
+from gsencoder.data.text_table import load_text_table, save_text_table
+from gsencoder.errors import SceneWarning
+from gsencoder.fusion.store import WORDS_FILE, save_features
+from gsencoder.infer.boxes import scene_spacing
+from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.heap import keep_heap
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.weights import WEIGHTS_FILE, load_weights
+from gsencoder.outputs import output_folder
+from gsencoder.progress import Progress, console
+from gsencoder.summary import Summary
+from gsencoder.types import Scene
+
+SPACING_IN_VOXELS = 1.0
+"""Where no unit is known, a splat is taken to have about one Gaussian in each cell of a surface, as seeds have."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncodeCommandConfig(CommonConfig):
+    """Settings of `encode`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "splats, scenes, or folders of scenes", "metavar": "SPLAT", "required": True},
+    )
+    weights: str = field(
+        default="house_cpu", metadata={"help": "what `train` wrote: its folder or file, or a name that comes with gsencoder"}
+    )
+    splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    encode: EncodeConfig = field(default_factory=EncodeConfig)
+
+
+def run(config: EncodeCommandConfig, summary: Summary) -> None:
+    """Encodes one scene into out=, or each of several into a folder of its name below out=."""
+    keep_heap()
+    paths = find_scenes(config.paths)
+    with summary.step("weights"):
+        file = weights_file(config.weights)
+        encoder, outputs, _ = load_weights(file)
+        words_file = file.with_name(WORDS_FILE)
+        words = load_text_table(words_file) if words_file.is_file() else None
+    screen = console(config.quiet)
+    for path in paths:
+        one = summary if len(paths) == 1 else Summary(summary.command, summary.settings)
+        with one.step("load"):
+            scene = load_scene(path, splat=config.splat or None, options=config.data)
+        if scene.gaussians is None:
+            with one.step("seeds"):
+                scene = replace(scene, gaussians=seed(scene, config.seeds))
+        out = config.out or Path("outputs") / scene.name / "features"
+        if len(paths) > 1:
+            out = out / scene.name
+        with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
+            _encode_into(folder, scene, encoder, outputs, config, one)
+            if words is not None:
+                save_text_table(folder / WORDS_FILE, words)
+        screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
+
+
+def weights_file(given: str) -> Path:
+    """The weights that a user means: a file, a folder of `train`, or a name of the folder of models.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    path = Path(given)
+    if path.is_dir():
+        return path / WEIGHTS_FILE
+    shipped = Path(__file__).resolve().parent.parent / "weights" / given / WEIGHTS_FILE
+    return shipped if shipped.is_file() else find_file(given, "weights")
+
+
+def _encode_into(
+    folder: Path,
+    scene: Scene,
+    encoder: GaussianEncoder,
+    outputs: OutputSpace,
+    config: EncodeCommandConfig,
+    summary: Summary,
+) -> None:
+    assert scene.gaussians is not None
+    unit = scene.metres_per_unit
+    if unit is None:
+        spacing = scene_spacing(scene.gaussians.means)
+        unit = SPACING_IN_VOXELS * encoder.config.voxel / spacing if spacing else 1.0
+        warnings.warn(
+            f"encode: the unit of {scene.name!r} is unknown; its Gaussians lie {spacing:.4g} units apart, which is taken "
+            f"for the encoder's grid of {encoder.config.voxel:g} m (data.metres_per_unit={unit:.4g}); give "
+            "data.metres_per_unit= if you know better",
+            SceneWarning,
+            stacklevel=2,
+        )
+    with summary.step("encode"):
+        features = encode(
+            scene.gaussians,
+            encoder,
+            outputs,
+            config.encode,
+            metres_per_unit=unit,
+            track=Progress(quiet=config.quiet),
+        )
+    with summary.step("write"):
+        save_features(folder, scene, features, {"encode": settings(config.encode), "weights": config.weights})
+    summary.results.update(
+        gaussians=len(features),
+        seen=int(features.seen.sum()),
+        views=len(scene.views) if scene.views is not None else 0,
+        channels=features.space.channels,
+        rank=features.features.shape[1],
+        metres_per_unit=unit,
+        space=features.space.describe(),
+        features="features.safetensors",
+    )

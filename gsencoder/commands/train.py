@@ -1,0 +1,230 @@
+"""`gsencoder train SCENE… out=FOLDER`: distil a teacher into an encoder that needs neither photographs nor teacher."""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatch
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from gsencoder.config import CommonConfig, settings
+from gsencoder.data.augment import AugmentConfig
+from gsencoder.data.batch import SamplingConfig
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.text_table import TextTable, save_text_table
+from gsencoder.errors import InputError
+from gsencoder.evaluate.naming import naming
+from gsencoder.fusion.store import WORDS_FILE
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers.build import build_teacher, text_table_of
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.teachers.onnx import OnnxConfig
+from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.infer.encode import EncodeConfig
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
+from gsencoder.models.heap import keep_heap
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.weights import WEIGHTS_FILE, save_weights
+from gsencoder.outputs import output_folder
+from gsencoder.progress import Progress, console
+from gsencoder.summary import Summary
+from gsencoder.train.distributed import Place, joined, wait_for_all
+from gsencoder.train.log import EVENTS_FOLDER, LOG_FILE
+from gsencoder.train.losses import LossConfig
+from gsencoder.train.prepare import PrepareConfig, PreparedDataset
+from gsencoder.train.prepared import PreparedScene
+from gsencoder.train.samples import SampleDataset, SampleRecipe
+from gsencoder.train.trainer import Trainer, TrainerConfig
+from gsencoder.types import Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainConfig(CommonConfig):
+    """Settings of `train`."""
+
+    paths: tuple[str, ...] = field(
+        default=(), metadata={"help": "scenes, or folders of scenes", "metavar": "SCENE", "required": True}
+    )
+    holdout: tuple[str, ...] = field(
+        default=(), metadata={"help": "names of scenes kept for validation, with * and ? as in file names"}
+    )
+    prepared: Path | None = field(
+        default=None,
+        metadata={"help": "folder of prepared scenes, made if missing; empty = OUT.prepared", "metavar": "PATH"},
+    )
+    prepare_only: bool = field(default=False, metadata={"help": "prepare the scenes and stop"})
+    resume: bool = field(default=True, metadata={"help": "go on where a run that was cut off stopped"})
+    tensorboard: bool = field(default=True, metadata={"help": "write TensorBoard events beside log.csv"})
+    store: Literal["float16", "float32"] = field(default="float16", metadata={"help": "type of the written weights"})
+    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where the encoder computes"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    teacher: LabelsConfig | PaletteConfig | OnnxConfig = field(default_factory=LabelsConfig)
+    prepare: PrepareConfig = field(default_factory=PrepareConfig)
+    model: EncoderConfig = field(default_factory=EncoderConfig)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    train: TrainerConfig = field(default_factory=TrainerConfig)
+
+
+def run(config: TrainConfig, summary: Summary) -> None:
+    """Prepares scenes, trains, and writes weights, log and scores into out=."""
+    keep_heap()
+    out = config.out or Path("outputs") / "train"
+    track = Progress(quiet=config.quiet)
+    training, held_out = split(find_scenes(config.paths), config.holdout)
+    words = text_table_of(config.teacher)
+    with joined(config.device) as (place, device):
+        with summary.step("prepare"):
+            dataset = prepare(training, held_out, words, config, out, place, track)
+        if config.prepare_only:
+            console(config.quiet or not place.first).print(f"{dataset.folder}: {len(training)} scenes to train on, "
+                                                           f"{len(held_out)} for validation")
+            return
+        work = out.with_name(f"{out.name}.training")
+        if place.first:
+            if not config.resume:
+                shutil.rmtree(work, ignore_errors=True)
+            work.mkdir(parents=True, exist_ok=True)
+        wait_for_all()
+        outputs, codebook = dataset.load_space()
+        torch.manual_seed(config.train.seed)
+        encoder = GaussianEncoder(config.model, outputs.channels)
+        rarity = dataset.load_rarity()
+        recipe = SampleRecipe(
+            encoder=config.model,
+            sampling=config.sampling,
+            augmentation=config.augment,
+            losses=config.loss,
+            rarity=rarity,
+            seed=config.train.seed,
+        )
+        validation = dataset.scenes([path.name for path in held_out])
+        kinds = codebook if codebook is not None else rarity.codebook
+        trainer = Trainer(
+            encoder,
+            SampleDataset(dataset.scenes([path.name for path in training]), recipe),
+            config.loss,
+            config.train,
+            folder=work,
+            settings=_identity(config),
+            place=place,
+            device=device,
+            tensorboard=config.tensorboard,
+            validate=partial(_validate, validation, outputs, kinds, config) if validation else None,
+        )
+        with summary.step("train"):
+            done = trainer.run(track)
+        if not place.first:
+            return
+        with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+            scores = _validate(validation, outputs, kinds, config, encoder, done.step) if validation else {}
+            made_by = {"settings": settings(config), "steps": done.step, "seconds": done.seconds, "validation": scores}
+            save_weights(folder / WEIGHTS_FILE, encoder, outputs, made_by, dtype=config.store)
+            if words is not None:
+                save_text_table(folder / WORDS_FILE, words)
+            shutil.copy(work / LOG_FILE, folder / LOG_FILE)
+            if config.tensorboard:
+                shutil.copytree(work / EVENTS_FOLDER, folder / EVENTS_FOLDER)
+            summary.results.update(
+                steps=done.step,
+                seconds=done.seconds,
+                parameters=sum(value.numel() for value in encoder.parameters()),
+                validation=scores,
+                weights=WEIGHTS_FILE,
+                log=LOG_FILE,
+            )
+        shutil.rmtree(work, ignore_errors=True)
+        told = ", ".join(f"{name} {value:.3f}" for name, value in scores.items())
+        console(config.quiet).print(f"{out}: {done.step} steps in {done.seconds / 60:.1f} minutes; {told or 'not validated'}")
+
+
+def split(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[Path], list[Path]]:
+    """Scenes to train on, and those whose names match a pattern.
+
+    Raises:
+        InputError: a pattern that matches nothing, none left to train on, or two scenes of one name.
+    """
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"paths: two scenes are called {twice!r}; prepared scenes are told apart by name")
+    for pattern in patterns:
+        if not any(fnmatch(name, pattern) for name in names):
+            raise InputError(f"holdout: no scene is called {pattern!r}; there are {', '.join(names[:5])}, …")
+    held = [path for path in paths if any(fnmatch(path.name, pattern) for pattern in patterns)]
+    training = [path for path in paths if path not in held]
+    if not training:
+        raise InputError("holdout: matches every scene; none is left to train on")
+    return training, held
+
+
+def prepare(
+    training: Sequence[Path],
+    held_out: Sequence[Path],
+    words: TextTable | None,
+    config: TrainConfig,
+    out: Path,
+    place: Place,
+    track: Progress,
+) -> PreparedDataset:
+    """Prepares what is not prepared yet; processes share the scenes."""
+
+    def open_scene(path: Path) -> tuple[Scene, Teacher]:
+        scene = load_scene(path, options=config.data)
+        return scene, build_teacher(config.teacher, scene, words)
+
+    made_with = {
+        "data": settings(config.data),
+        "seeds": settings(config.seeds),
+        "teacher": settings(config.teacher),
+        "prepare": settings(config.prepare),
+        "training": [path.name for path in training],
+    }
+    folder = config.prepared or out.with_name(f"{out.name}.prepared")
+    if place.first:
+        dataset = PreparedDataset(folder, made_with)
+        dataset.find_space(training, open_scene, config.prepare)
+    wait_for_all()
+    dataset = PreparedDataset(folder, made_with)
+    missing = [path for path in [*training, *held_out] if not dataset.path_of(path.name).is_file()]
+    wait_for_all()  # Nobody begins before everybody has seen what is missing.
+    for path in track(missing[place.rank :: place.size], "preparing scenes"):
+        scene, teacher = open_scene(path)
+        if scene.gaussians is None:
+            scene = replace(scene, gaussians=seed(scene, config.seeds))
+        dataset.prepare(replace(scene, name=path.name), teacher, config.prepare)
+    wait_for_all()
+    if place.first:
+        dataset.find_rarity([path.name for path in training], track)
+    wait_for_all()
+    return dataset
+
+
+def _validate(
+    scenes: Sequence[PreparedScene],
+    outputs: OutputSpace,
+    codebook: np.ndarray,
+    config: TrainConfig,
+    encoder: GaussianEncoder,
+    step: int,  # noqa: ARG001
+) -> Mapping[str, float]:
+    encoding = EncodeConfig(precision=config.train.precision, device=config.device)
+    found = naming(scenes, encoder, outputs, codebook, encoding)
+    return {"names": found.score, "cosine": found.cosine}
+
+
+def _identity(config: TrainConfig) -> dict[str, Any]:
+    """What a run must have in common with one that it continues."""
+    chosen = {name: settings(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
+    for name in ("workers", "log_every", "validate_every", "checkpoint_every", "compile"):
+        del chosen["train"][name]
+    return {**chosen, "teacher": settings(config.teacher), "holdout": list(config.holdout)}
+
+

@@ -1,0 +1,95 @@
+"""The naming protocol: is the nearest word of a Gaussian's predicted feature that of its fused one?
+
+For every scene the choices are the kinds of target that occur in it (for a labels teacher its names and "other"; for
+other teachers clusters of their features). Scores are averaged over kinds, so that a floor counts no more than a spoon.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.train.prepared import PreparedScene
+from gsencoder.train.rarity import nearest_codes
+
+Track = Callable[[Iterable[Any], str], Iterable[Any]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Naming:
+    """Gaussians by the kind of their target, over some scenes.
+
+    Attributes:
+        right: for each row of the codebook, Gaussians that were told right.
+        total: for each row, Gaussians that have this target.
+        cosine: mean cosine of predicted and fused features, about the space's mean, over named Gaussians: those whose
+            target is at least half a typical distance from it.
+    """
+
+    right: Float64[np.ndarray, " C"]
+    total: Float64[np.ndarray, " C"]
+    cosine: float
+
+    def accuracies(self) -> Float64[np.ndarray, " C"]:
+        """Share told right of each kind; NaN where there is none."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(self.right / self.total)
+
+    @property
+    def score(self) -> float:
+        """The mean over kinds that occur."""
+        return float(np.nanmean(self.accuracies()))
+
+
+def nearest_names(
+    outputs: Float32[np.ndarray, "n channels"], codebook: Float32[np.ndarray, "C channels"], choices: np.ndarray
+) -> Int64[np.ndarray, " n"]:
+    """The row of the codebook, among `choices`, that is nearest to each output; for unit vectors the one of largest
+    cosine, whatever mean was taken off."""
+    return np.asarray(choices[nearest_codes(codebook[choices], outputs)])
+
+
+def naming(
+    scenes: Sequence[PreparedScene],
+    encoder: GaussianEncoder,
+    outputs: OutputSpace,
+    codebook: Float32[np.ndarray, "C channels"],
+    config: EncodeConfig = EncodeConfig(),
+    *,
+    track: Track = lambda items, label: items,  # noqa: ARG005
+) -> Naming:
+    """Encodes prepared scenes and counts.
+
+    Args:
+        scenes: with fused targets.
+        encoder: to judge.
+        outputs: what its numbers mean.
+        codebook: the kinds of target, in standard units.
+        config: how scenes are encoded.
+        track: wraps the loop over scenes to show progress.
+    """
+    right, total = np.zeros(len(codebook)), np.zeros(len(codebook))
+    cosines, count = 0.0, 0
+    for scene in track(scenes, "validation"):
+        seen = np.flatnonzero(scene.weights)
+        everything = scene.gaussians(np.arange(len(scene)))
+        found = encode(everything, encoder, outputs, config, metres_per_unit=scene.metres_per_unit or 1.0)
+        predicted = outputs.standardize(found.features[seen])
+        targets = scene.targets(seen)
+        truth = nearest_codes(codebook, targets)
+        choices = np.unique(truth)
+        guess = nearest_names(predicted, codebook, choices)
+        right += np.bincount(truth, weights=guess == truth, minlength=len(codebook))
+        total += np.bincount(truth, minlength=len(codebook))
+        lengths = np.sqrt(np.square(targets).sum(axis=1))
+        named = lengths >= 0.5 * outputs.channels**0.5
+        dots = (targets[named] * predicted[named]).sum(axis=1)
+        norms = lengths[named] * np.sqrt(np.square(predicted[named]).sum(axis=1) + 1e-12)
+        cosines += float((dots / norms).sum())
+        count += int(named.sum())
+    return Naming(right=right, total=total, cosine=cosines / max(count, 1))

@@ -1,0 +1,108 @@
+"""Where a training stands: parameters, optimiser and step in one safetensors file that appears whole or not at all.
+
+The schedule, the order of samples and everything random are functions of the seed and the step, so the step is all
+that has to be kept of them.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.errors import InputError
+
+CHECKPOINT_FILE = "checkpoint.safetensors"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """What a checkpoint says beside its tensors.
+
+    Attributes:
+        step: steps that are done.
+        seconds: that they took.
+        best: best validation score so far; None where there was none.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    best: float | None = None
+
+
+def save_checkpoint(
+    path: Path,
+    model: torch.nn.Module,
+    optimizer: torch.optim.Optimizer,
+    progress: Progress,
+    settings: dict[str, Any],
+) -> None:
+    """Writes a checkpoint; the one before stays until the new one is whole.
+
+    Args:
+        path: the file.
+        model: whose parameters are trained.
+        optimizer: over parameters of `model`, with state tensors of their shapes, as AdamW has them.
+        progress: see there.
+        settings: what a run must have in common to go on from here, as JSON values.
+
+    Raises:
+        InputError: the disk is full.
+    """
+    arrays = {f"model.{name}": value.detach().cpu().numpy() for name, value in model.state_dict().items()}
+    for name, parameter in model.named_parameters():
+        for key, value in optimizer.state.get(parameter, {}).items():
+            arrays[f"optimizer.{key}.{name}"] = value.detach().float().cpu().numpy()
+    header = {"step": progress.step, "seconds": progress.seconds, "best": progress.best, "settings": settings}
+    write_archive(path, arrays, header)
+
+
+def load_checkpoint(
+    path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, settings: dict[str, Any]
+) -> Progress:
+    """Puts model and optimiser where the checkpoint was made.
+
+    Raises:
+        InputError: damaged, of another network, or of a run with other settings; the first that differs is named.
+    """
+    with open_archive(path) as file:
+        found = file.value("settings", dict)
+        if found != settings:
+            key, old, new = _difference(found, settings)
+            raise InputError(
+                f"{path}: was made with {key}={old!r}, and this run has {new!r}; "
+                "give the same settings, another out=, or resume=false to begin anew"
+            )
+        state = {
+            name: torch.from_numpy(file.array(f"model.{name}", "float32", tuple(value.shape)))
+            for name, value in model.state_dict().items()
+        }
+        moments: dict[torch.nn.Parameter, dict[str, torch.Tensor]] = {}
+        for name, parameter in model.named_parameters():
+            shape = tuple(parameter.shape)
+            keys = (("step", ()), ("exp_avg", shape), ("exp_avg_sq", shape))
+            if f"optimizer.step.{name}" in file:
+                moments[parameter] = {
+                    key: torch.from_numpy(file.array(f"optimizer.{key}.{name}", "float32", size).copy())
+                    for key, size in keys
+                }
+        progress = Progress(
+            step=file.value("step", int),
+            seconds=float(file.value("seconds", float, int)),
+            best=file.value("best", float, int, None),
+        )
+    model.load_state_dict(state)
+    for parameter, values in moments.items():
+        on_device = {key: value if key == "step" else value.to(parameter.device) for key, value in values.items()}
+        optimizer.state[parameter] = on_device
+    return progress
+
+
+def _difference(old: Any, new: Any, path: str = "") -> tuple[str, Any, Any]:
+    """The first place in which two settings differ, and what stands there."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            if old.get(key) != new.get(key):
+                return _difference(old.get(key), new.get(key), f"{path}.{key}" if path else key)
+    return path, old, new

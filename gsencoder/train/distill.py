@@ -1,0 +1,52 @@
+"""Distillation: what a batch of samples costs an encoder (SplatDistill Eq. 5), term by term."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from gsencoder.train.losses import Head, LossConfig, Sum, field_loss, render_loss
+from gsencoder.train.samples import Batch, Rows
+
+TERMS = ("field", "render")
+
+
+class Distillation:
+    """The loss L = λ_3D · L_3D + λ_render · L_render, in parts that are summed before they are divided.
+
+    A step's loss is Σ total / Σ weight of each term over all its micro-batches on all processes. The weights are known
+    before anything is computed, so every micro-batch can divide by the step's own and simply be added.
+    """
+
+    def __init__(self, encoder: nn.Module, config: LossConfig, *, heads: Sequence[tuple[Head, nn.Module]] = ()) -> None:
+        """Args:
+        encoder: a `GaussianEncoder`, or one wrapped for several processes.
+        config: what is compared.
+        heads: a teacher's adapter heads, each with what decodes standard units for it.
+        """
+        self.encoder, self.config, self.heads = encoder, config, heads
+
+    @property
+    def lambdas(self) -> dict[str, float]:
+        """How much each term counts."""
+        return {"field": self.config.field_weight, "render": self.config.render_weight}
+
+    def weights(self, batch: Batch) -> dict[str, float]:
+        """The sum of weights of each term in a batch: what its total will be divided by."""
+        return {
+            "field": float(batch.weights.double().sum()),
+            "render": float(batch.rows.row_weights.double().sum()) if self.config.render_weight else 0.0,
+        }
+
+    def __call__(self, batch: Batch) -> dict[str, Sum]:
+        """Totals and weights of the terms that the batch has."""
+        predicted = self.encoder(batch.attributes, batch.opacities, batch.plan)
+        with torch.autocast(predicted.device.type, enabled=False):
+            terms = {"field": field_loss(predicted, batch.targets, batch.weights, self.config)}
+            if self.config.render_weight and len(batch.rows.row_weights):
+                terms["render"] = self._render(predicted, batch.rows)
+        return terms
+
+    def _render(self, predicted: Tensor, rows: Rows) -> Sum:
+        b = rows.blend(len(predicted))
+        return render_loss(predicted, b, rows.targets, rows.row_weights, self.config, self.heads)

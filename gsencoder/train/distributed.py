@@ -1,0 +1,147 @@
+"""One process or many, on one machine or many: who this process is, and sums over all of them.
+
+torchrun and SLURM (srun, submitit) tell a process its place through the environment; without either there is one.
+Nothing else in the package asks how many there are.
+"""
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+
+import torch
+from torch import Tensor, distributed
+
+from gsencoder.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """A process among those that train together.
+
+    Attributes:
+        rank: its number.
+        size: how many there are.
+        local_rank: its number on its machine.
+    """
+
+    rank: int = 0
+    size: int = 1
+    local_rank: int = 0
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the process that writes and speaks."""
+        return self.rank == 0
+
+
+def place_from(environment: Mapping[str, str]) -> tuple[Place, str]:
+    """The place that an environment tells, and where processes meet ("tcp://…", or "env://" under torchrun).
+
+    Raises:
+        InputError: an environment that contradicts itself.
+    """
+    if "RANK" in environment and "WORLD_SIZE" in environment:
+        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
+        rank, size, local = (_number(environment, name, "0") for name in names)
+        meeting = "env://"
+    elif "SLURM_STEP_ID" in environment and _number(environment, "SLURM_NTASKS", "1") > 1:
+        # Without a step this is the batch script itself, which runs once however many tasks the job has.
+        names = ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_LOCALID")
+        rank, size, local = (_number(environment, name, "0") for name in names)
+        nodes = environment.get("SLURM_STEP_NODELIST") or environment.get("SLURM_JOB_NODELIST", "")
+        host = environment.get("MASTER_ADDR") or first_host(nodes)
+        # Jobs that share a machine must not meet at one port; their numbers differ.
+        port = environment.get("MASTER_PORT") or str(20_000 + _number(environment, "SLURM_JOB_ID", "0") % 20_000)
+        meeting = f"tcp://{host}:{port}"
+    else:
+        return Place(), ""
+    if not 0 <= rank < size:
+        raise InputError(f"{names[0]}={rank} is not below {names[1]}={size}; start all processes with one launcher")
+    return Place(rank=rank, size=size, local_rank=local), meeting
+
+
+def first_host(nodes: str) -> str:
+    """The first machine of a SLURM list such as `a[03-07,9],b1`.
+
+    Raises:
+        InputError: an empty list.
+    """
+    found = re.match(r"([^\[,\s]+)(?:\[([^\]]*)\])?([^\[,\s]*)", nodes)
+    if not found:
+        raise InputError("SLURM: the list of machines (SLURM_STEP_NODELIST) is empty; set MASTER_ADDR")
+    before, numbers, after = found.groups()
+    return before + (re.split(r"[-,]", numbers)[0] if numbers else "") + after
+
+
+def _number(environment: Mapping[str, str], name: str, default: str) -> int:
+    value = environment.get(name, default)
+    if not value.isdigit():
+        raise InputError(f"{name}: expected a whole number in the environment, got {value!r}")
+    return int(value)
+
+
+@contextmanager
+def joined(device: str = "auto", *, timeout_minutes: float = 60.0) -> Iterator[tuple[Place, torch.device]]:
+    """Meets the other processes for the block; yields the place and the device of this one.
+
+    Args:
+        device: "auto" (a GPU for each process of a machine where there are enough, else the CPU), "cpu" or "cuda".
+        timeout_minutes: how long to wait for the others: validation and preparation may keep one busy.
+
+    Raises:
+        InputError: no such device, or the others cannot be met.
+    """
+    place, meeting = place_from(os.environ)
+    chosen = _device(device, place)
+    if place.size == 1:
+        yield place, chosen
+        return
+    backend = "nccl" if chosen.type == "cuda" else "gloo"
+    try:
+        distributed.init_process_group(
+            backend,
+            init_method=meeting,
+            rank=place.rank,
+            world_size=place.size,
+            timeout=timedelta(minutes=timeout_minutes),
+        )
+    except (RuntimeError, ValueError) as error:
+        message = " ".join(str(error).split())[:200]
+        raise InputError(f"training: process {place.rank} of {place.size} cannot meet the others: {message}") from error
+    try:
+        yield place, chosen
+    finally:
+        distributed.destroy_process_group()
+
+
+def _device(name: str, place: Place) -> torch.device:
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cpu":
+        return torch.device("cpu")
+    if name != "cuda":
+        raise InputError(f"device: expected auto, cpu or cuda, got {name!r}")
+    count = torch.cuda.device_count()
+    if place.local_rank >= count:
+        raise InputError(f"device: process {place.local_rank} of this machine has no GPU; there are {count}")
+    device = torch.device("cuda", place.local_rank)
+    torch.cuda.set_device(device)
+    return device
+
+
+def sum_over_processes(values: Tensor) -> Tensor:
+    """The sum of each entry over all processes; what was given where there is one."""
+    if distributed.is_available() and distributed.is_initialized():
+        distributed.all_reduce(values)
+    return values
+
+
+def wait_for_all() -> None:
+    """Returns when every process has come here."""
+    if distributed.is_available() and distributed.is_initialized():
+        # A sum rather than a barrier: it needs no device to be named.
+        device = "cuda" if distributed.get_backend() == "nccl" else "cpu"
+        distributed.all_reduce(torch.zeros(1, device=device))

@@ -1,0 +1,103 @@
+"""What a training writes down as it goes: a CSV that a resumed run continues, and TensorBoard events."""
+
+import csv
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsencoder.errors import InputError
+
+LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
+
+
+class Log:
+    """Rows of numbers by step. The file is closed after every row, so that a kill loses none."""
+
+    def __init__(self, folder: Path, *, first_step: int, events: bool) -> None:
+        """Args:
+        folder: where the log lies; rows of steps that will be done again are taken out.
+        first_step: the step that comes next.
+        events: whether to write TensorBoard events too.
+
+        Raises:
+            InputError: TensorBoard is asked for and not installed, or the log cannot be written.
+        """
+        self.path = folder / LOG_FILE
+        self._columns: list[str] = []
+        self._writer: Any = None
+        if events:
+            try:
+                from torch.utils.tensorboard import SummaryWriter
+            except ImportError as error:
+                raise InputError(
+                    "tensorboard=true needs the package tensorboard (pip install tensorboard), or tensorboard=false"
+                ) from error
+            # Events of steps at or after this one, left by a run that was killed, are no longer shown.
+            self._writer = SummaryWriter(str(folder / EVENTS_FOLDER), purge_step=first_step)
+        try:
+            self._keep_before(first_step)
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(f"{self.path}: cannot be continued: {error}") from error
+
+    def _keep_before(self, step: int) -> None:
+        if not self.path.is_file():
+            return
+        rows = read_log(self.path)
+        kept = [row for row in rows if int(row["step"]) < step]
+        self.path.unlink()
+        for row in kept:
+            self._append(row)
+
+    def add(self, step: int, values: Mapping[str, float]) -> None:
+        """One row; every number is also a TensorBoard scalar.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        self._append({"step": step, **values})
+        if self._writer is not None:
+            for name, value in values.items():
+                self._writer.add_scalar(name, value, step)
+
+    def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
+        """A picture uint8 [H, W, 3], for TensorBoard alone."""
+        if self._writer is not None:
+            self._writer.add_image(name, pixels, step, dataformats="HWC")
+
+    def _append(self, row: Mapping[str, Any]) -> None:
+        new = [name for name in row if name not in self._columns]
+        try:
+            if new and self._columns:
+                # Validation adds columns: the file is written anew, once, with empty cells before.
+                rows = read_log(self.path)
+                self._columns += new
+                self.path.write_text(_text(self._columns, [*rows, row], header=True), encoding="utf-8")
+                return
+            self._columns += new
+            with self.path.open("a", encoding="utf-8", newline="") as stream:
+                stream.write(_text(self._columns, [row], header=bool(new)))
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot write: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """Writes what TensorBoard still holds."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def read_log(path: Path) -> list[dict[str, str]]:
+    """The rows of a log, as text; empty cells are left out."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return [{name: cell for name, cell in row.items() if name and cell} for row in csv.DictReader(stream)]
+
+
+def _text(columns: list[str], rows: list[Mapping[str, Any]] | list[dict[str, str]], *, header: bool) -> str:
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
+    if header:
+        writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()

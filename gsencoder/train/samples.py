@@ -1,0 +1,293 @@
+"""Training samples: a part of a prepared scene, changed at random, with its plan, its targets and its rows of B.
+
+Everything random about sample k of a run comes from (seed, k). Nothing depends on which process makes it, on how many
+there are, or on what was made before, so that a run may be cut off and resumed, or spread over more machines, and go
+through the same samples.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int16, Int32, Int64
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from gsencoder.data.augment import AugmentConfig, augment
+from gsencoder.data.batch import SamplingConfig, choose_rows, choose_views, thin_out
+from gsencoder.errors import InputError
+from gsencoder.models.encoder import EncoderConfig, encoder_inputs
+from gsencoder.models.plan import CloudPlan, Plan, join_plans
+from gsencoder.render import Blend, BlendConfig
+from gsencoder.render.lattice import Lattice
+from gsencoder.train.losses import LossConfig
+from gsencoder.train.prepared import PreparedScene, ViewRows
+from gsencoder.train.rarity import Rarity, nearest_codes
+
+
+class Rows(NamedTuple):
+    """Rows of B that are compared with a teacher's cells, over the Gaussians of a sample or a batch."""
+
+    crow: Int64[Tensor, " P_plus_1"]
+    col: Int32[Tensor, " nnz"]
+    weight: Float[Tensor, " nnz"]
+    targets: Float[Tensor, "P C"]
+    row_weights: Float[Tensor, " P"]
+
+    def blend(self, gaussians: int) -> Blend:
+        """B itself. Its rows belong to no picture, so its lattice is a line of them."""
+        lattice = Lattice(height=len(self.crow) - 1, width=1, side=1, x0=0.5, y0=0.5, dx=1.0, dy=1.0)
+        depths = self.weight.new_zeros(gaussians)
+        return Blend(self.crow, self.col, self.weight, depths, lattice, BlendConfig())
+
+
+class Sample(NamedTuple):
+    """One part of one scene, as a worker hands it over."""
+
+    name: str
+    attributes: Float[Tensor, "N A"]
+    opacities: Float[Tensor, " N"]
+    plan: CloudPlan
+    targets: Float[Tensor, "N C"]
+    weights: Float[Tensor, " N"]
+    rows: Rows
+
+
+class Batch(NamedTuple):
+    """Samples side by side: Gaussians, tokens and rows follow one another, and plans and rows count on.
+
+    Attributes:
+        names: scene and views of each sample, for messages.
+        attributes, opacities, plan: what the encoder takes.
+        targets: standard units.
+        weights: of each Gaussian in the loss; 0 where it has no target.
+        rows: of the render loss.
+    """
+
+    names: tuple[str, ...]
+    attributes: Float[Tensor, "N A"]
+    opacities: Float[Tensor, " N"]
+    plan: Plan
+    targets: Float[Tensor, "N C"]
+    weights: Float[Tensor, " N"]
+    rows: Rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SampleRecipe:
+    """All that turns a scene into samples.
+
+    Attributes:
+        encoder: which attributes, which grid.
+        sampling: which part of the scene.
+        augmentation: what is changed; None leaves the scene as it is.
+        losses: which rows are compared.
+        rarity: how often targets of each kind occur.
+        seed: of everything random.
+    """
+
+    encoder: EncoderConfig
+    sampling: SamplingConfig
+    augmentation: AugmentConfig | None
+    losses: LossConfig
+    rarity: Rarity
+    seed: int
+
+
+class SampleDataset(Dataset[Sample]):
+    """Sample k of a run, for any k: each pass over the scenes is in an order of its own."""
+
+    def __init__(self, scenes: Sequence[PreparedScene], recipe: SampleRecipe) -> None:
+        """Raises:
+        InputError: no scenes.
+        """
+        if not scenes:
+            raise InputError("training: no scenes to train on")
+        self.scenes, self.recipe = list(scenes), recipe
+        self._codes: dict[int, np.ndarray] = {}
+
+    def __getitem__(self, number: int) -> Sample:
+        epoch, place = divmod(number, len(self.scenes))
+        order = np.random.default_rng([self.recipe.seed, 0, epoch]).permutation(len(self.scenes))
+        rng = np.random.default_rng([self.recipe.seed, 1, number])
+        which = int(order[place])
+        scene, rarity = self.scenes[which], self.recipe.rarity
+        if which not in self._codes:
+            self._codes[which] = target_codes(scene, rarity)
+        return make_sample(scene, self._codes[which], self.recipe, rng)
+
+
+class StepSampler(Sampler[list[int]]):
+    """The numbers of the samples of each micro-batch of this process, step by step.
+
+    Step s of a run takes samples s·n to (s + 1)·n − 1, n being batch · accumulate · processes; micro-batch m of process
+    r takes `batch` of them in a row.
+    """
+
+    def __init__(self, first: int, last: int, *, batch: int, accumulate: int, rank: int, world: int) -> None:
+        """Args:
+        first: step to begin with.
+        last: step to end before.
+        batch: samples of a micro-batch.
+        accumulate: micro-batches of a process in a step.
+        rank: number of this process.
+        world: number of processes.
+        """
+        self.steps = range(first, last)
+        self.batch, self.accumulate, self.rank, self.world = batch, accumulate, rank, world
+
+    def __len__(self) -> int:
+        return len(self.steps) * self.accumulate
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for step in self.steps:
+            for micro in range(self.accumulate):
+                start = ((step * self.accumulate + micro) * self.world + self.rank) * self.batch
+                yield list(range(start, start + self.batch))
+
+
+def target_codes(scene: PreparedScene, rarity: Rarity) -> Int16[np.ndarray, " N"]:
+    """For each Gaussian the row of the codebook that its target is nearest to; −1 where it has none."""
+    codes = np.full(len(scene), -1, np.int16)
+    seen = np.flatnonzero(scene.weights)
+    codes[seen] = nearest_codes(rarity.codebook, scene.targets(seen))
+    return codes
+
+
+def make_sample(
+    scene: PreparedScene, codes: Int16[np.ndarray, " N"], recipe: SampleRecipe, rng: np.random.Generator
+) -> Sample:
+    """Cuts a part out of a scene and makes it ready for the encoder.
+
+    Args:
+        scene: to cut from.
+        codes: of its Gaussians (`target_codes`).
+        recipe: how.
+        rng: everything random comes from it.
+
+    Raises:
+        InputError: the chosen views see none of the scene's Gaussians.
+    """
+    views = choose_views(len(scene.cameras), recipe.sampling, rng)
+    # Row −1 of the table is the last one, which gives the unseen their weight of 0.
+    rarity = np.append(recipe.rarity.each(recipe.losses.rarity), np.float32(0))[codes]
+    try:
+        selected = choose_rows(scene.means, scene.cameras.select(views), rarity, recipe.sampling, rng)
+    except InputError as error:
+        raise InputError(f"scene {scene.name}, views {_listed(scene, views)}: {error}") from error
+    change = recipe.augmentation
+    kept = thin_out(selected, change.drop, rng) if change is not None else selected
+    voxel = recipe.encoder.voxel / (scene.metres_per_unit or 1.0)
+    gaussians = scene.gaussians(kept)
+    if change is not None:
+        gaussians = augment(gaussians, rng, change, voxel=voxel, up=scene.up)
+    attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
+    shape = recipe.losses
+    rows = [restrict(scene.view(view), len(scene), selected, kept, shape) for view in views if shape.render_weight]
+    return Sample(
+        name=f"{scene.name} ({_listed(scene, views)})",
+        attributes=attributes,
+        opacities=opacities,
+        plan=plan,
+        targets=torch.from_numpy(scene.targets(kept)),
+        weights=torch.from_numpy(rarity[kept]),
+        rows=_stack(rows, [0] * len(rows), scene.channels, recipe),
+    )
+
+
+def _listed(scene: PreparedScene, views: Sequence[int]) -> str:
+    return ", ".join(scene.view_names[view] for view in views)
+
+
+def restrict(
+    view: ViewRows,
+    gaussians: int,
+    selected: Int64[np.ndarray, " s"],
+    kept: Int64[np.ndarray, " n"],
+    config: LossConfig,
+) -> ViewRows:
+    """The rows of B that a sample can be held against, over its Gaussians.
+
+    A row stays if the teacher saw something there, the whole scene fills it to `min_alpha`, and the selection has
+    `min_kept` of its weight. Of Gaussians that were left out at random afterwards the row is simply without.
+
+    Args:
+        view: over all Gaussians of the scene.
+        gaussians: how many these are.
+        selected: the Gaussians that the views were chosen for.
+        kept: those of them that the sample has; they become columns 0, 1, ….
+        config: see there.
+    """
+    column = np.full(gaussians, -1, np.int32)
+    column[selected] = -2
+    column[kept] = np.arange(len(kept), dtype=np.int32)
+    place = column[view.col]
+    starts = view.crow[:-1]
+    alpha = _row_sums(view.weight, starts, view.crow)
+    inside = _row_sums(np.where(place != -1, view.weight, 0), starts, view.crow)
+    there = _row_sums(np.where(place >= 0, view.weight, 0), starts, view.crow)
+    good = view.valid & (alpha >= config.min_alpha) & (inside >= config.min_kept * alpha)
+    # What is left after thinning out must still be more than a trace, or its average means nothing.
+    good &= there >= 0.5 * alpha
+    entries = np.repeat(good, np.diff(view.crow)) & (place >= 0)
+    counts = np.add.reduceat(np.append(entries, False), view.crow[:-1])[good] if len(entries) else np.zeros(0, int)
+    return ViewRows(
+        crow=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        col=place[entries],
+        weight=view.weight[entries],
+        targets=view.targets[good],
+        valid=np.ones(int(good.sum()), bool),
+    )
+
+
+def _row_sums(values: np.ndarray, starts: np.ndarray, crow: np.ndarray) -> np.ndarray:
+    """Sums of compressed rows; empty rows are 0."""
+    total = np.add.reduceat(np.append(values, np.float32(0)), starts)
+    return np.where(np.diff(crow) > 0, total, 0)
+
+
+def _stack(views: Sequence[ViewRows], shifts: Sequence[int], channels: int, recipe: SampleRecipe) -> Rows:
+    """Rows of several views as one matrix; `shifts` are added to columns."""
+    entries = np.cumsum([0, *(len(view.col) for view in views)])
+    crows = [view.crow[:-1] + start for view, start in zip(views, entries[:-1], strict=True)]
+    targets = np.concatenate([np.zeros((0, channels), np.float32), *(view.targets for view in views)])
+    weights = recipe.rarity.weights(targets, recipe.losses.rarity)
+    cols = [view.col + np.int32(shift) for view, shift in zip(views, shifts, strict=True)]
+    return Rows(
+        crow=torch.from_numpy(np.concatenate([*crows, entries[-1:]]).astype(np.int64)),
+        col=torch.from_numpy(np.concatenate([np.zeros(0, np.int32), *cols])),
+        weight=torch.from_numpy(np.concatenate([np.zeros(0, np.float32), *(view.weight for view in views)])),
+        targets=torch.from_numpy(targets),
+        row_weights=torch.from_numpy(weights),
+    )
+
+
+def join_samples(samples: Sequence[Sample], patch: int) -> Batch:
+    """Puts samples side by side.
+
+    Args:
+        samples: at least one.
+        patch: of the encoder's attention.
+    """
+    sizes = [len(sample.attributes) for sample in samples]
+    starts = [sum(sizes[:i]) for i in range(len(sizes))]
+    entries = [sum(len(sample.rows.col) for sample in samples[:i]) for i in range(len(samples) + 1)]
+    crows = [sample.rows.crow[:-1] + entry for sample, entry in zip(samples, entries, strict=False)]
+    rows = Rows(
+        crow=torch.cat([*crows, torch.tensor(entries[-1:])]),
+        col=torch.cat([sample.rows.col + start for sample, start in zip(samples, starts, strict=True)]),
+        weight=torch.cat([sample.rows.weight for sample in samples]),
+        targets=torch.cat([sample.rows.targets for sample in samples]),
+        row_weights=torch.cat([sample.rows.row_weights for sample in samples]),
+    )
+    return Batch(
+        names=tuple(sample.name for sample in samples),
+        attributes=torch.cat([sample.attributes for sample in samples]),
+        opacities=torch.cat([sample.opacities for sample in samples]),
+        plan=join_plans([sample.plan for sample in samples], patch, round_up=True),
+        targets=torch.cat([sample.targets for sample in samples]),
+        weights=torch.cat([sample.weights for sample in samples]),
+        rows=rows,
+    )

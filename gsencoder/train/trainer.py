@@ -1,0 +1,268 @@
+"""The training loop: one step after another, the same on one process or many, and after a kill."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from gsencoder.errors import InputError
+from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.precision import Precision, autocast_dtype
+from gsencoder.train.checkpoint import CHECKPOINT_FILE, Progress, load_checkpoint, save_checkpoint
+from gsencoder.train.distill import Distillation
+from gsencoder.train.distributed import Place, sum_over_processes, wait_for_all
+from gsencoder.train.log import Log
+from gsencoder.train.losses import LossConfig
+from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainerConfig:
+    """How long, how fast, how much at a time."""
+
+    steps: int = field(default=2000, metadata={"help": "optimiser steps"})
+    batch: int = field(default=1, metadata={"help": "samples that one process takes at a time"})
+    accumulate: int = field(default=1, metadata={"help": "such micro-batches of a process in one step"})
+    learning_rate: float = field(default=2e-3, metadata={"help": "highest learning rate"})
+    final_rate: float = field(default=0.01, metadata={"help": "learning rate at the end, as a share of the highest"})
+    warmup: int = field(default=100, metadata={"help": "steps in which the learning rate rises"})
+    weight_decay: float = field(default=0.05, metadata={"help": "of matrices; never of norms and biases"})
+    clip: float = field(default=1.0, metadata={"help": "largest norm of the gradient; 0 = not clipped"})
+    precision: Precision = field(
+        default="auto",
+        metadata={"help": "what the encoder computes in; auto = bfloat16 where the device multiplies it"},
+    )
+    workers: int = field(default=0, metadata={"help": "processes that make samples; 0 = the training process itself"})
+    seed: int = field(default=0, metadata={"help": "of everything random"})
+    log_every: int = field(default=10, metadata={"help": "steps that one line of the log stands for"})
+    validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = at the end alone"})
+    checkpoint_every: float = field(default=300.0, metadata={"help": "seconds between checkpoints"})
+    compile: bool = field(default=False, metadata={"help": "torch.compile the encoder"})
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "accumulate", "log_every"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
+        for name in ("warmup", "weight_decay", "clip", "workers", "seed", "validate_every", "checkpoint_every"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if not 0 < self.learning_rate < math.inf:
+            raise InputError(f"learning_rate: expected a positive number, got {self.learning_rate}")
+        if not 0 <= self.final_rate <= 1:
+            raise InputError(f"final_rate: expected a share in [0, 1], got {self.final_rate}")
+
+
+Validation = Callable[[GaussianEncoder, int], Mapping[str, float]]
+Track = Callable[[range, str], Iterator[int]]
+
+
+class Trainer:
+    """Trains an encoder on samples; everything that must survive a kill lies in one folder."""
+
+    def __init__(
+        self,
+        encoder: GaussianEncoder,
+        dataset: SampleDataset,
+        losses: LossConfig,
+        config: TrainerConfig,
+        *,
+        folder: Path,
+        settings: Mapping[str, Any],
+        place: Place = Place(),
+        device: torch.device = torch.device("cpu"),
+        tensorboard: bool = False,
+        validate: Validation | None = None,
+    ) -> None:
+        """Takes up what an earlier run with the same settings left in `folder`.
+
+        Args:
+            encoder: trained in place; moved to `device`.
+            dataset: what it is trained on.
+            losses: what is compared.
+            config: see there.
+            folder: for checkpoint and log; exists.
+            settings: what a run must have in common with one that it continues, as JSON values.
+            place: of this process.
+            device: of this process.
+            tensorboard: whether to write events.
+            validate: scores of the encoder after a step, "score" being what is best when largest; asked of the first
+                process alone.
+
+        Raises:
+            InputError: the folder holds another run.
+        """
+        self.config, self.dataset, self.place, self.device = config, dataset, place, device
+        self.folder, self.settings, self.validate = folder, dict(settings), validate
+        self.encoder = encoder.to(device)
+        self.optimizer = torch.optim.AdamW(
+            _groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
+        )
+        self.progress = Progress()
+        if (folder / CHECKPOINT_FILE).is_file():
+            self.progress = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
+        self._log = Log(folder, first_step=self.progress.step, events=tensorboard) if place.first else None
+        network: nn.Module = torch.compile(encoder, dynamic=True) if config.compile else encoder  # type: ignore[assignment]
+        self._parallel: nn.parallel.DistributedDataParallel | None = None
+        if place.size > 1:
+            ids = [device.index] if device.type == "cuda" else None
+            network = self._parallel = nn.parallel.DistributedDataParallel(network, device_ids=ids)
+        self.distillation = Distillation(network, losses)
+        self._autocast = autocast_dtype(config.precision, device)
+
+    def run(self, track: Track = lambda steps, label: iter(steps)) -> Progress:  # noqa: ARG005
+        """All steps that are left.
+
+        Raises:
+            InputError: a loss or gradient is not finite; the samples and the term are named, and the checkpoint is
+                that of the last step that was.
+        """
+        config, start = self.config, time.monotonic() - self.progress.seconds
+        first, saved = self.progress.step, time.monotonic()
+        batches = iter(self._loader(first))
+        recent: list[dict[str, float]] = []
+        for step in track(range(first, config.steps), "training"):
+            recent.append(self._step(step, [next(batches) for _ in range(config.accumulate)]))
+            done = step + 1
+            row: dict[str, float] = {}
+            if done % config.log_every == 0 or done == config.steps:
+                row = {name: float(np.mean([each[name] for each in recent])) for name in recent[-1]}
+                recent = []
+            if done == config.steps or (config.validate_every and done % config.validate_every == 0):
+                row |= self._validated(done)
+            self.progress = Progress(step=done, seconds=time.monotonic() - start, best=self.progress.best)
+            if row and self._log is not None:
+                self._log.add(step, row | {"seconds": self.progress.seconds})
+            if time.monotonic() - saved >= config.checkpoint_every or done == config.steps:
+                self.save()
+                saved = time.monotonic()
+        if self._log is not None:
+            self._log.close()
+        return self.progress
+
+    def save(self) -> None:
+        """Writes the checkpoint; only the first process does."""
+        if self.place.first:
+            save_checkpoint(self.folder / CHECKPOINT_FILE, self.encoder, self.optimizer, self.progress, self.settings)
+
+    def _loader(self, first: int) -> "DataLoader[Any]":
+        config = self.config
+        sampler = StepSampler(
+            first,
+            config.steps,
+            batch=config.batch,
+            accumulate=config.accumulate,
+            rank=self.place.rank,
+            world=self.place.size,
+        )
+        # Workers are started anew and not forked: a forked child would inherit kernels' threads that no longer run.
+        return DataLoader(
+            self.dataset,
+            batch_sampler=sampler,
+            collate_fn=partial(join_samples, patch=self.encoder.config.transformer.patch),
+            num_workers=config.workers,
+            multiprocessing_context="spawn" if config.workers else None,
+            worker_init_fn=_one_thread if config.workers else None,
+            prefetch_factor=4 if config.workers else None,
+        )
+
+    def _step(self, step: int, batches: list[Batch]) -> dict[str, float]:
+        """One optimiser step; returns the losses of all processes together."""
+        rate = self.rate_at(step)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.encoder.train()
+        lambdas = {name: weight for name, weight in self.distillation.lambdas.items() if weight}
+        own = [self.distillation.weights(batch) for batch in batches]
+        counts = [sum(weights[name] for weights in own) for name in lambdas]
+        counts = sum_over_processes(torch.tensor(counts, dtype=torch.float64, device=self.device)).tolist()
+        divisors = {name: max(count, 1e-12) for name, count in zip(lambdas, counts, strict=True)}
+        totals = torch.zeros(len(lambdas) + 1, dtype=torch.float64, device=self.device)
+        blame = ""
+        for micro, batch in enumerate(batches):
+            last = micro + 1 == len(batches)
+            # What is random in the network follows the step and the micro-batch, not what was drawn before.
+            number = (step * len(batches) + micro) * self.place.size + self.place.rank
+            torch.manual_seed((self.config.seed << 40) + number)
+            if self._parallel is not None:
+                self._parallel.require_backward_grad_sync = last
+            with torch.autocast(self.device.type, self._autocast, enabled=self._autocast is not None):
+                terms = self.distillation(_on(batch, self.device))
+            loss = torch.zeros((), device=self.device)
+            for place, name in enumerate(lambdas):
+                if name in terms:
+                    share = terms[name].total / divisors[name]
+                    loss = loss + lambdas[name] * share
+                    totals[place] += share.detach().double()
+                    if not math.isfinite(share.item()):
+                        blame = blame or f"the {name} loss of {'; '.join(batch.names)}"
+            # Gradients of several processes are averaged; what is wanted is their sum.
+            (loss * self.place.size).backward()
+        norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), self.config.clip or math.inf)
+        if not blame and not math.isfinite(norm.item()):
+            blame = f"the gradient of {'; '.join(name for batch in batches for name in batch.names)}"
+        totals[-1] = float(bool(blame))
+        sums = sum_over_processes(totals).tolist()
+        if sums[-1]:
+            where = blame or "a loss or gradient of another process"
+            raise InputError(
+                f"training: {where} is not finite at step {step}; nothing was changed by it. Lower learning_rate, or "
+                "look at these scenes (`gsencoder inspect`)"
+            )
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        losses = dict(zip(lambdas, sums[:-1], strict=True))
+        total = sum(lambdas[name] * loss for name, loss in losses.items())
+        return {"loss": total, **losses, "gradient": float(norm), "learning_rate": rate}
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step: a linear rise, then half a cosine."""
+        config = self.config
+        if step < config.warmup:
+            return config.learning_rate * (step + 1) / config.warmup
+        share = (step - config.warmup) / max(config.steps - config.warmup, 1)
+        low = config.final_rate
+        return config.learning_rate * (low + (1 - low) * 0.5 * (1 + math.cos(math.pi * share)))
+
+    def _validated(self, done: int) -> dict[str, float]:
+        scores: dict[str, float] = {}
+        if self.validate is not None and self.place.first:
+            self.encoder.eval()
+            scores = {f"validation/{name}": float(value) for name, value in self.validate(self.encoder, done).items()}
+        wait_for_all()
+        return scores
+
+
+def _groups(encoder: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
+    matrices = [value for value in encoder.parameters() if value.ndim > 1]
+    rest = [value for value in encoder.parameters() if value.ndim <= 1]
+    return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+
+
+def _on(batch: Batch, device: torch.device) -> Batch:
+    if device.type == "cpu":
+        return batch
+
+    def move(value: Tensor) -> Tensor:
+        return value.to(device, non_blocking=True)
+
+    return Batch(
+        names=batch.names,
+        attributes=move(batch.attributes),
+        opacities=move(batch.opacities),
+        plan=batch.plan.to(device),
+        targets=move(batch.targets),
+        weights=move(batch.weights),
+        rows=type(batch.rows)(*map(move, batch.rows)),
+    )
+
+
+def _one_thread(worker: int) -> None:  # noqa: ARG001
+    torch.set_num_threads(1)
