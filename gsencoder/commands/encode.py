@@ -36,7 +36,8 @@ class EncodeCommandConfig(CommonConfig):
         metadata={"help": "splats, scenes, or folders of scenes", "metavar": "SPLAT", "required": True},
     )
     weights: str = field(
-        default="house_cpu", metadata={"help": "what `train` wrote: its folder or file, or a name that comes with gsencoder"}
+        default="house_cpu",
+        metadata={"help": "what `train` wrote: its folder or file, or a name that comes with gsencoder"},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -98,7 +99,7 @@ def _encode_into(
         spacing = scene_spacing(scene.gaussians.means)
         unit = SPACING_IN_VOXELS * encoder.config.voxel / spacing if spacing else 1.0
         warnings.warn(
-            f"encode: the unit of {scene.name!r} is unknown; its Gaussians lie {spacing:.4g} units apart, which is taken "
+            f"encode: the unit of {scene.name!r} is unknown; its Gaussians lie {spacing:.4g} units apart, taken "
             f"for the encoder's grid of {encoder.config.voxel:g} m (data.metres_per_unit={unit:.4g}); give "
             "data.metres_per_unit= if you know better",
             SceneWarning,

@@ -17,9 +17,8 @@ from gsencoder.evaluate.localization import (
 )
 from gsencoder.evaluate.tables import csv_text
 from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.onnx import OnnxConfig
-from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.outputs import output_folder, write_bytes
 from gsencoder.progress import Progress, console
@@ -40,7 +39,7 @@ class EvaluateConfig(CommonConfig):
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
-    teacher: LabelsConfig | PaletteConfig | OnnxConfig = field(default_factory=LabelsConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
 

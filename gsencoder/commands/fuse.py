@@ -17,8 +17,6 @@ from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.store import WORDS_FILE, save_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.onnx import OnnxConfig
-from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.outputs import output_folder
 from gsencoder.progress import Progress, console
 from gsencoder.render.rgb import RenderedImages
@@ -41,7 +39,7 @@ class FuseCommandConfig(CommonConfig):
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
-    teacher: LabelsConfig | PaletteConfig | OnnxConfig = field(default_factory=LabelsConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
 
     def __post_init__(self) -> None:
         if not 1 <= self.orbits <= MOST_ORBITS:

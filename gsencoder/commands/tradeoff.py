@@ -14,9 +14,8 @@ from gsencoder.evaluate.tables import csv_text
 from gsencoder.evaluate.tradeoff import BudgetConfig, SweepConfig, Trade, pick, row_of, settings_of, trade_off
 from gsencoder.evaluate.tradeoff_plot import plot_trades
 from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.onnx import OnnxConfig
-from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.outputs import output_folder, write_bytes
 from gsencoder.progress import Progress, console
@@ -36,7 +35,7 @@ class TradeoffConfig(CommonConfig):
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
-    teacher: LabelsConfig | PaletteConfig | OnnxConfig = field(default_factory=LabelsConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
 

@@ -21,10 +21,8 @@ from gsencoder.errors import InputError
 from gsencoder.evaluate.naming import naming
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher, text_table_of
+from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.onnx import OnnxConfig
-from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.infer.encode import EncodeConfig
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.heap import keep_heap
@@ -64,7 +62,7 @@ class TrainConfig(CommonConfig):
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where the encoder computes"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
-    teacher: LabelsConfig | PaletteConfig | OnnxConfig = field(default_factory=LabelsConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
     model: EncoderConfig = field(default_factory=EncoderConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -84,8 +82,9 @@ def run(config: TrainConfig, summary: Summary) -> None:
         with summary.step("prepare"):
             dataset = prepare(training, held_out, words, config, out, place, track)
         if config.prepare_only:
-            console(config.quiet or not place.first).print(f"{dataset.folder}: {len(training)} scenes to train on, "
-                                                           f"{len(held_out)} for validation")
+            console(config.quiet or not place.first).print(
+                f"{dataset.folder}: {len(training)} scenes to train on, {len(held_out)} for validation"
+            )
             return
         work = out.with_name(f"{out.name}.training")
         if place.first:
@@ -142,7 +141,9 @@ def run(config: TrainConfig, summary: Summary) -> None:
             )
         shutil.rmtree(work, ignore_errors=True)
         told = ", ".join(f"{name} {value:.3f}" for name, value in scores.items())
-        console(config.quiet).print(f"{out}: {done.step} steps in {done.seconds / 60:.1f} minutes; {told or 'not validated'}")
+        console(config.quiet).print(
+            f"{out}: {done.step} steps in {done.seconds / 60:.1f} minutes; {told or 'not validated'}"
+        )
 
 
 def split(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[Path], list[Path]]:
@@ -226,5 +227,3 @@ def _identity(config: TrainConfig) -> dict[str, Any]:
     for name in ("workers", "log_every", "validate_every", "checkpoint_every", "compile"):
         del chosen["train"][name]
     return {**chosen, "teacher": settings(config.teacher), "holdout": list(config.holdout)}
-
-

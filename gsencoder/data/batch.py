@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float32, Int64
 from gsencoder.errors import InputError
 from gsencoder.types import Cameras
 
+_AROUND = 4
+"""Times the size of a crop: so many of the nearest Gaussians are held against the frusta before all are."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SamplingConfig:
@@ -21,7 +24,7 @@ class SamplingConfig:
     views: int = field(default=4, metadata={"help": "target views of a sample; render losses are taken in them"})
     gaussians: int = field(default=30_000, metadata={"help": "most Gaussians of a sample, nearest first; 0 = all"})
     rare_centers: float = field(
-        default=0.5, metadata={"help": "share of crops whose centre is drawn by rarity of its target, not evenly"}
+        default=0.8, metadata={"help": "share of crops whose centre is of any kind of target alike, not just anywhere"}
     )
 
     def __post_init__(self) -> None:
@@ -60,41 +63,61 @@ def nearest(means: Float32[np.ndarray, "n 3"], center: Float32[np.ndarray, "3"],
     return np.sort(np.argpartition(distances, count)[:count])
 
 
-def choose_views(count: int, config: SamplingConfig, rng: np.random.Generator) -> tuple[int, ...]:
-    """Target views, drawn without repetition; all of them where there are no more."""
-    return tuple(int(view) for view in rng.permutation(count)[: config.views])
-
-
-def choose_rows(
+def choose_part(
     means: Float32[np.ndarray, "N 3"],
     cameras: Cameras,
-    rarity: Float32[np.ndarray, " N"],
+    chances: Float32[np.ndarray, " N"],
     config: SamplingConfig,
     rng: np.random.Generator,
-) -> Int64[np.ndarray, " n"]:
-    """Rows of a sample, ascending.
+) -> tuple[tuple[int, ...], Int64[np.ndarray, " n"]]:
+    """Target views, and the rows of the sample that is cut for them.
+
+    Without a limit the views are drawn first, and everything in their frusta is taken, as in the paper. With one, the
+    centre of the crop is drawn first and the views are among those that look at it: views that look elsewhere would
+    show nothing of the sample.
 
     Args:
         means: of the whole scene.
-        cameras: the target views.
-        rarity: how rare each Gaussian's target is; 0 = has none, and is never the centre of a crop.
+        cameras: of all its views.
+        chances: of each Gaussian to be the centre of a crop; 0 = has no target, and never is.
         config: see there.
         rng: everything random comes from it.
 
+    Returns:
+        Views without repetition (all that there are, where there are no more than asked for), and rows, ascending.
+
     Raises:
-        InputError: no Gaussian lies in any frustum.
+        InputError: no Gaussian lies in any frustum of the drawn views.
     """
-    rows = np.arange(len(means)) if config.scope == "scene" else np.flatnonzero(in_frusta(means, cameras))
+    everywhere = config.scope == "scene"
+    if not 0 < config.gaussians < len(means):
+        views = rng.permutation(len(cameras))[: config.views]
+        rows = np.arange(len(means)) if everywhere else np.flatnonzero(in_frusta(means, cameras.select(views)))
+    else:
+        center = means[_draw(chances, config, rng)]
+        looking = [view for view in range(len(cameras)) if in_frusta(center[None], cameras.select([view]))[0]]
+        views = rng.permutation(looking or len(cameras))[: config.views]
+        rows = nearest(means, center, len(means) if everywhere else _AROUND * config.gaussians)
+        if not everywhere:
+            chosen = cameras.select(views)
+            rows = rows[in_frusta(means[rows], chosen)]
+            if len(rows) < config.gaussians:
+                rows = np.flatnonzero(in_frusta(means, chosen))
+        rows = rows[nearest(means[rows], center, config.gaussians)]
     if not len(rows):
         raise InputError("sample: no Gaussian lies in the frusta of the chosen views; check poses and units")
-    if 0 < config.gaussians < len(rows):
-        chances = rarity[rows].astype(np.float64)
-        if rng.random() >= config.rare_centers:
-            chances = (chances > 0).astype(np.float64)
-        total = chances.sum()
-        center = rng.choice(len(rows), p=chances / total) if 0 < total < math.inf else rng.integers(len(rows))
-        rows = rows[nearest(means[rows], means[rows[center]], config.gaussians)]
-    return rows
+    return tuple(int(view) for view in views), rows
+
+
+def _draw(chances: Float32[np.ndarray, " N"], config: SamplingConfig, rng: np.random.Generator) -> int:
+    """The centre of a crop."""
+    each = chances.astype(np.float64)
+    if rng.random() >= config.rare_centers:
+        each = (each > 0).astype(np.float64)
+    total = np.cumsum(each)
+    if not 0 < total[-1] < math.inf:
+        return int(rng.integers(len(chances)))
+    return int(min(np.searchsorted(total, rng.random() * total[-1], side="right"), len(chances) - 1))
 
 
 def thin_out(rows: Int64[np.ndarray, " n"], most: float, rng: np.random.Generator) -> Int64[np.ndarray, " m"]:

@@ -29,7 +29,7 @@ class PatchAttention(nn.Module):
         channels = x.shape[1]
         placed = self.qkv(x.index_select(0, gather))
         # torch's backward of attention in bfloat16 on a CPU is five times slower than in float32.
-        slow = placed.device.type == "cpu" and torch.is_grad_enabled()
+        slow = placed.device.type == "cpu" and placed.dtype == torch.bfloat16 and torch.is_grad_enabled()
         qkv = (placed.float() if slow else placed).view(-1, width, 3, self.heads, channels // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
         with torch.autocast(placed.device.type, enabled=False):

@@ -13,6 +13,9 @@ from torch import Tensor
 
 from gsencoder.errors import InputError
 
+MOST_LEVELS = 22
+"""Bits of a coordinate, at most and with one to spare: levels go in pairs."""
+
 Order = Literal["z", "z-trans", "hilbert", "hilbert-trans"]
 
 _EVERY_THIRD = 0x1249249249249249
@@ -84,7 +87,10 @@ def morton_codes(cells: Int64[Tensor, "N 3"]) -> Int64[Tensor, " N"]:
 
 
 def hilbert_codes(cells: Int64[Tensor, "N 3"], bits: int) -> Int64[Tensor, " N"]:
-    """Positions along Hilbert's curve, which only ever steps to a face neighbour; for coordinates below 2^bits."""
+    """Positions along Hilbert's curve, which only ever steps to a face neighbour, for coordinates below 2^bits.
+
+    `bits` says how far to look and changes nothing else, so that a part of a scene is ordered as in the whole.
+    """
     return _hilbert_from_morton(morton_codes(cells), bits)
 
 
@@ -93,15 +99,22 @@ def _hilbert_from_morton(morton: Int64[Tensor, " N"], bits: int) -> Int64[Tensor
     for an orientation and the octants of the next two levels, their places on the curve and the orientation inside."""
     table = _hilbert_table().to(morton.device)
     code, state = torch.zeros_like(morton), torch.zeros_like(morton)
-    # Where levels are odd in number, an empty one is put on top, in the orientation whose first octant is as state 0.
     levels = bits + bits % 2
-    if bits % 2:
-        state += next(outer for outer in range(24) if _hilbert_step(outer, 0) == (0, 0))
+    state += _start_of(levels)
     for level in range(levels - 2, -1, -2):
         found = table.index_select(0, (state << 6) | ((morton >> (3 * level)) & 63))
         code = (code << 6) | (found & 63)
         state = found >> 6
     return code
+
+
+@cache
+def _start_of(levels: int) -> int:
+    """The orientation of the lowest corner of so many levels, within a curve of MOST_LEVELS."""
+    state = 0
+    for _ in range(MOST_LEVELS - levels):
+        _, state = _hilbert_step(state, 0)
+    return state
 
 
 @cache

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from gsencoder.data.augment import AugmentConfig, augment
-from gsencoder.data.batch import SamplingConfig, choose_rows, choose_views, thin_out
+from gsencoder.data.batch import SamplingConfig, choose_part, thin_out
 from gsencoder.errors import InputError
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, Plan, join_plans
@@ -170,13 +170,13 @@ def make_sample(
     Raises:
         InputError: the chosen views see none of the scene's Gaussians.
     """
-    views = choose_views(len(scene.cameras), recipe.sampling, rng)
-    # Row −1 of the table is the last one, which gives the unseen their weight of 0.
-    rarity = np.append(recipe.rarity.each(recipe.losses.rarity), np.float32(0))[codes]
+    # Code −1 is the last row of these tables, which gives the unseen 0. All kinds are equally often the centre.
+    chances = np.append(recipe.rarity.each(1.0), np.float32(0))[codes]
+    weights = np.append(recipe.rarity.each(recipe.losses.rarity), np.float32(0))[codes]
     try:
-        selected = choose_rows(scene.means, scene.cameras.select(views), rarity, recipe.sampling, rng)
+        views, selected = choose_part(scene.means, scene.cameras, chances, recipe.sampling, rng)
     except InputError as error:
-        raise InputError(f"scene {scene.name}, views {_listed(scene, views)}: {error}") from error
+        raise InputError(f"scene {scene.name}: {error}") from error
     change = recipe.augmentation
     kept = thin_out(selected, change.drop, rng) if change is not None else selected
     voxel = recipe.encoder.voxel / (scene.metres_per_unit or 1.0)
@@ -187,18 +187,14 @@ def make_sample(
     shape = recipe.losses
     rows = [restrict(scene.view(view), len(scene), selected, kept, shape) for view in views if shape.render_weight]
     return Sample(
-        name=f"{scene.name} ({_listed(scene, views)})",
+        name=f"{scene.name} ({', '.join(scene.view_names[view] for view in views)})",
         attributes=attributes,
         opacities=opacities,
         plan=plan,
         targets=torch.from_numpy(scene.targets(kept)),
-        weights=torch.from_numpy(rarity[kept]),
+        weights=torch.from_numpy(weights[kept]),
         rows=_stack(rows, [0] * len(rows), scene.channels, recipe),
     )
-
-
-def _listed(scene: PreparedScene, views: Sequence[int]) -> str:
-    return ", ".join(scene.view_names[view] for view in views)
 
 
 def restrict(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from gsencoder.errors import InputError
 from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.errors import InputError
 
 ARRAYS = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.arange(3, dtype=np.float32)}
 

@@ -8,9 +8,10 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteConfig, PaletteTeacher
+from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Scene
 
-TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig
+TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig
 
 
 def text_table_of(config: TeacherConfig) -> TextTable | None:
@@ -40,6 +41,8 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: TextTable | None) 
         return PaletteTeacher(config)
     if isinstance(config, OnnxConfig):
         return OnnxTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
+    if isinstance(config, RadioConfig):
+        return RadioTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
     assert words is not None
     return LabelsTeacher(
         scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder, cell=config.cell

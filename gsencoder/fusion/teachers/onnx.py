@@ -7,11 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
-from PIL import Image
 
 from gsencoder.data.model_files import find_file
 from gsencoder.data.npz import read_npz
 from gsencoder.errors import InputError
+from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 LARGEST_SIDE = 8192
@@ -137,12 +137,10 @@ class OnnxTeacher:
         """
         if views.images is None:
             raise InputError("teacher onnx: the scene has no pictures")
-        image, patch = views.images[view], self.config.patch
-        height, width = image.shape[:2]
-        ratio = self.config.size / max(height, width)
-        rows, columns = max(1, round(height * ratio / patch)), max(1, round(width * ratio / patch))
-        resized = Image.fromarray(image).resize((columns * patch, rows * patch), Image.Resampling.BICUBIC)
-        features = self._run(np.asarray(resized))
+        patch = self.config.patch
+        resized, grid_from_image = fit_to_patches(views.images[view], self.config.size, patch)
+        rows, columns = resized.shape[0] // patch, resized.shape[1] // patch
+        features = self._run(resized)
         if features.shape[:2] != (rows, columns):
             raise InputError(
                 f"teacher onnx: expected {rows}×{columns} cells of {patch} pixels, the model gave "
@@ -154,11 +152,7 @@ class OnnxTeacher:
                 f"teacher onnx: {bad} of {features.size} values of {self._path.name} for view {views.names[view]!r} "
                 "are not finite; check teacher.scale, teacher.mean and teacher.std, or the model"
             )
-        return FeatureMap(
-            features=features,
-            grid_from_image=np.array([[columns / width, 0, 0], [0, rows / height, 0]]),
-            space=self.space,
-        )
+        return FeatureMap(features=features, grid_from_image=grid_from_image, space=self.space)
 
     def _run(self, image: np.ndarray) -> Float32[np.ndarray, "h w D"]:
         config = self.config

@@ -1,0 +1,22 @@
+"""How a picture is fitted to a backbone of patches: resized as a whole, without a crop."""
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+from PIL import Image
+
+
+def fit_to_patches(
+    image: UInt8[np.ndarray, "H W 3"], size: int, patch: int
+) -> tuple[UInt8[np.ndarray, "h w 3"], Float64[np.ndarray, "2 3"]]:
+    """A picture with sides of whole patches, and the affine from its own pixels to the grid of patches.
+
+    Args:
+        image: any size.
+        size: about what the longer side becomes, pixels.
+        patch: pixels along a patch.
+    """
+    height, width = image.shape[:2]
+    ratio = size / max(height, width)
+    rows, columns = max(1, round(height * ratio / patch)), max(1, round(width * ratio / patch))
+    resized = Image.fromarray(image).resize((columns * patch, rows * patch), Image.Resampling.BICUBIC)
+    return np.asarray(resized), np.array([[columns / width, 0, 0], [0, rows / height, 0]])

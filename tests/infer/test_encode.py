@@ -1,0 +1,114 @@
+"""Encoding scenes of any size: in parts as in one, and always all of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from splats import random_gaussians
+from training_scenes import SMALL
+
+from gsencoder.errors import InputError
+from gsencoder.infer.encode import EncodeConfig, cut, encode
+from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.types import FeatureSpace
+
+OUTPUTS = OutputSpace(space=FeatureSpace(name="s", channels=5), mean=np.arange(5, dtype=np.float32), scale=2.0)
+WHOLE = EncodeConfig(chunk=0, precision="float32")
+
+
+def encoder() -> GaussianEncoder:
+    torch.manual_seed(0)
+    return GaussianEncoder(SMALL, 5)
+
+
+@given(st.integers(1, 300), st.integers(1, 80), st.floats(0, 2), st.integers(0, 3))
+@settings(max_examples=60)
+def test_every_gaussian_is_some_chunks_own_once_and_no_chunk_is_too_large(
+    count: int, chunk: int, halo: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    means = rng.normal(size=(count, 3)).astype(np.float32)
+    means[: count // 3] = 0.5  # Coincident ones cannot be cut apart by a plane.
+    chunks = cut(means, chunk, halo)
+    assert sorted(np.concatenate([one.own for one in chunks]).tolist()) == list(range(count))
+    for one in chunks:
+        assert len(one.rows) <= chunk
+        assert np.array_equal(one.rows[: len(one.own)], one.own)
+        assert len(np.unique(one.rows)) == len(one.rows)
+
+
+def test_the_halo_is_what_lies_around_a_box() -> None:
+    means = np.random.default_rng(0).uniform(0, 10, (2000, 3)).astype(np.float32)
+    for one in cut(means, 1500, 0.5):
+        own, rows = means[one.own], means[one.rows]
+        low, high = own.min(axis=0), own.max(axis=0)
+        near = ((means >= low - 0.45) & (means <= high + 0.45)).all(axis=1)
+        assert np.isin(np.flatnonzero(near), one.rows).all()
+        assert (rows >= low - 1.5).all()
+        assert (rows <= high + 1.5).all()
+
+
+def test_chunks_give_nearly_what_the_whole_gives() -> None:
+    one = random_gaussians(1500)
+    whole = encode(one, encoder(), OUTPUTS, WHOLE)
+    parts = encode(one, encoder(), OUTPUTS, replace(WHOLE, chunk=700, halo=1.0))
+    a, b = whole.features - OUTPUTS.mean, parts.features - OUTPUTS.mean
+    cosines = (a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+    assert cosines.mean() > 0.97
+    assert len(cut(one.means, 700, 1.0)) > 1
+
+
+def test_features_come_with_their_space_and_a_weight_for_every_gaussian() -> None:
+    found = encode(random_gaussians(50), encoder(), OUTPUTS, WHOLE)
+    assert found.space == OUTPUTS.space
+    assert (found.weights == 1).all()
+    assert found.basis is None
+
+
+def test_the_unit_of_the_scene_is_taken_into_account() -> None:
+    """A splat in centimetres is the same splat."""
+    one = random_gaussians(200)
+    one = replace(one, means=np.round(one.means * 512).astype(np.float32) / 512)
+    in_quarters = replace(one, means=one.means * np.float32(4), scales=one.scales * np.float32(4))
+    network = encoder()
+    network.config = replace(SMALL, voxel=0.125)
+    there = encode(in_quarters, network, OUTPUTS, WHOLE, metres_per_unit=0.25)
+    np.testing.assert_allclose(there.features, encode(one, network, OUTPUTS, WHOLE).features, atol=1e-4)
+
+
+def test_a_rerun_gives_the_same_bits() -> None:
+    one = random_gaussians(300)
+    config = EncodeConfig(chunk=100)
+    assert np.array_equal(
+        encode(one, encoder(), OUTPUTS, config).features, encode(one, encoder(), OUTPUTS, config).features
+    )
+
+
+def test_an_empty_splat_is_refused() -> None:
+    with pytest.raises(InputError, match="no Gaussians"):
+        encode(random_gaussians(0), encoder(), OUTPUTS, WHOLE)
+
+
+def test_an_encoder_that_overflows_is_told_of() -> None:
+    network = encoder()
+    with torch.no_grad():
+        network.head.weight.fill_(3e38)
+    with pytest.raises(InputError, match="features are not finite"):
+        encode(random_gaussians(20), network, OUTPUTS, WHOLE)
+
+
+@pytest.mark.parametrize("change", [{"chunk": -1}, {"halo": -0.1}, {"halo": float("inf")}])
+def test_sizes_out_of_range_are_refused(change: dict) -> None:
+    with pytest.raises(InputError, match=next(iter(change))):
+        replace(WHOLE, **change)
+
+
+def test_a_gpu_that_is_not_there_is_refused() -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(InputError, match="sees no GPU"):
+        encode(random_gaussians(5), encoder(), OUTPUTS, replace(WHOLE, device="cuda"))

@@ -1,0 +1,241 @@
+"""The encoder's laws: order, batch mates and reruns change nothing; gradients are right; extremes stay finite."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsencoder.errors import InputError
+from gsencoder.geometry import rotmats_from_quats
+from gsencoder.models.embed import CHANNELS, channels_of, embed
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, encoder_inputs, merge
+from gsencoder.models.plan import join_plans, plan_cloud
+from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.types import Gaussians
+
+TINY = TransformerConfig(
+    encoder_depths=(1, 1, 2),
+    encoder_channels=(16, 32, 32),
+    decoder_depths=(1, 1),
+    decoder_channels=(16, 32),
+    head_channels=16,
+    patch=24,
+)
+CONFIG = EncoderConfig(voxel=0.1, transformer=TINY)
+
+
+def splat(count: int, seed: int = 0, extent: float = 1.5) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    quats = rng.normal(size=(count, 4))
+    return Gaussians(
+        means=rng.uniform(0, extent, (count, 3)).astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=rng.uniform(0.005, 0.1, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0, 1, count).astype(np.float32),
+        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
+    )
+
+
+def encoder(config: EncoderConfig = CONFIG, channels: int = 7) -> GaussianEncoder:
+    torch.manual_seed(0)
+    return GaussianEncoder(config, channels).eval()
+
+
+def run(network: GaussianEncoder, *splats: Gaussians, round_up: bool = False) -> torch.Tensor:
+    """The features of splats, put side by side."""
+    inputs = [encoder_inputs(one, network.config, network.config.voxel) for one in splats]
+    plan = network.join([cloud for _, _, cloud in inputs], round_up=round_up)
+    with torch.no_grad():
+        return network(torch.cat([a for a, _, _ in inputs]), torch.cat([o for _, o, _ in inputs]), plan)
+
+
+def test_a_batch_gives_what_its_clouds_give_alone() -> None:
+    network, splats = encoder(), [splat(300, 1), splat(41, 2), splat(1, 3)]
+    for round_up in (False, True):
+        together = run(network, *splats, round_up=round_up)
+        alone = torch.cat([run(network, one) for one in splats])
+        torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
+
+
+def test_the_order_of_gaussians_orders_the_output_and_does_nothing_else() -> None:
+    network, one = encoder(), splat(500)
+    order = np.random.default_rng(1).permutation(500)
+    torch.testing.assert_close(run(network, one.select(order)), run(network, one)[order], rtol=1e-5, atol=1e-5)
+
+
+def test_a_rerun_gives_the_same_bits() -> None:
+    network, one = encoder(), splat(400)
+    first = run(network, one)
+    torch.manual_seed(99)
+    assert torch.equal(run(network, one), first)
+
+
+def test_moving_the_scene_by_whole_blocks_of_cells_changes_nothing() -> None:
+    """Pooling pairs cells from multiples of ALIGN, so that is the step within which places matter."""
+    network, one = encoder(), splat(300)
+    one = replace(one, means=np.round(one.means * 1024).astype(np.float32) / 1024)
+    network.config = replace(network.config, voxel=0.125)
+    moved = replace(one, means=one.means + np.float32(0.125 * 64) * np.array([3, -2, 1], np.float32))
+    torch.testing.assert_close(run(network, moved), run(network, one), rtol=1e-5, atol=1e-5)
+
+
+def test_one_ellipsoid_has_one_embedding_however_it_is_written() -> None:
+    """The sign of the quaternion, and which axis is called first, are choices of the file."""
+    one = splat(50)
+    tensors = [torch.from_numpy(getattr(one, name)) for name in ("means", "quats", "scales", "opacities")]
+    means, quats, scales, opacities = tensors
+    sh = torch.from_numpy(one.sh[:, 0])
+    names = tuple(CHANNELS)
+    plain = embed(means, quats, scales, opacities, sh, voxel=0.1, attributes=names)
+    # Turning the Gaussian's own frame by a third of a turn about its diagonal renames x, y, z as y, z, x.
+    third = torch.tensor([0.5, 0.5, 0.5, 0.5])
+    w, x, y, z = quats.unbind(1)
+    a, b, c, d = third
+    renamed = torch.stack(
+        (
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ),
+        dim=1,
+    )
+    turned = rotmats_from_quats(renamed) * scales[:, [1, 2, 0]].unsqueeze(1)
+    original = rotmats_from_quats(quats) * scales.unsqueeze(1)
+    torch.testing.assert_close(turned @ turned.mT, original @ original.mT, rtol=1e-4, atol=1e-7)
+    for other, sizes in ((-quats, scales), (renamed, scales[:, [1, 2, 0]])):
+        again = embed(means, other, sizes, opacities, sh, voxel=0.1, attributes=names)
+        torch.testing.assert_close(again, plain, rtol=1e-5, atol=1e-5)
+
+
+def test_embeddings_stay_small_at_the_ends_of_what_a_splat_may_hold() -> None:
+    scales = torch.tensor([[1e-30, 1e30, 1.0], [1e-9, 1e-9, 1e4], [1e38, 1e38, 1e38]])
+    quats = torch.tensor([[1.0, 0, 0, 0], [0, 0, 0, 0], [1e-20, 1e20, 0, 0]])
+    means = torch.tensor([[1e6, -1e6, 0], [0, 0, 0], [3e5, 1, 1]])
+    channels = embed(
+        means,
+        quats,
+        scales,
+        torch.tensor([0.0, 1.0, 0.5]),
+        torch.tensor([[1e30, -1e30, 0]] * 3),
+        voxel=0.02,
+        attributes=tuple(CHANNELS),
+    )
+    assert channels.shape == (3, channels_of(tuple(CHANNELS)))
+    assert channels.abs().max() <= 9
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    network = encoder(replace(CONFIG, transformer=replace(TINY, encoder_depths=(1, 1, 1))), channels=2).double()
+    attributes, opacities, cloud = encoder_inputs(splat(12, extent=0.4), network.config, 0.1)
+    plan = network.join([cloud])
+    inputs = (attributes.double().requires_grad_(), opacities.double().requires_grad_())
+
+    # The head gives float32 whatever went in; here its doubles are kept.
+    def forward(a: torch.Tensor, o: torch.Tensor) -> torch.Tensor:
+        tokens = merge(a, o, plan)
+        x = torch.nn.functional.gelu(network.stem_norm(network.stem(tokens, plan.levels[0].neighbors)))
+        return network.head(network.head_norm(network.transformer(x, plan)))
+
+    assert torch.autograd.gradcheck(forward, inputs, eps=1e-6, atol=1e-6)
+    parameters = list(network.parameters())
+    chosen = [parameters[i] for i in range(0, len(parameters), 7)]
+    for value in chosen:
+        step, place = 1e-6, (0,) * value.ndim
+        loss = forward(*inputs).square().sum()
+        (gradient,) = torch.autograd.grad(loss, [value])
+        with torch.no_grad():
+            value[place] += step
+            up = forward(*inputs).square().sum()
+            value[place] -= 2 * step
+            down = forward(*inputs).square().sum()
+            value[place] += step
+        assert abs(float((up - down) / (2 * step) - gradient[place])) <= 1e-4 * max(1.0, float(gradient[place].abs()))
+
+
+def test_keeping_no_activations_gives_the_same_gradients() -> None:
+    attributes, opacities, cloud = encoder_inputs(splat(100), CONFIG, 0.1)
+    found = []
+    for kept in (False, True):
+        network = encoder(replace(CONFIG, transformer=replace(TINY, checkpoint=kept, drop_path=0.3))).train()
+        torch.manual_seed(5)
+        network(attributes, opacities, network.join([cloud])).square().mean().backward()
+        found.append([value.grad for value in network.parameters()])
+    for plain, again in zip(*found, strict=True):
+        torch.testing.assert_close(plain, again)
+
+
+def test_training_draws_orders_and_paths_at_random_and_evaluation_never() -> None:
+    attributes, opacities, cloud = encoder_inputs(splat(200), CONFIG, 0.1)
+    network = encoder()
+    plan = network.join([cloud])
+    with torch.no_grad():
+        same = [network(attributes, opacities, plan) for _ in range(2)]
+        network.train()
+        different = [network(attributes, opacities, plan) for _ in range(2)]
+    assert torch.equal(*same)
+    assert not torch.equal(*different)
+
+
+def test_in_bfloat16_features_stay_close_and_come_as_float32() -> None:
+    network, one = encoder(), splat(300)
+    exact = run(network, one)
+    with torch.autocast("cpu", torch.bfloat16):
+        rough = run(network, one, round_up=True)
+    assert rough.dtype == torch.float32
+    assert torch.cosine_similarity(rough, exact, dim=1).mean() > 0.99
+
+
+# torch's own compiler instantiates an autograd function, and warns that one should not.
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+def test_compiled_it_gives_the_same(no_jaxtyping: None) -> None:
+    network, one = encoder(), splat(64)
+    attributes, opacities, cloud = encoder_inputs(one, CONFIG, 0.1)
+    plan = network.join([cloud])
+    with torch.no_grad():
+        exact = network(attributes, opacities, plan)
+        compiled = torch.compile(network, backend="aot_eager", dynamic=True)(attributes, opacities, plan)
+    torch.testing.assert_close(compiled, exact, rtol=1e-5, atol=1e-5)
+
+
+def test_merging_gives_the_weighted_mean_of_a_cells_gaussians() -> None:
+    means = torch.tensor([[0.01, 0.01, 0.01], [0.05, 0.05, 0.05], [0.95, 0.95, 0.95]])
+    plan = join_plans([plan_cloud(means, 0.1, levels=1)], 8)
+    merged = merge(torch.tensor([[1.0], [4.0], [9.0]]), torch.tensor([1.0, 2.0, 0.5]), plan)
+    torch.testing.assert_close(merged, torch.tensor([[3.0], [9.0]]))
+
+
+def test_a_cell_of_invisible_gaussians_has_features_too() -> None:
+    one = replace(splat(20, extent=0.05), opacities=np.zeros(20, np.float32))
+    assert torch.isfinite(run(encoder(), one)).all()
+
+
+def test_thousands_of_coincident_gaussians_are_one_token() -> None:
+    one = splat(3000)
+    found = run(encoder(), replace(one, means=np.full_like(one.means, 0.5)))
+    assert torch.isfinite(found).all()
+    assert (found == found[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"decoder_depths": (1,)}, "decoder_depths: expected 2 entries"),
+        ({"encoder_channels": (16, 32)}, "encoder_channels: expected one entry a level"),
+        ({"head_channels": 12}, "multiples of head_channels"),
+        ({"patch": 0}, "patch"),
+        ({"orders": ()}, "orders"),
+        ({"drop_path": 1.0}, "drop_path"),
+        ({"encoder_depths": (1, -1, 1)}, "encoder_depths"),
+    ],
+)
+def test_a_shape_that_cannot_be_is_refused(change: dict, message: str, no_jaxtyping: None) -> None:
+    with pytest.raises(InputError, match=message):
+        replace(TINY, **change)
+
+
+@pytest.mark.parametrize("change", [{"voxel": 0.0}, {"inputs": ()}, {"inputs": ("color", "color")}])
+def test_an_encoder_of_nothing_is_refused(change: dict) -> None:
+    with pytest.raises(InputError):
+        replace(CONFIG, **change)

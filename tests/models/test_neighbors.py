@@ -1,0 +1,89 @@
+"""Neighbourhoods and the convolution over them, against plain twins."""
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsencoder.models import neighbors
+from gsencoder.models.neighbors import NeighborConv, convolve_reference, neighbor_table
+
+
+def distinct_cells(count: int, extent: int, seed: int = 0) -> torch.Tensor:
+    torch.manual_seed(seed)
+    return torch.unique(torch.randint(0, extent, (count, 3)), dim=0)[torch.randperm(1)[0] :]
+
+
+def slow_table(cells: torch.Tensor) -> torch.Tensor:
+    """The table by looking every cell up in a dictionary."""
+    rows = {tuple(cell): row for row, cell in enumerate(cells.tolist())}
+    steps = list(itertools.product((-1, 0, 1), repeat=3))
+    return torch.tensor(
+        [[rows.get((x + dx, y + dy, z + dz), len(cells)) for dx, dy, dz in steps] for x, y, z in cells.tolist()],
+        dtype=torch.int32,
+    ).view(-1, 27)
+
+
+@given(st.sets(st.tuples(*[st.integers(0, 6)] * 3), min_size=1, max_size=60), st.randoms(), st.integers(0, 2**20))
+def test_the_table_is_that_of_looking_each_cell_up(cells: set, random: object, shift: int) -> None:
+    listed = sorted(cells)
+    random.shuffle(listed)  # type: ignore[attr-defined]
+    tensor = torch.tensor(listed) + shift
+    assert torch.equal(neighbor_table(tensor), slow_table(tensor))
+
+
+def test_columns_do_not_run_into_one_another() -> None:
+    """The highest cell of a column and the lowest of the next are far apart in space, and close in the sorted keys."""
+    cells = torch.tensor([[0, 0, 9], [0, 1, 0], [0, 0, 0], [1, 0, 0], [0, 9, 9]])
+    assert torch.equal(neighbor_table(cells), slow_table(cells))
+
+
+def test_one_cell_has_itself_and_no_other() -> None:
+    table = neighbor_table(torch.tensor([[5, 5, 5]]))
+    assert table[0, 13] == 0
+    assert (table == 1).sum() == 26
+
+
+def test_no_cells_have_no_neighbours() -> None:
+    assert neighbor_table(torch.zeros(0, 3, dtype=torch.int64)).shape == (0, 27)
+
+
+def test_extents_of_a_million_cells_do_not_overflow() -> None:
+    far = 2**20 + 62
+    cells = torch.tensor([[0, 0, 0], [far, far, far], [far, far, far - 1], [far, 0, 0]])
+    assert torch.equal(neighbor_table(cells), slow_table(cells))
+
+
+@pytest.mark.parametrize("count", [1, 5, 300])
+@pytest.mark.parametrize("rows_at_once", [64, 8192])
+def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(
+    count: int, rows_at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(neighbors, "ROWS_AT_ONCE", rows_at_once)
+    table = neighbor_table(distinct_cells(count, 8))
+    layer = NeighborConv(3, 5).double()
+    x = torch.randn(len(table), 3, dtype=torch.float64, requires_grad=True)
+    ours, plain = layer(x, table), convolve_reference(x, table, layer.weight) + layer.bias
+    torch.testing.assert_close(ours, plain, rtol=1e-12, atol=1e-12)
+    upstream = torch.randn_like(ours)
+    ours_grads = torch.autograd.grad(ours, [x, layer.weight, layer.bias], upstream)
+    plain_grads = torch.autograd.grad(plain, [x, layer.weight, layer.bias], upstream)
+    for mine, theirs in zip(ours_grads, plain_grads, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-6, atol=1e-6)
+
+
+def test_moving_all_cells_changes_nothing() -> None:
+    cells = distinct_cells(200, 10)
+    assert torch.equal(neighbor_table(cells), neighbor_table(cells + torch.tensor([7, 1000, 64])))
+
+
+def test_in_bfloat16_the_convolution_stays_close() -> None:
+    table = neighbor_table(distinct_cells(200, 8))
+    layer, x = NeighborConv(16, 16), torch.randn(200, 16)[: len(table)]
+    exact = layer(x, table)
+    with torch.autocast("cpu", torch.bfloat16):
+        rough = layer(x, table)
+    assert rough.dtype == torch.bfloat16
+    assert (rough.float() - exact).norm() < 0.01 * exact.norm()

@@ -1,0 +1,129 @@
+"""Plans: tokens, levels, patches, and what putting clouds side by side must not change."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsencoder.models.plan import ORDERS, Plan, join_plans, make_plan, plan_cloud
+
+VOXEL = 0.1
+
+
+def cloud(count: int, seed: int = 0, extent: float = 2.0) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(0, extent, (count, 3)).astype(np.float32))
+
+
+def check(plan: Plan, gaussians: int) -> None:
+    """What every plan must keep to."""
+    assert plan.token_of.shape == (gaussians,)
+    assert sorted(plan.members.tolist()) == list(range(gaussians))
+    assert plan.counts.sum() == gaussians
+    assert torch.equal(plan.token_of[plan.members], torch.repeat_interleave(plan.counts))
+    for level in plan.levels:
+        tokens = len(level.neighbors)
+        for gather, scatter in zip(level.gathers, level.scatters, strict=True):
+            assert gather.numel() % level.width == 0
+            assert int(gather.max()) < tokens
+            assert int(scatter.max()) < gather.numel()
+
+
+@given(st.integers(1, 300), st.integers(1, 4), st.integers(1, 40), st.booleans(), st.integers(0, 5))
+@settings(max_examples=60)
+def test_every_plan_holds_together(count: int, levels: int, patch: int, round_up: bool, seed: int) -> None:
+    plan = join_plans([plan_cloud(cloud(count, seed), VOXEL, levels=levels)], patch, round_up=round_up)
+    check(plan, count)
+    real = len(plan.counts)
+    for number, level in enumerate(plan.levels):
+        for gather, scatter in zip(level.gathers, level.scatters, strict=True):
+            # Each token stands in exactly one place that attention looks at, and finds itself there.
+            assert torch.equal(gather[scatter[:real]], torch.arange(real))
+            used = torch.ones_like(gather, dtype=torch.bool) if level.padding is None else level.padding.flatten()
+            patches = -(-real // patch)
+            assert int(used.view(-1, level.width)[:patches].sum()) == real
+        if number + 1 < levels:
+            coarser = len(torch.unique(level.parents[:real]))
+            assert torch.equal(torch.unique(level.parents[:real]), torch.arange(coarser))
+            for parent in range(coarser):
+                own = set(torch.nonzero(level.parents[:real] == parent).flatten().tolist())
+                assert set(level.children[parent].tolist()) == own
+            real = coarser
+
+
+def test_tokens_are_the_occupied_cells() -> None:
+    points = cloud(500)
+    plan = make_plan(points, VOXEL, levels=2, patch=32)
+    cells = torch.floor(points.double() / VOXEL)
+    assert len(plan.counts) == len(torch.unique(cells, dim=0))
+    for token in range(0, len(plan.counts), 37):
+        assert len(torch.unique(cells[plan.token_of == token], dim=0)) == 1
+
+
+def test_patches_of_a_cloud_differ_by_one_token_at_most() -> None:
+    plan = make_plan(cloud(1000), VOXEL, levels=1, patch=64)
+    level = plan.levels[0]
+    used = level.padding.view(-1, level.width) if level.padding is not None else torch.ones(1)
+    sizes = used.sum(dim=1)
+    assert sizes.max() - sizes.min() <= 1
+    assert level.width <= 64
+
+
+def test_patches_are_compact_in_space() -> None:
+    """Along a curve, tokens of a patch lie closer together than tokens taken at random."""
+    points = cloud(4000)
+    plan = make_plan(points, 0.05, levels=1, patch=64)
+    level = plan.levels[0]
+    first = plan.members[plan.counts.cumsum(0) - plan.counts]
+    centers = points[first]
+    for order in range(len(ORDERS)):
+        placed = centers[level.gathers[order]].view(-1, level.width, 3)
+        assert placed.std(dim=1).mean() < 0.5 * centers.std(dim=0).mean()
+
+
+def test_clouds_side_by_side_have_the_plans_that_they_have_alone() -> None:
+    a, b = cloud(300, 1), cloud(120, 2)
+    together = join_plans([plan_cloud(part, VOXEL, levels=3) for part in (a, b)], 32)
+    alone = [make_plan(part, VOXEL, levels=3, patch=32) for part in (a, b)]
+    check(together, 420)
+    assert together.items == (len(alone[0].counts), len(alone[1].counts))
+    for level, (first, second) in enumerate(zip(alone[0].levels, alone[1].levels, strict=True)):
+        joined, n = together.levels[level], len(first.neighbors)
+        total = n + len(second.neighbors)
+        assert torch.equal(joined.neighbors[:n], torch.where(first.neighbors == n, total, first.neighbors).int())
+        moved = torch.where(second.neighbors == len(second.neighbors), total, second.neighbors + n)
+        assert torch.equal(joined.neighbors[n:], moved.int())
+        # No patch holds tokens of both.
+        for gather in joined.gathers:
+            sides = (gather.view(-1, joined.width) < n).float().mean(dim=1)
+            assert ((sides == 0) | (sides == 1)).all()
+
+
+def test_rounding_up_makes_few_sizes() -> None:
+    sizes = set()
+    for count in range(1000, 1400, 20):
+        plan = join_plans([plan_cloud(cloud(count, count), 0.02, levels=2)], 32, round_up=True)
+        sizes.add(len(plan.levels[0].neighbors))
+        assert len(plan.levels[0].neighbors) <= 1.13 * len(plan.counts)
+    assert len(sizes) <= 7
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_clouds_that_fit_into_one_cell_are_one_token(count: int) -> None:
+    plan = make_plan(torch.zeros(count, 3) + 0.01, VOXEL, levels=4, patch=16)
+    check(plan, count)
+    assert plan.counts.tolist() == [count]
+    assert all(len(level.neighbors) == 1 for level in plan.levels)
+
+
+def test_a_cloud_of_nothing_has_a_plan() -> None:
+    plan = make_plan(torch.zeros(0, 3), VOXEL, levels=3, patch=16)
+    assert plan.items == (0,)
+    assert all(len(level.neighbors) == 0 for level in plan.levels)
+
+
+def test_a_plan_moves_to_a_device_whole() -> None:
+    plan = make_plan(cloud(50), VOXEL, levels=2, patch=16).to("meta")
+    for level in plan.levels:
+        assert all(part.device.type == "meta" for part in level if isinstance(part, torch.Tensor))
+    assert plan.token_of.device.type == "meta"

@@ -1,0 +1,110 @@
+"""Curves against their definitions: every cell once, neighbours in the order are neighbours in space, levels nest."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsencoder.errors import InputError
+from gsencoder.models.serialize import (
+    ALIGN,
+    LARGEST_EXTENT,
+    bits_of,
+    cells_of,
+    encode_cells,
+    hilbert_codes,
+    morton_codes,
+)
+
+ORDERS = ("z", "z-trans", "hilbert", "hilbert-trans")
+
+
+def cube(bits: int) -> torch.Tensor:
+    """All cells of a cube, in no particular order of any curve."""
+    return torch.tensor(list(itertools.product(range(2**bits), repeat=3)))
+
+
+def interleaved(x: int, y: int, z: int) -> int:
+    """A Morton code, bit by bit."""
+    return sum(((x >> i & 1) << 3 * i + 2) | ((y >> i & 1) << 3 * i + 1) | ((z >> i & 1) << 3 * i) for i in range(21))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_a_curve_visits_every_cell_of_a_cube_once(order: str, bits: int) -> None:
+    codes = encode_cells(cube(bits), order, bits)
+    assert sorted(codes.tolist()) == list(range(8**bits))
+
+
+@pytest.mark.parametrize("order", ["hilbert", "hilbert-trans"])
+@pytest.mark.parametrize("bits", [1, 2, 3, 4, 5])
+def test_hilbert_steps_to_a_face_neighbour_always(order: str, bits: int) -> None:
+    cells = cube(bits)
+    path = cells[torch.argsort(encode_cells(cells, order, bits))]
+    assert (path.diff(dim=0).abs().sum(dim=1) == 1).all()
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("bits", [2, 3, 4])
+def test_cutting_three_bits_off_a_code_gives_the_code_of_the_larger_cell_up_to_the_curve(order: str, bits: int) -> None:
+    codes = encode_cells(cube(bits), order, bits) >> 3
+    parents = morton_codes(cube(bits) >> 1)
+    # One code for all eight children, and different codes for different parents.
+    pairs = set(zip(codes.tolist(), parents.tolist(), strict=True))
+    assert len(pairs) == 8 ** (bits - 1)
+
+
+def test_transposed_orders_are_the_orders_of_swapped_cells() -> None:
+    cells = torch.randint(0, 2**20, (500, 3))
+    swapped = cells[:, [1, 0, 2]]
+    assert torch.equal(encode_cells(cells, "z-trans", 20), encode_cells(swapped, "z", 20))
+    assert torch.equal(encode_cells(cells, "hilbert-trans", 20), encode_cells(swapped, "hilbert", 20))
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 2**21 - 1)] * 3), min_size=1, max_size=20))
+def test_morton_codes_interleave_bits(cells: list[tuple[int, int, int]]) -> None:
+    assert morton_codes(torch.tensor(cells)).tolist() == [interleaved(*cell) for cell in cells]
+
+
+def test_codes_are_distinct_at_the_far_end_of_twenty_bits() -> None:
+    far = 2**20 + ALIGN - 1
+    cells = torch.tensor(list(itertools.product((0, 1, far - 1, far), repeat=3)))
+    for order in ORDERS:
+        codes = encode_cells(cells, order, bits_of(cells))
+        assert len(codes.unique()) == 64
+        assert (codes >= 0).all()
+
+
+@pytest.mark.parametrize("bits", range(2, 22))
+def test_hilbert_codes_do_not_depend_on_how_many_bits_are_looked_at(bits: int) -> None:
+    """The corner of a large scene is ordered as a small scene of its own."""
+    assert torch.equal(hilbert_codes(cube(2), bits), hilbert_codes(cube(2), 2))
+
+
+def test_cells_are_anchored_so_that_a_part_falls_into_the_cells_of_the_whole() -> None:
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-5, 5, (1000, 3)).astype(np.float32))
+    whole, part = cells_of(points, 0.02), cells_of(points[:100], 0.02)
+    shift = whole[:100] - part
+    assert (shift == shift[0]).all()
+    assert (shift[0] % ALIGN == 0).all()
+
+
+def test_a_cloud_may_spread_over_almost_a_million_cells_but_no_further() -> None:
+    ends = torch.tensor([[0.0, 0, 0], [LARGEST_EXTENT - 1.5, 0, 0]])
+    assert cells_of(ends, 1.0).max() < LARGEST_EXTENT + ALIGN
+    with pytest.raises(InputError, match="larger voxel"):
+        cells_of(torch.tensor([[0.0, 0, 0], [LARGEST_EXTENT + 0.0, 0, 0]]), 1.0)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_positions_that_are_not_finite_are_counted_and_refused(bad: float) -> None:
+    with pytest.raises(InputError, match="1 of 2 positions are not finite"):
+        cells_of(torch.tensor([[0.0, 0, 0], [0, bad, 0]]), 1.0)
+
+
+def test_no_points_have_no_cells() -> None:
+    assert cells_of(torch.zeros(0, 3), 0.1).shape == (0, 3)
+    assert bits_of(torch.zeros(0, 3, dtype=torch.int64)) == 1

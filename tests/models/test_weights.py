@@ -1,0 +1,120 @@
+"""Weights on disk: what is read is what was written, and anything else is refused with a reason."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from training_scenes import SMALL
+
+from gsencoder.errors import InputError
+from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.weights import load_weights, save_weights
+from gsencoder.types import FeatureBasis, FeatureSpace
+
+SPACE = FeatureSpace(name="s", channels=6, teacher="labels", text_encoder="t")
+
+
+def outputs(basis: bool) -> OutputSpace:
+    rng = np.random.default_rng(0)
+    mean = rng.normal(size=6).astype(np.float32)
+    components = np.linalg.qr(rng.normal(size=(6, 6)))[0][:4].astype(np.float32)
+    own = FeatureBasis(mean=mean, components=components, energy_kept=0.9, space=SPACE) if basis else None
+    return OutputSpace(space=SPACE, mean=mean, scale=0.7, basis=own)
+
+
+def encoder(space: OutputSpace) -> GaussianEncoder:
+    torch.manual_seed(1)
+    return GaussianEncoder(SMALL, space.channels)
+
+
+@pytest.mark.parametrize("basis", [False, True])
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+def test_what_is_read_is_what_was_written(basis: bool, dtype: str, tmp_path: Path) -> None:
+    space, path = outputs(basis), tmp_path / "e.safetensors"
+    written = encoder(space)
+    save_weights(path, written, space, {"steps": 3}, dtype=dtype)  # type: ignore[arg-type]
+    read, found, made_by = load_weights(path)
+    assert made_by == {"steps": 3}
+    assert read.config == SMALL
+    assert not read.training
+    assert found.space == SPACE
+    assert found.scale == space.scale
+    np.testing.assert_array_equal(found.mean, space.mean)
+    assert (found.basis is None) == (not basis)
+    tolerance = 0.0 if dtype == "float32" else 1e-3
+    for name, value in written.state_dict().items():
+        torch.testing.assert_close(read.state_dict()[name], value, rtol=tolerance, atol=tolerance)
+        assert read.state_dict()[name].dtype == torch.float32
+
+
+def test_parameters_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
+    broken = encoder(outputs(False))
+    with torch.no_grad():
+        broken.head.bias[0] = float("nan")
+    with pytest.raises(InputError, match="parameter head.bias is not finite"):
+        save_weights(tmp_path / "e.safetensors", broken, outputs(False), {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_file_is_said_to_be_missing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        load_weights(tmp_path / "e.safetensors")
+
+
+def header_of(path: Path) -> dict:
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    return json.loads(json.loads(data[8 : 8 + size])["__metadata__"]["gsencoder"])
+
+
+def with_header(path: Path, change: dict) -> None:
+    """Rewrites the file's own header."""
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    entries = json.loads(data[8 : 8 + size])
+    entries["__metadata__"]["gsencoder"] = json.dumps({**json.loads(entries["__metadata__"]["gsencoder"]), **change})
+    written = json.dumps(entries).encode()
+    path.write_bytes(struct.pack("<Q", len(written)) + written + data[8 + size :])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 99}, "expected version 1"),
+        ({"encoder": {"voxel": 0.1, "depth": 3}}, "configuration is not one of this version"),
+        ({"encoder": {"voxel": -1.0}}, "voxel: expected a positive length"),
+        ({"encoder": None}, "expected encoder"),
+        ({"scale": 0.0}, "scale"),
+        ({"dtype": "int8"}, "expected parameters of float32 or float16"),
+        ({"space": {"name": "x"}}, "feature space"),
+    ],
+)
+def test_a_header_that_says_something_else_is_refused(change: dict, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "e.safetensors"
+    save_weights(path, encoder(outputs(True)), outputs(True), {})
+    with_header(path, change)
+    with pytest.raises(InputError, match=message):
+        load_weights(path)
+
+
+def test_parameters_of_another_network_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "e.safetensors"
+    save_weights(path, encoder(outputs(True)), outputs(True), {})
+    config = header_of(path)["encoder"]
+    config["transformer"]["encoder_channels"] = [16, 48]
+    with_header(path, {"encoder": config})
+    with pytest.raises(InputError, match=r"expected encoder\.\S+ float32\["):
+        load_weights(path)
+
+
+@pytest.mark.parametrize("cut", [0, 7, 100, 5000])
+def test_a_truncated_file_is_refused(cut: int, tmp_path: Path) -> None:
+    path = tmp_path / "e.safetensors"
+    save_weights(path, encoder(outputs(False)), outputs(False), {})
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(InputError, match="damaged"):
+        load_weights(path)

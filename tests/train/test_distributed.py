@@ -1,0 +1,71 @@
+"""Who a process is, as its environment tells."""
+
+import pytest
+
+from gsencoder.errors import InputError
+from gsencoder.train.distributed import Place, first_host, joined, place_from
+
+SLURM = {
+    "SLURM_STEP_ID": "0",
+    "SLURM_PROCID": "5",
+    "SLURM_NTASKS": "8",
+    "SLURM_LOCALID": "1",
+    "SLURM_STEP_NODELIST": "gpu[03-04]",
+    "SLURM_JOB_ID": "123456",
+}
+
+
+def test_without_a_launcher_there_is_one_process() -> None:
+    assert place_from({}) == (Place(), "")
+    with joined("cpu") as (place, device):
+        assert place.first
+        assert device.type == "cpu"
+
+
+def test_torchrun_tells_rank_and_size() -> None:
+    place, meeting = place_from({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"})
+    assert (place.rank, place.size, place.local_rank, place.first) == (3, 4, 1, False)
+    assert meeting == "env://"
+
+
+def test_slurm_tells_rank_and_size_and_where_to_meet() -> None:
+    place, meeting = place_from(SLURM)
+    assert (place.rank, place.size, place.local_rank) == (5, 8, 1)
+    assert meeting == "tcp://gpu03:23456"
+
+
+def test_an_address_that_is_given_is_taken() -> None:
+    assert place_from({**SLURM, "MASTER_ADDR": "h", "MASTER_PORT": "9"})[1] == "tcp://h:9"
+
+
+def test_a_batch_script_itself_is_one_process() -> None:
+    environment = {name: value for name, value in SLURM.items() if name != "SLURM_STEP_ID"}
+    assert place_from(environment) == (Place(), "")
+
+
+@pytest.mark.parametrize(
+    ("nodes", "host"),
+    [("a", "a"), ("a,b", "a"), ("a[1,3]", "a1"), ("a[001-200]", "a001"), ("n[2-3].x.org,m", "n2.x.org")],
+)
+def test_the_first_machine_of_a_list(nodes: str, host: str) -> None:
+    assert first_host(nodes) == host
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ({"RANK": "4", "WORLD_SIZE": "4"}, "RANK=4 is not below WORLD_SIZE=4"),
+        ({"RANK": "x", "WORLD_SIZE": "4"}, "RANK: expected a whole number"),
+        ({**SLURM, "SLURM_STEP_NODELIST": ""}, "list of machines"),
+    ],
+)
+def test_an_environment_that_contradicts_itself_is_refused(environment: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        place_from(environment)
+
+
+def test_a_device_that_is_not_there_is_refused() -> None:
+    with pytest.raises(InputError, match="no GPU"), joined("cuda"):
+        pass
+    with pytest.raises(InputError, match="expected auto, cpu or cuda"), joined("tpu"):
+        pass

@@ -1,0 +1,137 @@
+"""The losses, in closed form and at their ends."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from splats import front_camera, random_gaussians
+
+from gsencoder.errors import InputError
+from gsencoder.render import blend
+from gsencoder.train.losses import Head, LossConfig, field_loss, match_loss, render_loss
+
+CONFIG = LossConfig()
+
+
+def typical(count: int, channels: int = 8, seed: int = 0) -> torch.Tensor:
+    """Targets of typical length: √channels."""
+    vectors = torch.randn(count, channels, generator=torch.Generator().manual_seed(seed))
+    return vectors / vectors.norm(dim=1, keepdim=True) * channels**0.5
+
+
+def test_a_perfect_prediction_costs_nothing() -> None:
+    target = typical(10)
+    torch.testing.assert_close(match_loss(target, target, CONFIG), torch.zeros(10), atol=1e-6, rtol=0)
+
+
+def test_the_matching_loss_is_equation_three_for_typical_targets() -> None:
+    target, predicted = typical(6), torch.randn(6, 8)
+    cosines = torch.nn.functional.cosine_similarity(predicted, target, dim=1)
+    distance = torch.nn.functional.smooth_l1_loss(predicted, target, reduction="none").mean(dim=1)
+    expected = 0.9 * (1 - cosines) + 0.1 * distance
+    torch.testing.assert_close(match_loss(predicted, target, CONFIG), expected)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0, 3.0])
+def test_near_the_mean_the_direction_counts_in_proportion_and_beyond_it_not_more(share: float) -> None:
+    target, predicted = typical(4) * share, torch.randn(4, 8)
+    config = replace(CONFIG, cosine=1.0, smooth_l1=0.0)
+    cosines = torch.nn.functional.cosine_similarity(predicted, typical(4), dim=1)
+    torch.testing.assert_close(match_loss(predicted, target, config), (1 - cosines) * min(1, share), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-8, 1e-20, 1e6, 1e15])
+def test_losses_and_gradients_are_finite_for_predictions_of_any_length(size: float) -> None:
+    predicted = (torch.randn(5, 8) * size).requires_grad_()
+    loss = match_loss(predicted, typical(5), CONFIG)
+    (gradient,) = torch.autograd.grad(loss.sum(), [predicted])
+    assert torch.isfinite(loss).all()
+    assert torch.isfinite(gradient).all()
+
+
+def test_gaussians_that_were_never_seen_neither_cost_nor_learn() -> None:
+    predicted = torch.randn(5, 8, requires_grad=True)
+    target = typical(5)
+    weights = torch.tensor([1.0, 0.0, 2.0, 0.0, 1.0])
+    found = field_loss(predicted, target, weights, CONFIG)
+    expected = (match_loss(predicted, target, CONFIG) * weights).sum()
+    torch.testing.assert_close(found.total, expected)
+    assert found.weight == 4
+    (gradient,) = torch.autograd.grad(found.total, [predicted])
+    assert (gradient[[1, 3]] == 0).all()
+    spoiled = target.clone()
+    spoiled[1] = float("nan")
+    assert torch.isfinite(field_loss(predicted, spoiled, weights, CONFIG).total)
+
+
+def test_no_seen_gaussian_is_a_sum_of_nothing() -> None:
+    found = field_loss(torch.randn(3, 8), typical(3), torch.zeros(3), CONFIG)
+    assert found.total == 0
+    assert found.weight == 0
+
+
+def test_the_render_loss_compares_what_is_left_after_dividing_by_alpha() -> None:
+    cloud, camera = random_gaussians(60), front_camera()
+    b = blend(cloud, camera, patch=8)
+    predicted = torch.randn(60, 8, requires_grad=True)
+    rows = b.alpha > 0.3
+    weights = rows.float()
+    target = typical(b.rows)
+    dense = torch.zeros(b.rows, 60)
+    dense[torch.repeat_interleave(torch.arange(b.rows), b.crow.diff()), b.col.long()] = b.weight
+    rendered = (dense @ predicted) / b.alpha.clamp(min=1e-12)[:, None]
+    expected = (match_loss(rendered, target, CONFIG) * weights).sum()
+    found = render_loss(predicted, b, target, weights, CONFIG)
+    torch.testing.assert_close(found.total, expected, rtol=1e-4, atol=1e-4)
+    ours = torch.autograd.grad(found.total, [predicted])[0]
+    plain = torch.autograd.grad(expected, [predicted])[0]
+    torch.testing.assert_close(ours, plain, rtol=1e-3, atol=1e-5)
+
+
+def test_a_field_of_one_vector_renders_to_that_vector_wherever_anything_is() -> None:
+    b = blend(random_gaussians(60), front_camera(), patch=8)
+    vector = typical(1)
+    target = vector.expand(b.rows, -1)
+    found = render_loss(vector.expand(60, -1).contiguous(), b, target, (b.alpha > 1e-3).float(), CONFIG)
+    assert found.total < 1e-3
+
+
+def test_heads_are_compared_in_their_own_spaces_and_do_not_learn() -> None:
+    b = blend(random_gaussians(60), front_camera(), patch=8)
+    body = torch.nn.Linear(12, 5)
+    decode = torch.nn.Linear(8, 12)
+    head = Head(body, torch.zeros(5), 1.0)
+    predicted = torch.randn(60, 8, requires_grad=True)
+    weights = (b.alpha > 0.3).float()
+    found = render_loss(predicted, b, typical(b.rows), weights, CONFIG, [(head, decode), (head, decode)])
+    once = render_loss(predicted, b, typical(b.rows), weights, CONFIG, [(head, decode)])
+    torch.testing.assert_close(found.total, 2 * once.total)
+    assert body.weight.requires_grad is False
+    assert torch.autograd.grad(found.total, [predicted])[0].abs().sum() > 0
+
+
+@pytest.mark.parametrize("change", [{"cosine": -1.0}, {"min_alpha": 0.0}, {"min_kept": 1.5}, {"rarity": float("inf")}])
+def test_weights_out_of_range_are_refused(change: dict) -> None:
+    with pytest.raises(InputError, match=next(iter(change))):
+        replace(CONFIG, **change)
+
+
+def test_no_loss_at_all_is_refused() -> None:
+    with pytest.raises(InputError, match="no loss left"):
+        LossConfig(field_weight=0, render_weight=0)
+
+
+def test_units_of_numpy_and_torch_agree() -> None:
+    """A target of typical length has √C in standard units, as `OutputSpace` makes it."""
+    from gsencoder.models.output_space import OutputSpace
+    from gsencoder.types import FeatureSpace
+
+    rng = np.random.default_rng(0)
+    vectors = rng.normal(size=(200, 6)).astype(np.float32) + 5
+    mean = vectors.mean(axis=0)
+    scale = float(np.sqrt(np.square(vectors - mean).sum(axis=1).mean()))
+    outputs = OutputSpace(space=FeatureSpace(name="s", channels=6), mean=mean, scale=scale)
+    standard = outputs.standardize(vectors)
+    assert abs(np.square(standard).mean() - 1) < 1e-5
+    np.testing.assert_allclose(outputs.restore(standard), vectors, atol=1e-5)

@@ -1,0 +1,136 @@
+"""Preparation: one space for all scenes, whole files, and no mixing of two datasets."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from training_scenes import PREPARE, SPACE, TABLE, DenseSideTeacher, SideTeacher, prepared, scene
+
+from gsencoder.errors import InputError
+from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.train.dataset_space import dataset_space
+from gsencoder.train.prepare import SETTINGS_FILE, PreparedDataset
+from gsencoder.train.rarity import Rarity, cluster_targets, count_targets, nearest_codes
+from gsencoder.types import FeatureSpace
+
+
+def test_targets_are_the_fused_features_in_standard_units(tmp_path: Path) -> None:
+    dataset, names = prepared(tmp_path, count=1)
+    outputs, codebook = dataset.load_space()
+    one = dataset.scenes(names)[0]
+    fused = fuse(scene(0), SideTeacher(), FuseConfig(basis=False)).features
+    rows = np.flatnonzero(fused.seen)
+    np.testing.assert_array_equal(np.flatnonzero(one.weights), rows)
+    np.testing.assert_allclose(outputs.restore(one.targets(rows)), fused.features[rows], atol=5e-3)
+    assert codebook is not None
+    found = {tuple(row) for row in np.round(outputs.restore(codebook), 4).tolist()}
+    assert found == {tuple(row) for row in TABLE.tolist()}
+
+
+def test_a_prepared_scene_gives_back_its_gaussians_and_cameras(tmp_path: Path) -> None:
+    dataset, names = prepared(tmp_path, count=1)
+    one, source = dataset.scenes(names)[0], scene(0)
+    assert source.gaussians is not None
+    assert source.views is not None
+    rows = np.array([3, 1, 4])
+    chosen = one.gaussians(rows)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(chosen, name), getattr(source.gaussians, name)[rows])
+    np.testing.assert_array_equal(one.cameras.Ks, source.views.cameras.Ks)
+    assert one.view_names == source.views.names
+    assert one.metres_per_unit == 1.0
+    assert one.up is None
+
+
+def test_cells_of_the_render_loss_hold_the_mean_of_their_pixels(tmp_path: Path) -> None:
+    dataset, names = prepared(tmp_path, count=1)
+    outputs, _ = dataset.load_space()
+    view = dataset.scenes(names)[0].view(0)
+    assert len(view.valid) == 12 * 10
+    assert view.valid.all()
+    vectors = outputs.restore(view.targets).reshape(10, 12, 4)
+    np.testing.assert_allclose(vectors[:, :6], np.broadcast_to(TABLE[1], (10, 6, 4)), atol=5e-3)
+    np.testing.assert_allclose(vectors[:, 6:], np.broadcast_to(TABLE[2], (10, 6, 4)), atol=5e-3)
+
+
+def test_what_is_prepared_is_not_prepared_again(tmp_path: Path) -> None:
+    dataset, names = prepared(tmp_path, count=2)
+    before = dataset.path_of(names[0]).stat().st_mtime_ns
+    again = PreparedDataset(tmp_path, {"made": "for a test"})
+    again.find_space([], None, PREPARE)  # type: ignore[arg-type]
+    again.find_rarity([], lambda items, label: items)
+    assert dataset.path_of(names[0]).stat().st_mtime_ns == before
+
+
+def test_a_folder_of_another_dataset_is_refused_and_the_setting_named(tmp_path: Path) -> None:
+    prepared(tmp_path, count=1)
+    with pytest.raises(InputError, match=r"prepared with other settings \(made\)"):
+        PreparedDataset(tmp_path, {"made": "otherwise"})
+
+
+def test_settings_that_cannot_be_read_are_an_error_with_the_folder(tmp_path: Path) -> None:
+    (tmp_path / SETTINGS_FILE).write_text("{")
+    with pytest.raises(InputError, match=str(tmp_path)):
+        PreparedDataset(tmp_path, {})
+
+
+def test_a_damaged_scene_is_told_with_its_file(tmp_path: Path) -> None:
+    dataset, names = prepared(tmp_path, count=1)
+    path = dataset.path_of(names[0])
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(InputError, match=str(path)):
+        len(dataset.scenes(names)[0])
+
+
+def test_scenes_of_two_spaces_are_refused() -> None:
+    class Other(SideTeacher):
+        space = FeatureSpace(name="other", channels=4)
+
+    teachers = iter([SideTeacher(), Other()])
+    with pytest.raises(InputError, match="several feature spaces"):
+        dataset_space([Path("a"), Path("b")], lambda path: (scene(0), next(teachers)), FuseConfig(), views=2)
+    with pytest.raises(InputError, match="no scenes"):
+        dataset_space([], lambda path: (scene(0), SideTeacher()), FuseConfig(), views=2)
+
+
+def test_the_space_of_a_dense_teacher_has_the_moments_of_its_maps() -> None:
+    outputs, codebook = dataset_space(
+        [Path("a"), Path("b")], lambda path: (scene(0), DenseSideTeacher()), FuseConfig(narrow=0), views=4
+    )
+    assert codebook is None
+    np.testing.assert_allclose(outputs.mean, (TABLE[1] + TABLE[2]) / 2, atol=1e-5)
+    assert outputs.scale == pytest.approx(np.sqrt(0.5), rel=1e-4)
+    assert outputs.basis is not None
+    assert outputs.basis.rank == 1  # Two vectors lie on one line.
+    assert outputs.space == SPACE
+
+
+def test_rarity_gives_each_kind_its_power_of_the_count_and_a_mean_of_one() -> None:
+    rarity = Rarity(codebook=np.eye(3, dtype=np.float32), counts=np.array([100.0, 25.0, 0.0]))
+    each = rarity.each(0.5)
+    assert each[1] / each[0] == pytest.approx(2.0, rel=1e-5)
+    assert (each * rarity.counts).sum() / 125 == pytest.approx(1.0, rel=1e-5)
+    assert np.isfinite(each).all()
+    assert (rarity.each(0.0) == 1).all()
+
+
+def test_targets_are_counted_by_the_nearest_vector() -> None:
+    codebook = np.array([[0, 0], [10, 0]], np.float32)
+    targets = np.array([[1, 5], [9, -3], [6, 0]], np.float32)
+    assert nearest_codes(codebook, targets).tolist() == [0, 1, 1]
+    assert count_targets([targets, targets[:1]], codebook).counts.tolist() == [2, 2]
+    assert nearest_codes(codebook, targets[:0]).shape == (0,)
+
+
+def test_clusters_stand_for_names_where_there_are_none() -> None:
+    rng = np.random.default_rng(0)
+    sample = np.concatenate([rng.normal(center, 0.01, (50, 2)) for center in (0, 5, 10)]).astype(np.float32)
+    book = cluster_targets(sample)
+    assert np.abs(book[nearest_codes(book, sample)] - sample).max() < 0.1
+
+
+def test_settings_are_kept_as_json(tmp_path: Path) -> None:
+    PreparedDataset(tmp_path / "new", {"a": (1, 2)})
+    assert json.loads((tmp_path / "new" / SETTINGS_FILE).read_text()) == {"a": [1, 2]}
+    PreparedDataset(tmp_path / "new", {"a": (1, 2)})

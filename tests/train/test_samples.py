@@ -1,0 +1,186 @@
+"""Samples and batches: where they come from, what they keep to, and that nothing else decides them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_encoder
+
+from gsencoder.data.augment import AugmentConfig
+from gsencoder.data.batch import SamplingConfig
+from gsencoder.errors import InputError
+from gsencoder.render import blend
+from gsencoder.train.losses import LossConfig
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared import ViewRows
+from gsencoder.train.samples import SampleDataset, StepSampler, join_samples, restrict
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[PreparedDataset, list[str]]:
+    return prepared(tmp_path_factory.mktemp("prepared"))
+
+
+def same(first: object, second: object) -> bool:
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first, second)  # type: ignore[arg-type]
+    if isinstance(first, tuple):
+        return all(same(a, b) for a, b in zip(first, second, strict=True))  # type: ignore[arg-type]
+    return first == second
+
+
+def test_a_sample_depends_on_the_seed_and_its_number_alone(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    one, other = samples(*dataset), samples(*dataset)
+    other[7]
+    np.random.seed(5)
+    assert same(one[3], other[3])
+    assert not same(one[3], one[4])
+    assert not same(one[3], samples(*dataset, seed=4)[3])
+
+
+def test_every_pass_shows_every_scene_once(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    data = samples(*dataset)
+    for epoch in range(3):
+        seen = {data[3 * epoch + place].name.split(" ")[0] for place in range(3)}
+        assert seen == set(dataset[1])
+
+
+@given(st.integers(1, 3), st.integers(1, 3), st.integers(1, 4), st.integers(0, 3), st.integers(1, 3))
+def test_processes_share_a_step_and_a_resumed_run_goes_on_in_the_middle(
+    batch: int, accumulate: int, world: int, first: int, steps: int
+) -> None:
+    def numbers(rank: int, begin: int) -> list[list[int]]:
+        return list(StepSampler(begin, first + steps, batch=batch, accumulate=accumulate, rank=rank, world=world))
+
+    taken = sorted(number for rank in range(world) for micro in numbers(rank, first) for number in micro)
+    size = batch * accumulate * world
+    assert taken == list(range(first * size, (first + steps) * size))
+    assert numbers(0, 0)[-steps * accumulate :] == numbers(0, first)
+
+
+def test_one_process_with_more_micro_batches_takes_the_samples_of_several(
+    dataset: tuple[PreparedDataset, list[str]],
+) -> None:
+    alone = list(StepSampler(0, 2, batch=1, accumulate=2, rank=0, world=1))
+    pair = [list(StepSampler(0, 2, batch=1, accumulate=1, rank=rank, world=2)) for rank in range(2)]
+    assert alone == [micro for step in zip(*pair, strict=True) for micro in step]
+
+
+def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    whole = SamplingConfig(scope="scene", gaussians=0, views=2)
+    data = samples(*dataset, augmentation=None, sampling=whole)
+    found, source = data[0], None
+    for scene in data.scenes:
+        if found.name.startswith(scene.name):
+            source = scene
+    assert source is not None
+    assert len(found.attributes) == len(source)
+    everything = np.arange(len(source))
+    np.testing.assert_array_equal(found.targets.numpy(), source.targets(everything))
+    assert ((found.weights > 0).numpy() == (source.weights > 0)).all()
+
+
+def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    """With all Gaussians and nothing changed, B is that of `render.blend`, and its render of the targets is near the
+    teacher's own cells."""
+    whole = SamplingConfig(scope="scene", gaussians=0, views=1)
+    data = samples(*dataset, augmentation=None, sampling=whole, losses=LossConfig(rarity=0.0))
+    found = data[0]
+    scene = next(scene for scene in data.scenes if found.name.startswith(scene.name))
+    view = scene.view_names.index(found.name.split("(")[1].rstrip(")"))
+    b = blend(scene.gaussians(np.arange(len(scene))), scene.cameras, view, patch=4)
+    ours = found.rows.blend(len(scene))
+    opaque = b.alpha >= 0.5
+    assert ours.rows == int(opaque.sum())
+    torch.testing.assert_close(ours.alpha, b.alpha[opaque], rtol=2e-3, atol=2e-3)
+    rendered = ours.render(found.targets) / ours.alpha[:, None]
+    assert torch.cosine_similarity(rendered, found.rows.targets, dim=1).mean() > 0.9
+
+
+def rows_of(weights: list[list[float]], valid: list[bool] | None = None) -> ViewRows:
+    """Dense rows as compressed ones."""
+    dense = np.array(weights, np.float32)
+    counts = (dense > 0).sum(axis=1)
+    return ViewRows(
+        crow=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        col=np.nonzero(dense)[1].astype(np.int32),
+        weight=dense[dense > 0],
+        targets=np.arange(len(dense), dtype=np.float32)[:, None],
+        valid=np.array(valid if valid is not None else [True] * len(dense)),
+    )
+
+
+ALL = np.arange(4)
+
+
+@pytest.mark.parametrize(
+    ("row", "selected", "kept", "stays"),
+    [
+        ([0.4, 0.4, 0.0, 0.0], ALL, ALL, True),
+        ([0.2, 0.2, 0.0, 0.0], ALL, ALL, False),  # too faint
+        ([0.0, 0.0, 0.0, 0.0], ALL, ALL, False),  # empty
+        ([0.9, 0.04, 0.0, 0.0], np.array([0]), np.array([0]), True),  # 96 % inside the selection
+        ([0.8, 0.1, 0.0, 0.0], np.array([0]), np.array([0]), False),  # 89 %
+        ([0.4, 0.4, 0.0, 0.0], ALL, np.array([0, 2, 3]), True),  # half was left out at random
+        ([0.2, 0.6, 0.0, 0.0], ALL, np.array([0, 2, 3]), False),  # too much was
+    ],
+)
+def test_rows_stay_where_they_mean_something(
+    row: list[float], selected: np.ndarray, kept: np.ndarray, stays: bool
+) -> None:
+    found = restrict(rows_of([row, [1.0, 0, 0, 0]]), 4, selected, kept, LossConfig())
+    assert found.targets.ravel().tolist() == ([0.0, 1.0] if stays else [1.0])
+    assert found.col.max() < len(kept)
+
+
+def test_cells_without_a_teachers_vector_are_left_out() -> None:
+    found = restrict(rows_of([[1.0, 0], [0, 1.0]], [False, True]), 2, np.arange(2), np.arange(2), LossConfig())
+    assert found.targets.ravel().tolist() == [1.0]
+    assert found.col.tolist() == [1]
+
+
+def test_samples_side_by_side_are_the_samples_alone(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    data = samples(*dataset)
+    parts = [data[0], data[1]]
+    batch = join_samples(parts, SMALL.transformer.patch)
+    n = len(parts[0].attributes)
+    b = batch.rows.blend(len(batch.attributes))
+    field = torch.randn(len(batch.attributes), 3)
+    expected = [
+        part.rows.blend(len(part.attributes)).render(values)
+        for part, values in zip(parts, (field[:n], field[n:]), strict=True)
+    ]
+    torch.testing.assert_close(b.render(field), torch.cat(expected))
+    encoder = small_encoder().eval()
+    with torch.no_grad():
+        together = encoder(batch.attributes, batch.opacities, batch.plan)
+        alone = [join_samples([part], SMALL.transformer.patch) for part in parts]
+        apart = torch.cat([encoder(one.attributes, one.opacities, one.plan) for one in alone])
+    torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-5)
+
+
+def test_a_dense_teacher_has_clusters_in_the_place_of_names(tmp_path: Path) -> None:
+    dataset, names = prepared(tmp_path, teacher=DenseSideTeacher())
+    rarity = dataset.load_rarity()
+    assert dataset.load_space()[1] is None
+    assert rarity.counts.sum() == sum(int((scene.weights > 0).sum()) for scene in dataset.scenes(names))
+    assert np.isfinite(samples(dataset, names)[0].targets.numpy()).all()
+
+
+def test_no_scenes_are_refused(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    with pytest.raises(InputError, match="no scenes"):
+        SampleDataset([], samples(*dataset).recipe)
+
+
+def test_views_that_see_nothing_are_named(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    data = samples(*dataset)
+    scene = data.scenes[0]
+    scene._header[0].cam_from_world[:, 2, 3] -= 1000  # Both cameras now stand behind the wall and look away.
+    data = SampleDataset([scene], replace(data.recipe, augmentation=AugmentConfig()))
+    with pytest.raises(InputError, match=r"scene wall_0: sample: no Gaussian"):
+        data[0]
+    scene._header[0].cam_from_world[:, 2, 3] += 1000

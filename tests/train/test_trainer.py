@@ -1,0 +1,236 @@
+"""The loop: it learns, it goes on after a kill, it does the same on several processes, and it stops before harm."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from training_scenes import SHORT, prepared, samples, small_encoder
+
+from gsencoder.errors import InputError
+from gsencoder.train.checkpoint import CHECKPOINT_FILE
+from gsencoder.train.log import LOG_FILE, read_log
+from gsencoder.train.losses import LossConfig
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.trainer import Trainer, TrainerConfig
+
+Prepared = tuple[PreparedDataset, list[str]]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    return prepared(tmp_path_factory.mktemp("prepared"))
+
+
+def trainer(dataset: Prepared, folder: Path, config: TrainerConfig = SHORT, **changes: object) -> Trainer:
+    folder.mkdir(exist_ok=True)
+    return Trainer(
+        small_encoder(), samples(*dataset), LossConfig(), config, folder=folder, settings={"run": 1}, **changes
+    )
+
+
+def losses(folder: Path) -> list[float]:
+    return [float(row["loss"]) for row in read_log(folder / LOG_FILE)]
+
+
+def test_training_brings_the_loss_down(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path, replace(SHORT, steps=40)).run()
+    curve = losses(tmp_path)
+    assert len(curve) == 40
+    assert np.mean(curve[-5:]) < 0.6 * np.mean(curve[:5])
+
+
+def test_a_rerun_gives_the_same_losses(dataset: Prepared, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        torch.manual_seed(len(name))
+        trainer(dataset, tmp_path / name).run()
+    assert losses(tmp_path / "a") == losses(tmp_path / "b")
+
+
+def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path / "whole").run()
+
+    def stop_at_five(steps: range, label: str):
+        for step in steps:
+            if step == 5:
+                raise KeyboardInterrupt
+            yield step
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(dataset, tmp_path / "cut").run(stop_at_five)
+    assert len(losses(tmp_path / "cut")) == 5
+    trainer(dataset, tmp_path / "cut").run()
+    assert losses(tmp_path / "cut") == losses(tmp_path / "whole")
+
+
+def test_rows_of_steps_that_are_done_again_are_taken_out_of_the_log(dataset: Prepared, tmp_path: Path) -> None:
+    first = trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9, steps=8))
+
+    def stop_at_five(steps: range, label: str):
+        for step in steps:
+            if step == 5:
+                raise KeyboardInterrupt
+            if step == 3:
+                first.save()
+            yield step
+
+    with pytest.raises(KeyboardInterrupt):
+        first.run(stop_at_five)
+    assert len(losses(tmp_path)) == 5  # Two rows more than the checkpoint has steps.
+    trainer(dataset, tmp_path).run()
+    assert [int(row["step"]) for row in read_log(tmp_path / LOG_FILE)] == list(range(8))
+
+
+def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path).run()
+    with pytest.raises(InputError, match=r"was made with run=1, and this run has 2"):
+        Trainer(small_encoder(), samples(*dataset), LossConfig(), SHORT, folder=tmp_path, settings={"run": 2})
+
+
+def test_micro_batches_add_up_to_the_batch(dataset: Prepared, tmp_path: Path) -> None:
+    """Two samples at once, or one after the other: the same sums, divided by the same counts."""
+    config = replace(SHORT, steps=4)
+    for name, batch, accumulate in (("at_once", 2, 1), ("in_turn", 1, 2)):
+        encoder = small_encoder()
+        for module in encoder.modules():
+            if hasattr(module, "share"):
+                module.share = 0.0  # What is dropped at random is drawn by micro-batch.
+        one = Trainer(
+            encoder,
+            samples(*dataset),
+            LossConfig(),
+            replace(config, batch=batch, accumulate=accumulate),
+            folder=_made(tmp_path / name),
+            settings={},
+        )
+        _fix_turns(encoder)
+        one.run()
+    np.testing.assert_allclose(losses(tmp_path / "at_once"), losses(tmp_path / "in_turn"), rtol=1e-4)
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _fix_turns(encoder: torch.nn.Module) -> None:
+    """Orders as in evaluation: their shuffle is drawn once a micro-batch."""
+    encoder.train = lambda mode=True: encoder  # type: ignore[method-assign,assignment]
+    encoder.eval = lambda: encoder  # type: ignore[method-assign,assignment]
+    for module in encoder.modules():
+        module.training = False
+
+
+def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the_scene(
+    dataset: Prepared, tmp_path: Path
+) -> None:
+    data = samples(*dataset)
+    one = Trainer(small_encoder(), data, LossConfig(), SHORT, folder=tmp_path, settings={})
+    before = {name: value.clone() for name, value in one.encoder.state_dict().items()}
+    for scene in data.scenes:
+        spoiled = scene._arrays["targets"].copy()
+        spoiled[:] = np.inf
+        scene.__dict__["_arrays"] = {**scene._arrays, "targets": spoiled}
+    with pytest.raises(
+        InputError, match=r"the field loss of wall_\d \((near, far|far, near)\) is not finite at step 0"
+    ):
+        one.run()
+    assert all(torch.equal(value, before[name]) for name, value in one.encoder.state_dict().items())
+    assert not (tmp_path / CHECKPOINT_FILE).exists()
+
+
+def test_a_gradient_that_is_not_finite_stops_the_run_too(dataset: Prepared, tmp_path: Path) -> None:
+    one = trainer(dataset, tmp_path)
+    one.encoder.head.weight.register_hook(lambda gradient: gradient * float("inf"))
+    with pytest.raises(InputError, match="the gradient of wall_"):
+        one.run()
+
+
+def test_the_learning_rate_rises_and_falls(dataset: Prepared, tmp_path: Path) -> None:
+    one = trainer(dataset, tmp_path, replace(SHORT, steps=100, warmup=10, learning_rate=1.0, final_rate=0.1))
+    rates = [one.rate_at(step) for step in range(100)]
+    assert rates[0] == pytest.approx(0.1)
+    assert max(rates) == pytest.approx(1.0, abs=1e-2)
+    assert rates[99] == pytest.approx(0.1, abs=1e-2)
+    assert all(np.diff(rates[10:]) < 0)
+
+
+def test_validation_is_asked_for_and_logged(dataset: Prepared, tmp_path: Path) -> None:
+    config = replace(SHORT, validate_every=4)
+    trainer(dataset, tmp_path, config, validate=lambda encoder, step: {"score": step / 8}).run()
+    rows = read_log(tmp_path / LOG_FILE)
+    assert [row.get("validation/score") for row in rows] == [None] * 3 + ["0.5"] + [None] * 3 + ["1.0"]
+
+
+def test_workers_are_spawned_and_make_the_same_samples(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path / "alone", replace(SHORT, steps=3)).run()
+    trainer(dataset, tmp_path / "helped", replace(SHORT, steps=3, workers=1)).run()
+    np.testing.assert_allclose(losses(tmp_path / "alone"), losses(tmp_path / "helped"), rtol=1e-5)
+
+
+SCRIPT = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from training_scenes import SHORT, samples, small_encoder
+from gsencoder.train.distributed import joined
+from gsencoder.train.losses import LossConfig
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.trainer import Trainer
+
+if __name__ == "__main__":
+    dataset = PreparedDataset(Path({prepared!r}), {{"made": "for a test"}})
+    names = {names!r}
+    with joined("cpu") as (place, device):
+        config = replace(SHORT, steps={steps}, accumulate={accumulate})
+        Trainer(small_encoder(), samples(dataset, names), LossConfig(), config, folder=Path({folder!r}),
+                settings={{}}, place=place, device=device).run()
+"""
+
+
+def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int) -> Path:
+    folder.mkdir(exist_ok=True)
+    path = folder / "run.py"
+    path.write_text(
+        SCRIPT.format(
+            tests=str(Path(__file__).resolve().parent.parent),
+            prepared=str(dataset[0].folder),
+            names=dataset[1],
+            steps=steps,
+            accumulate=accumulate,
+            folder=str(folder),
+        )
+    )
+    return path
+
+
+def test_two_processes_follow_the_losses_of_one(dataset: Prepared, tmp_path: Path) -> None:
+    alone = script(dataset, tmp_path / "one", steps=6, accumulate=2)
+    pair = script(dataset, tmp_path / "two", steps=6, accumulate=1)
+    subprocess.run([sys.executable, "-W", "ignore", str(alone)], check=True, timeout=300)
+    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run([*launcher, str(pair)], check=True, timeout=300, env=environment, capture_output=True)
+    np.testing.assert_allclose(losses(tmp_path / "two"), losses(tmp_path / "one"), rtol=1e-4)
+
+
+def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path) -> None:
+    whole = script(dataset, tmp_path / "whole", steps=60, accumulate=1)
+    cut = script(dataset, tmp_path / "cut", steps=60, accumulate=1)
+    subprocess.run([sys.executable, "-W", "ignore", str(whole)], check=True, timeout=300)
+    running = subprocess.Popen([sys.executable, "-W", "ignore", str(cut)])
+    log, deadline = tmp_path / "cut" / LOG_FILE, time.monotonic() + 120
+    while time.monotonic() < deadline and not (log.is_file() and len(log.read_text().splitlines()) > 10):
+        time.sleep(0.02)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    assert len(losses(tmp_path / "cut")) < 60
+    subprocess.run([sys.executable, "-W", "ignore", str(cut)], check=True, timeout=300)
+    assert losses(tmp_path / "cut") == losses(tmp_path / "whole")

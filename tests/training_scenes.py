@@ -1,0 +1,136 @@
+"""Small scenes with a teacher, prepared for training, that several test files stand on."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsencoder.data.augment import AugmentConfig
+from gsencoder.data.batch import SamplingConfig
+from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
+from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.train.losses import LossConfig
+from gsencoder.train.prepare import PrepareConfig, PreparedDataset
+from gsencoder.train.samples import SampleDataset, SampleRecipe
+from gsencoder.train.trainer import TrainerConfig
+from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
+
+TABLE = np.array([[0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]], np.float32)
+SPACE = FeatureSpace(name="sides", channels=4)
+SMALL = EncoderConfig(
+    voxel=0.1,
+    transformer=TransformerConfig(
+        encoder_depths=(1, 1),
+        encoder_channels=(16, 32),
+        decoder_depths=(1,),
+        decoder_channels=(16,),
+        head_channels=16,
+        patch=32,
+        drop_path=0.2,
+    ),
+)
+PREPARE = PrepareConfig(fusion=FuseConfig(basis=False), render_cell=4, render_min_weight=0.0)
+
+
+class SideTeacher:
+    """Says of every pixel whether it is in the left or the right half of its picture; a coded teacher."""
+
+    needs_images = False
+    cheap = True
+    table = TABLE
+    mean = TABLE.mean(axis=0)
+    space = SPACE
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        width, height = int(views.cameras.widths[view]), int(views.cameras.heights[view])
+        codes = np.where(np.arange(width) < width // 2, 1, 2).astype(np.int32)
+        return FeatureMap(
+            codes=np.broadcast_to(codes, (height, width)).copy(),
+            table=TABLE,
+            grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]),
+            space=SPACE,
+        )
+
+    def settings(self) -> dict[str, Any]:
+        return {"name": "sides"}
+
+
+class DenseSideTeacher(SideTeacher):
+    """The same as dense maps on cells of two pixels."""
+
+    table = None  # type: ignore[assignment]
+    mean = None  # type: ignore[assignment]
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        coded = super().feature_map(views, view)
+        assert coded.codes is not None
+        features = TABLE[coded.codes[::2, ::2]]
+        return FeatureMap(features=features, grid_from_image=np.array([[0.5, 0, 0], [0, 0.5, 0]]), space=SPACE)
+
+
+def scene(number: int, count: int = 400) -> Scene:
+    """A wall of Gaussians, red on the left and blue on the right, before two cameras."""
+    rng = np.random.default_rng(number)
+    means = rng.uniform((-1, -1, 2.9), (1, 1, 3.1), (count, 3)).astype(np.float32)
+    left = means[:, 0] < 0
+    quats = rng.normal(size=(count, 4))
+    poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    poses[1, 2, 3] = 0.2
+    cameras = Cameras(
+        cam_from_world=poses,
+        Ks=np.tile(np.array([[40, 0, 24], [0, 40, 20], [0, 0, 1]], np.float32), (2, 1, 1)),
+        widths=np.full(2, 48, np.int32),
+        heights=np.full(2, 40, np.int32),
+    )
+    gaussians = Gaussians(
+        means=means,
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=np.full((count, 3), 0.06, np.float32),
+        opacities=np.full(count, 0.9, np.float32),
+        sh=np.where(left[:, None, None], [[[1.5, -1, -1]]], [[[-1, -1, 1.5]]]).astype(np.float32),
+    )
+    views = Views(cameras=cameras, names=("near", "far"))
+    return Scene(name=f"wall_{number}", gaussians=gaussians, views=views, metres_per_unit=1.0)
+
+
+def prepared(folder: Path, *, count: int = 3, teacher: Teacher | None = None) -> tuple[PreparedDataset, list[str]]:
+    """Some scenes, prepared in a folder."""
+    teacher = teacher or SideTeacher()  # type: ignore[assignment]
+    assert teacher is not None
+    dataset = PreparedDataset(folder, {"made": "for a test"})
+    names = [f"wall_{number}" for number in range(count)]
+    chosen: Teacher = teacher
+    dataset.find_space([Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
+    for number in range(count):
+        dataset.prepare(scene(number), teacher, PREPARE)
+    dataset.find_rarity(names, lambda items, label: items)
+    return dataset, names
+
+
+def samples(dataset: PreparedDataset, names: Sequence[str], **changes: Any) -> SampleDataset:
+    """Samples of prepared scenes."""
+    recipe = {
+        "encoder": SMALL,
+        "sampling": SamplingConfig(views=2, gaussians=200),
+        "augmentation": AugmentConfig(turn=10.0),
+        "losses": LossConfig(),
+        "rarity": dataset.load_rarity(),
+        "seed": 3,
+    }
+    return SampleDataset(dataset.scenes(names), SampleRecipe(**{**recipe, **changes}))
+
+
+def small_encoder(channels: int = 4) -> GaussianEncoder:
+    """The same parameters every time."""
+    import torch
+
+    torch.manual_seed(0)
+    return GaussianEncoder(SMALL, channels)
+
+
+SHORT = TrainerConfig(
+    steps=8, learning_rate=3e-3, warmup=2, log_every=1, validate_every=0, precision="float32", checkpoint_every=0.0
+)
