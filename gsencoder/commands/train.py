@@ -1,7 +1,7 @@
 """`gsencoder train SCENE… out=FOLDER`: distil a teacher into an encoder that needs neither photographs nor teacher."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import partial
@@ -37,8 +37,11 @@ from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
 from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe
-from gsencoder.train.trainer import Trainer, TrainerConfig
+from gsencoder.train.trainer import Trainer, TrainerConfig, Validated
 from gsencoder.types import Scene
+
+SHOWN_SCENES = 3
+"""Held-out scenes of which a view is drawn at every validation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,21 +119,25 @@ def run(config: TrainConfig, summary: Summary) -> None:
             place=place,
             device=device,
             tensorboard=config.tensorboard,
-            validate=partial(_validate, validation, outputs, kinds, config) if validation else None,
+            validate=partial(_validate, validation, outputs, kinds, config),
         )
         with summary.step("train"):
             done = trainer.run(track)
         if not place.first:
             return
         with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-            scores = _validate(validation, outputs, kinds, config, encoder, done.step) if validation else {}
+            judged = trainer.validated
+            if judged is None:  # A run that had been cut off after its last step.
+                judged = _validate(validation, outputs, kinds, config, encoder, done.step)
+            scores = dict(judged.scores)
             made_by = {"settings": settings(config), "steps": done.step, "seconds": done.seconds, "validation": scores}
             save_weights(folder / WEIGHTS_FILE, encoder, outputs, made_by, dtype=config.store)
             if words is not None:
                 save_text_table(folder / WORDS_FILE, words)
             shutil.copy(work / LOG_FILE, folder / LOG_FILE)
-            if config.tensorboard:
-                shutil.copytree(work / EVENTS_FOLDER, folder / EVENTS_FOLDER)
+            for name in (EVENTS_FOLDER, "validation"):
+                if (work / name).is_dir():
+                    shutil.copytree(work / name, folder / name)
             summary.results.update(
                 steps=done.step,
                 seconds=done.seconds,
@@ -215,10 +222,13 @@ def _validate(
     config: TrainConfig,
     encoder: GaussianEncoder,
     step: int,  # noqa: ARG001
-) -> Mapping[str, float]:
+) -> Validated:
+    if not scenes:
+        return Validated({})
     encoding = EncodeConfig(precision=config.train.precision, device=config.device)
-    found = naming(scenes, encoder, outputs, codebook, encoding)
-    return {"names": found.score, "cosine": found.cosine}
+    found = naming(scenes, encoder, outputs, codebook, encoding, shown=SHOWN_SCENES)
+    pictures = {} if found.sheet is None else {"features": found.sheet}
+    return Validated({"names": found.score, "cosine": found.cosine}, pictures)
 
 
 def _identity(config: TrainConfig) -> dict[str, Any]:

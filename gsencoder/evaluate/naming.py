@@ -9,11 +9,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+import torch
+from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.infer.pictures import contact_sheet, fit_pca_colors, pca_picture
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.render import blend
+from gsencoder.render.rgb import render_image
 from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.rarity import nearest_codes
 
@@ -29,11 +33,13 @@ class Naming:
         total: for each row, Gaussians that have this target.
         cosine: mean cosine of predicted and fused features, about the space's mean, over named Gaussians: those whose
             target is at least half a typical distance from it.
+        sheet: for the first scenes one view in colour, its fused and its predicted features; None where not asked for.
     """
 
     right: Float64[np.ndarray, " C"]
     total: Float64[np.ndarray, " C"]
     cosine: float
+    sheet: UInt8[np.ndarray, "H W 3"] | None = None
 
     def accuracies(self) -> Float64[np.ndarray, " C"]:
         """Share told right of each kind; NaN where there is none."""
@@ -61,6 +67,7 @@ def naming(
     codebook: Float32[np.ndarray, "C channels"],
     config: EncodeConfig = EncodeConfig(),
     *,
+    shown: int = 0,
     track: Track = lambda items, label: items,  # noqa: ARG005
 ) -> Naming:
     """Encodes prepared scenes and counts.
@@ -71,8 +78,11 @@ def naming(
         outputs: what its numbers mean.
         codebook: the kinds of target, in standard units.
         config: how scenes are encoded.
+        shown: scenes of which a view is drawn.
         track: wraps the loop over scenes to show progress.
     """
+    pictures: list[np.ndarray] = []
+    titles: list[str] = []
     right, total = np.zeros(len(codebook)), np.zeros(len(codebook))
     cosines, count = 0.0, 0
     for scene in track(scenes, "validation"):
@@ -81,6 +91,9 @@ def naming(
         found = encode(everything, encoder, outputs, config, metres_per_unit=scene.metres_per_unit or 1.0)
         predicted = outputs.standardize(found.features[seen])
         targets = scene.targets(seen)
+        if len(pictures) < 3 * shown:
+            pictures += view_pictures(scene, seen, targets, predicted)
+            titles += [f"{scene.name}: {what}" for what in ("colours", "fused", "predicted")]
         truth = nearest_codes(codebook, targets)
         choices = np.unique(truth)
         guess = nearest_names(predicted, codebook, choices)
@@ -92,4 +105,23 @@ def naming(
         norms = lengths[named] * np.sqrt(np.square(predicted[named]).sum(axis=1) + 1e-12)
         cosines += float((dots / norms).sum())
         count += int(named.sum())
-    return Naming(right=right, total=total, cosine=cosines / max(count, 1))
+    sheet = contact_sheet(pictures, titles, columns=3, width=400) if pictures else None
+    return Naming(right=right, total=total, cosine=cosines / max(count, 1), sheet=sheet)
+
+
+def view_pictures(
+    scene: PreparedScene,
+    rows: Int64[np.ndarray, " n"],
+    targets: Float32[np.ndarray, "n channels"],
+    predicted: Float32[np.ndarray, "n channels"],
+) -> list[UInt8[np.ndarray, "H W 3"]]:
+    """The middle view of a scene: its colours, its targets, and what was predicted, in the same false colours."""
+    gaussians = scene.gaussians(rows)
+    view = len(scene.cameras) // 2
+    b = blend(gaussians, scene.cameras, view)
+    colors = fit_pca_colors(targets)
+    found = [render_image(gaussians, scene.cameras, view, blended=b)]
+    for features in (targets, predicted):
+        rendered = b.render(torch.from_numpy(features)).numpy()
+        found.append(pca_picture(rendered.reshape(*b.shape, -1), colors, b.alpha.reshape(b.shape).numpy()))
+    return found

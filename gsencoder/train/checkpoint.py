@@ -23,12 +23,10 @@ class Progress:
     Attributes:
         step: steps that are done.
         seconds: that they took.
-        best: best validation score so far; None where there was none.
     """
 
     step: int = 0
     seconds: float = 0.0
-    best: float | None = None
 
 
 def save_checkpoint(
@@ -54,7 +52,7 @@ def save_checkpoint(
     for name, parameter in model.named_parameters():
         for key, value in optimizer.state.get(parameter, {}).items():
             arrays[f"optimizer.{key}.{name}"] = value.detach().float().cpu().numpy()
-    header = {"step": progress.step, "seconds": progress.seconds, "best": progress.best, "settings": settings}
+    header = {"step": progress.step, "seconds": progress.seconds, "settings": settings}
     write_archive(path, arrays, header)
 
 
@@ -90,7 +88,6 @@ def load_checkpoint(
         progress = Progress(
             step=file.value("step", int),
             seconds=float(file.value("seconds", float, int)),
-            best=file.value("best", float, int, None),
         )
     model.load_state_dict(state)
     for parameter, values in moments.items():

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from gsencoder.errors import InputError
 
@@ -63,7 +64,17 @@ class Log:
                 self._writer.add_scalar(name, value, step)
 
     def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
-        """A picture uint8 [H, W, 3], for TensorBoard alone."""
+        """A picture uint8 [H, W, 3]: a file `NAME_STEP.png` beside the log, and for TensorBoard.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        path = self.path.parent / f"{name}_{step:06d}.png"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(pixels).save(path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot write: {error.strerror or error}") from error
         if self._writer is not None:
             self._writer.add_image(name, pixels, step, dataformats="HWC")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -60,7 +60,19 @@ class TrainerConfig:
             raise InputError(f"final_rate: expected a share in [0, 1], got {self.final_rate}")
 
 
-Validation = Callable[[GaussianEncoder, int], Mapping[str, float]]
+class Validated(NamedTuple):
+    """What a validation found.
+
+    Attributes:
+        scores: by name.
+        pictures: uint8 [H, W, 3], by name.
+    """
+
+    scores: Mapping[str, float]
+    pictures: Mapping[str, np.ndarray] = {}
+
+
+Validation = Callable[[GaussianEncoder, int], Validated]
 Track = Callable[[range, str], Iterator[int]]
 
 
@@ -93,8 +105,7 @@ class Trainer:
             place: of this process.
             device: of this process.
             tensorboard: whether to write events.
-            validate: scores of the encoder after a step, "score" being what is best when largest; asked of the first
-                process alone.
+            validate: judges the encoder after a step; asked of the first process alone.
 
         Raises:
             InputError: the folder holds another run.
@@ -106,6 +117,7 @@ class Trainer:
             _groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
         )
         self.progress = Progress()
+        self.validated: Validated | None = None
         if (folder / CHECKPOINT_FILE).is_file():
             self.progress = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
         self._log = Log(folder, first_step=self.progress.step, events=tensorboard) if place.first else None
@@ -137,7 +149,7 @@ class Trainer:
                 recent = []
             if done == config.steps or (config.validate_every and done % config.validate_every == 0):
                 row |= self._validated(done)
-            self.progress = Progress(step=done, seconds=time.monotonic() - start, best=self.progress.best)
+            self.progress = Progress(step=done, seconds=time.monotonic() - start)
             if row and self._log is not None:
                 self._log.add(step, row | {"seconds": self.progress.seconds})
             if time.monotonic() - saved >= config.checkpoint_every or done == config.steps:
@@ -233,9 +245,12 @@ class Trainer:
 
     def _validated(self, done: int) -> dict[str, float]:
         scores: dict[str, float] = {}
-        if self.validate is not None and self.place.first:
+        if self.validate is not None and self._log is not None:
             self.encoder.eval()
-            scores = {f"validation/{name}": float(value) for name, value in self.validate(self.encoder, done).items()}
+            self.validated = found = self.validate(self.encoder, done)
+            scores = {f"validation/{name}": float(value) for name, value in found.scores.items()}
+            for name, pixels in found.pictures.items():
+                self._log.picture(done, f"validation/{name}", pixels)
         wait_for_all()
         return scores
 

@@ -88,7 +88,7 @@ def cameras(count: int) -> Cameras:
 
 def cloud(count: int = 1000, places: int = 1) -> np.ndarray:
     """Points before the first cameras of a row."""
-    points = RNG(0).uniform(-1, 1, (count, 3)) + (0, 0, 3)
+    points = RNG(0).uniform(-1, 1, (count, 3)) + np.array([0, 0, 3])
     points[:, 0] += 10 * (np.arange(count) % places)
     return points.astype(np.float32)
 

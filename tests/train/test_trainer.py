@@ -18,7 +18,7 @@ from gsencoder.train.checkpoint import CHECKPOINT_FILE
 from gsencoder.train.log import LOG_FILE, read_log
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.trainer import Trainer, TrainerConfig
+from gsencoder.train.trainer import Trainer, TrainerConfig, Validated
 
 Prepared = tuple[PreparedDataset, list[str]]
 
@@ -162,8 +162,10 @@ def test_the_learning_rate_rises_and_falls(dataset: Prepared, tmp_path: Path) ->
 
 
 def test_validation_is_asked_for_and_logged(dataset: Prepared, tmp_path: Path) -> None:
-    config = replace(SHORT, validate_every=4)
-    trainer(dataset, tmp_path, config, validate=lambda encoder, step: {"score": step / 8}).run()
+    config, grey = replace(SHORT, validate_every=4), np.full((4, 6, 3), 128, np.uint8)
+    validate = lambda encoder, step: Validated({"score": step / 8}, {"sheet": grey})  # noqa: E731
+    trainer(dataset, tmp_path, config, validate=validate).run()
+    assert sorted(path.name for path in (tmp_path / "validation").iterdir()) == ["sheet_000004.png", "sheet_000008.png"]
     rows = read_log(tmp_path / LOG_FILE)
     assert [row.get("validation/score") for row in rows] == [None] * 3 + ["0.5"] + [None] * 3 + ["1.0"]
 

@@ -1,0 +1,206 @@
+"""What an encoder costs: time and memory by size, beside its matrix products alone, its plan, and the parts of a step.
+
+    python bench/encoder.py [--model tiny|small|base] [--sizes 10000,100000] [--precision float32|bfloat16]
+    python bench/encoder.py --chunked 1000000
+
+Splats are seeds of a long random floor with things on it, at the spacing that the encoder's grid expects. Every figure
+is the best of several runs in this process; ratios are of times taken in turn.
+"""
+
+import argparse
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gsencoder.commands.train import TrainConfig
+from gsencoder.compose import compose
+from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
+from gsencoder.models.heap import keep_heap
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.precision import autocast_dtype
+from gsencoder.train.losses import LossConfig, match_loss
+from gsencoder.types import FeatureSpace, Gaussians
+
+CHANNELS = 64
+PRODUCTS = ("mm", "addmm", "bmm", "_scaled_dot_product_flash_attention_for_cpu", "scaled_dot_product_attention")
+
+
+def surface(count: int, voxel: float = 0.02) -> Gaussians:
+    """A floor of one Gaussian a cell, with boxes on it: as many neighbours as scans of rooms have."""
+    rng = np.random.default_rng(0)
+    side = int(np.sqrt(count / 1.6)) + 1
+    x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+    height = np.zeros((side, side))
+    for _ in range(max(1, side * side // 900)):
+        i, j, w, h = rng.integers(0, side), rng.integers(0, side), rng.integers(4, 16), rng.integers(3, 25)
+        height[i : i + w, j : j + w] = h
+    points = [np.stack((x, y, height), axis=-1).reshape(-1, 3)]
+    for axis in range(2):
+        step = np.diff(height, axis=axis, append=0)
+        for i, j in np.argwhere(np.abs(step) > 1):
+            low, high = sorted((height[i, j], height[i, j] + step[i, j]))
+            levels = np.arange(low + 1, high)
+            points.append(np.stack((np.full(len(levels), i), np.full(len(levels), j), levels), axis=-1))
+    means = np.concatenate(points)[:count] if len(np.concatenate(points)) >= count else np.concatenate(points)
+    means = ((means + rng.uniform(0.2, 0.8, means.shape)) * voxel).astype(np.float32)
+    n = len(means)
+    quats = rng.normal(size=(n, 4))
+    return Gaussians(
+        means=means,
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=np.tile(np.array([0.011, 0.011, 0.0011], np.float32), (n, 1)),
+        opacities=np.full(n, 0.95, np.float32),
+        sh=rng.normal(size=(n, 1, 3)).astype(np.float32),
+    )
+
+
+def best(run: Callable[[], Any], times: int = 5) -> float:
+    """Seconds of the fastest of several runs, after one that is not counted."""
+    run()
+    found = []
+    for _ in range(times):
+        start = time.perf_counter()
+        run()
+        found.append(time.perf_counter() - start)
+    return min(found)
+
+
+class Recorded(TorchDispatchMode):
+    """Notes the matrix products of a forward pass, so that they can be done again alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.products: list[tuple[Any, tuple[Any, ...], dict[str, Any]]] = []
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = function.overloadpacket.__name__
+        if name in PRODUCTS:
+
+            def copy(value: Any) -> Any:
+                return value.detach().clone() if isinstance(value, torch.Tensor) else value
+
+            own = {key: copy(value) for key, value in (kwargs or {}).items()}
+            self.products.append((function, tuple(copy(value) for value in args), own))
+        return function(*args, **(kwargs or {}))
+
+
+def measure(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
+    """The figures of one size."""
+    splat = surface(size)
+    encoder = GaussianEncoder(config.model, CHANNELS).eval()
+    dtype = autocast_dtype(precision, torch.device("cpu"))  # type: ignore[arg-type]
+    voxel = config.model.voxel
+
+    def plan() -> Any:
+        return encoder_inputs(splat, config.model, voxel)
+
+    attributes, opacities, cloud = plan()
+    joined = encoder.join([cloud], round_up=dtype is not None)
+
+    def forward() -> None:
+        with torch.inference_mode(), torch.autocast("cpu", dtype, enabled=dtype is not None):
+            encoder(attributes, opacities, joined)
+
+    recorded = Recorded()
+    with torch.no_grad(), torch.autocast("cpu", dtype, enabled=dtype is not None), recorded:
+        encoder(attributes, opacities, joined)
+
+    def products() -> None:
+        with torch.inference_mode():
+            for function, args, kwargs in recorded.products:
+                function(*args, **kwargs)
+
+    seconds = {"gaussians": len(splat), "tokens": joined.items[0]}
+    seconds["products"], seconds["forward"] = best(products), best(forward)
+    seconds["plan"] = best(lambda: encoder.join([plan()[2]], round_up=dtype is not None), 3)
+    return seconds
+
+
+def step_parts(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
+    """Seconds of plan, forward, loss and backward of a training step."""
+    splat = surface(size)
+    encoder = GaussianEncoder(config.model, CHANNELS).train()
+    optimizer = torch.optim.AdamW(encoder.parameters(), lr=1e-3, fused=True)
+    dtype = autocast_dtype(precision, torch.device("cpu"))  # type: ignore[arg-type]
+    target = torch.randn(len(splat), CHANNELS)
+    parts: dict[str, list[float]] = {}
+    for _ in range(6):
+        marks = [time.perf_counter()]
+        attributes, opacities, cloud = encoder_inputs(splat, config.model, config.model.voxel)
+        joined = encoder.join([cloud], round_up=True)
+        marks.append(time.perf_counter())
+        with torch.autocast("cpu", dtype, enabled=dtype is not None):
+            found = encoder(attributes, opacities, joined)
+        marks.append(time.perf_counter())
+        loss = match_loss(found, target, LossConfig()).mean()
+        marks.append(time.perf_counter())
+        loss.backward()
+        marks.append(time.perf_counter())
+        optimizer.step()
+        optimizer.zero_grad()
+        marks.append(time.perf_counter())
+        for name, first, last in zip(
+            ("plan", "forward", "loss", "backward", "optimizer"), marks, marks[1:], strict=False
+        ):
+            parts.setdefault(name, []).append(last - first)
+    return {name: min(values[1:]) for name, values in parts.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", default="tiny")
+    parser.add_argument("--sizes", default="10000,30000,100000,300000")
+    parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
+    parser.add_argument("--patch", type=int, default=0)
+    parser.add_argument("--chunked", type=int, default=0)
+    parser.add_argument("--chunk", type=int, default=250_000)
+    chosen = parser.parse_args()
+    keep_heap()
+    config = compose("train", TrainConfig, ["scene", f"model={chosen.model}"])
+    if chosen.patch:
+        shape = replace(config.model.transformer, patch=chosen.patch)
+        config = replace(config, model=replace(config.model, transformer=shape))
+    if chosen.chunked:
+        splat = surface(chosen.chunked)
+        outputs = OutputSpace(
+            space=FeatureSpace(name="s", channels=CHANNELS), mean=np.zeros(CHANNELS, np.float32), scale=1.0
+        )
+        start = time.perf_counter()
+        encode(
+            splat,
+            GaussianEncoder(config.model, CHANNELS),
+            outputs,
+            EncodeConfig(chunk=chosen.chunk, precision=chosen.precision),
+        )
+        took = time.perf_counter() - start
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+        print(f"{len(splat):,} Gaussians in chunks of {chosen.chunk:,}: {took:.1f} s, {peak:.2f} GiB at most")
+        return
+    rows = []
+    for size in map(int, chosen.sizes.split(",")):
+        row = measure(config, size, chosen.precision)
+        rows.append(row)
+        print(
+            f"{row['gaussians']:>9,} Gaussians {row['tokens']:>9,} tokens: products {row['products']:.3f} s, forward "
+            f"{row['forward']:.3f} s ({row['forward'] / row['products']:.2f}×), plan {row['plan']:.3f} s "
+            f"({row['plan'] / row['forward']:.1%} of the forward)",
+            flush=True,
+        )
+    if len(rows) > 1:
+        sizes, times = (np.log([row[name] for row in rows]) for name in ("tokens", "forward"))
+        exponent = np.polyfit(sizes, times, 1)[0]
+        slope = rows[-1]["forward"] / rows[-1]["tokens"] * 1e6
+        print(f"forward grows as tokens^{exponent:.2f}, {slope:.2f} µs a token at the largest")
+    parts = step_parts(config, min(30_000, int(rows[-1]["gaussians"])), chosen.precision)
+    print("a step of 30,000: " + ", ".join(f"{name} {seconds:.3f} s" for name, seconds in parts.items()))
+
+
+if __name__ == "__main__":
+    main()
