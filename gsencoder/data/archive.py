@@ -108,12 +108,17 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     metadata = {"gsencoder": json.dumps({"version": VERSION, **header})}
     try:
-        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, metadata)
+        save_file({name: _contiguous(array) for name, array in arrays.items()}, temporary, metadata)
         os.replace(temporary, path)
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _contiguous(array: np.ndarray) -> np.ndarray:
+    """The array in one piece, of the same shape; numpy's own function makes a number a list of one."""
+    return np.ascontiguousarray(array).reshape(array.shape)
 
 
 @contextmanager

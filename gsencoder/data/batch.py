@@ -23,6 +23,9 @@ class SamplingConfig:
     )
     views: int = field(default=4, metadata={"help": "target views of a sample; render losses are taken in them"})
     gaussians: int = field(default=30_000, metadata={"help": "most Gaussians of a sample, nearest first; 0 = all"})
+    smallest: int = field(
+        default=4_000, metadata={"help": "crops are of sizes from this up to the most, in equal ratios; 0 = all of one"}
+    )
     rare_centers: float = field(
         default=0.8, metadata={"help": "share of crops whose centre is of any kind of target alike, not just anywhere"}
     )
@@ -32,6 +35,8 @@ class SamplingConfig:
             raise InputError(f"views: expected at least 1 target view, got {self.views}")
         if self.gaussians < 0:
             raise InputError(f"gaussians: expected 0 (all) or more, got {self.gaussians}")
+        if self.smallest < 0:
+            raise InputError(f"smallest: expected 0 (crops of one size) or more, got {self.smallest}")
         if not 0 <= self.rare_centers <= 1:
             raise InputError(f"rare_centers: expected a share in [0, 1], got {self.rare_centers}")
 
@@ -94,16 +99,20 @@ def choose_part(
         views = rng.permutation(len(cameras))[: config.views]
         rows = np.arange(len(means)) if everywhere else np.flatnonzero(in_frusta(means, cameras.select(views)))
     else:
+        count = config.gaussians
+        if 0 < config.smallest < count:
+            # Small crops show small things often; large ones show what a door or a sofa can be told by.
+            count = round(config.smallest * (count / config.smallest) ** rng.random())
         center = means[_draw(chances, config, rng)]
         looking = [view for view in range(len(cameras)) if in_frusta(center[None], cameras.select([view]))[0]]
         views = rng.permutation(looking or len(cameras))[: config.views]
-        rows = nearest(means, center, len(means) if everywhere else _AROUND * config.gaussians)
+        rows = nearest(means, center, len(means) if everywhere else _AROUND * count)
         if not everywhere:
             chosen = cameras.select(views)
             rows = rows[in_frusta(means[rows], chosen)]
-            if len(rows) < config.gaussians:
+            if len(rows) < count:
                 rows = np.flatnonzero(in_frusta(means, chosen))
-        rows = rows[nearest(means[rows], center, config.gaussians)]
+        rows = rows[nearest(means[rows], center, count)]
     if not len(rows):
         raise InputError("sample: no Gaussian lies in the frusta of the chosen views; check poses and units")
     return tuple(int(view) for view in views), rows

@@ -6,6 +6,7 @@ the arithmetic. Kept on one heap, the same step runs two to five times as fast.
 """
 
 import ctypes
+import os
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 _KEPT = (1 << 31) - 1
@@ -14,8 +15,11 @@ _KEPT = (1 << 31) - 1
 def keep_heap() -> bool:
     """Lets this process keep what it frees, from now on; whether the system's C library knows how (glibc does).
 
-    The process then holds as much memory as it once needed. Meant for commands, which own their process.
+    The process then holds as much memory as it once needed. Meant for commands, which own their process; to be called
+    before the first network runs, since oneDNN looks once how many compiled products it may keep (1,024 unless told:
+    too few for the sizes that occur in a training).
     """
+    os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):

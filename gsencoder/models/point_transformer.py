@@ -80,7 +80,7 @@ class PointTransformer(nn.Module):
         self.config = config
         down, up = config.encoder_channels, config.decoder_channels
         blocks_down = sum(config.encoder_depths)
-        rates = torch.linspace(0, config.drop_path, max(blocks_down, 1)).tolist()
+        rates = [config.drop_path * block / max(blocks_down - 1, 1) for block in range(blocks_down)]
         self.down = nn.ModuleList()
         for level, depth in enumerate(config.encoder_depths):
             begin = sum(config.encoder_depths[:level])

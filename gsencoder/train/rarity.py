@@ -49,7 +49,7 @@ def nearest_codes(
 
 
 def count_targets(
-    scenes: Iterable[Float32[np.ndarray, "n channels"]], codebook: Float32[np.ndarray, "C channels"]
+    scenes: Iterable[Float32[np.ndarray, "_n channels"]], codebook: Float32[np.ndarray, "C channels"]
 ) -> Rarity:
     """Counts the targets of a dataset, scene by scene."""
     counts = np.zeros(len(codebook))

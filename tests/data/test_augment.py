@@ -13,7 +13,7 @@ from gsencoder.errors import InputError
 from gsencoder.geometry import SH_C0, colors_from_sh, covariances
 from gsencoder.types import Gaussians
 
-NOTHING = AugmentConfig(turn=0, tilt=0, mirror=0, scale=0, jitter=0, drop=0, light=0, tint=0, noise=0)
+NOTHING = AugmentConfig(turn=0.0, tilt=0.0, mirror=0.0, scale=0.0, jitter=0.0, drop=0.0, light=0.0, tint=0.0, noise=0.0)
 
 
 def splat(count: int = 30, degree: int = 3) -> Gaussians:

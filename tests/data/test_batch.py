@@ -104,7 +104,7 @@ def test_without_a_limit_a_sample_is_all_that_its_views_see() -> None:
 def test_the_views_of_a_crop_look_at_its_centre() -> None:
     points, row = cloud(1000, 4), cameras(4)
     for seed in range(8):
-        config = SamplingConfig(views=2, gaussians=50)
+        config = SamplingConfig(views=2, gaussians=50, smallest=0)
         views, rows = choose_part(points, row, np.ones(1000, np.float32), config, RNG(seed))
         assert len(views) == 1  # No other camera of the row sees the same place.
         assert len(rows) == 50
@@ -160,7 +160,17 @@ def test_thinning_out_leaves_something(count: int, most: float, seed: int) -> No
     assert np.isin(kept, rows).all()
 
 
-@pytest.mark.parametrize("change", [{"views": 0}, {"gaussians": -1}, {"rare_centers": 1.2}])
+def test_crops_are_of_sizes_in_equal_ratios() -> None:
+    config = SamplingConfig(views=1, gaussians=400, smallest=25, scope="scene")
+    sizes = [
+        len(choose_part(cloud(), cameras(1), np.ones(1000, np.float32), config, RNG(seed))[1]) for seed in range(99)
+    ]
+    assert min(sizes) >= 25
+    assert max(sizes) <= 400
+    assert 70 < np.median(sizes) < 140  # 100 is as far from 25 as from 400.
+
+
+@pytest.mark.parametrize("change", [{"views": 0}, {"gaussians": -1}, {"rare_centers": 1.2}, {"smallest": -5}])
 def test_sizes_out_of_range_are_refused(change: dict) -> None:
     with pytest.raises(InputError, match=next(iter(change))):
         replace(SamplingConfig(), **change)

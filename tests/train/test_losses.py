@@ -119,7 +119,7 @@ def test_weights_out_of_range_are_refused(change: dict) -> None:
 
 def test_no_loss_at_all_is_refused() -> None:
     with pytest.raises(InputError, match="no loss left"):
-        LossConfig(field_weight=0, render_weight=0)
+        LossConfig(field_weight=0.0, render_weight=0.0)
 
 
 def test_units_of_numpy_and_torch_agree() -> None:

@@ -58,7 +58,7 @@ def test_what_is_prepared_is_not_prepared_again(tmp_path: Path) -> None:
     dataset, names = prepared(tmp_path, count=2)
     before = dataset.path_of(names[0]).stat().st_mtime_ns
     again = PreparedDataset(tmp_path, {"made": "for a test"})
-    again.find_space([], None, PREPARE)  # type: ignore[arg-type]
+    again.find_space([], lambda path: (scene(0), SideTeacher()), PREPARE)
     again.find_rarity([], lambda items, label: items)
     assert dataset.path_of(names[0]).stat().st_mtime_ns == before
 

@@ -13,7 +13,7 @@ from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_en
 from gsencoder.data.augment import AugmentConfig
 from gsencoder.data.batch import SamplingConfig
 from gsencoder.errors import InputError
-from gsencoder.render import blend
+from gsencoder.render import BlendConfig, blend
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared import ViewRows
@@ -92,7 +92,8 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     found = data[0]
     scene = next(scene for scene in data.scenes if found.name.startswith(scene.name))
     view = scene.view_names.index(found.name.split("(")[1].rstrip(")"))
-    b = blend(scene.gaussians(np.arange(len(scene))), scene.cameras, view, patch=4)
+    config = BlendConfig(rays_per_patch=16)  # One a pixel.
+    b = blend(scene.gaussians(np.arange(len(scene))), scene.cameras, view, patch=4, config=config)
     ours = found.rows.blend(len(scene))
     opaque = b.alpha >= 0.5
     assert ours.rows == int(opaque.sum())

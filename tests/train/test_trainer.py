@@ -131,6 +131,8 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
     dataset: Prepared, tmp_path: Path
 ) -> None:
     data = samples(*dataset)
+    for number in range(len(data.scenes)):
+        data[number]  # Kinds of targets are looked up once, and here before they are spoiled.
     one = Trainer(small_encoder(), data, LossConfig(), SHORT, folder=tmp_path, settings={})
     before = {name: value.clone() for name, value in one.encoder.state_dict().items()}
     for scene in data.scenes:
