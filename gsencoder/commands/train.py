@@ -106,6 +106,7 @@ def run(config: TrainConfig, summary: Summary) -> None:
             losses=config.loss,
             rarity=rarity,
             seed=config.train.seed,
+            step_samples=config.train.batch * config.train.accumulate * place.size,
         )
         validation = dataset.scenes([path.name for path in held_out])
         kinds = codebook if codebook is not None else rarity.codebook

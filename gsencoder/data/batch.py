@@ -68,11 +68,20 @@ def nearest(means: Float32[np.ndarray, "n 3"], center: Float32[np.ndarray, "3"],
     return np.sort(np.argpartition(distances, count)[:count])
 
 
+def crop_size(config: SamplingConfig, rng: np.random.Generator) -> int:
+    """How many Gaussians a crop holds at most; 0 = all. Small crops show small things often; large ones show what a
+    door or a sofa can be told by."""
+    if not 0 < config.smallest < config.gaussians:
+        return config.gaussians
+    return round(config.smallest * (config.gaussians / config.smallest) ** rng.random())
+
+
 def choose_part(
     means: Float32[np.ndarray, "N 3"],
     cameras: Cameras,
     chances: Float32[np.ndarray, " N"],
     config: SamplingConfig,
+    size: int,
     rng: np.random.Generator,
 ) -> tuple[tuple[int, ...], Int64[np.ndarray, " n"]]:
     """Target views, and the rows of the sample that is cut for them.
@@ -86,6 +95,7 @@ def choose_part(
         cameras: of all its views.
         chances: of each Gaussian to be the centre of a crop; 0 = has no target, and never is.
         config: see there.
+        size: most Gaussians (`crop_size`); 0 = all.
         rng: everything random comes from it.
 
     Returns:
@@ -95,24 +105,20 @@ def choose_part(
         InputError: no Gaussian lies in any frustum of the drawn views.
     """
     everywhere = config.scope == "scene"
-    if not 0 < config.gaussians < len(means):
+    if not 0 < size < len(means):
         views = rng.permutation(len(cameras))[: config.views]
         rows = np.arange(len(means)) if everywhere else np.flatnonzero(in_frusta(means, cameras.select(views)))
     else:
-        count = config.gaussians
-        if 0 < config.smallest < count:
-            # Small crops show small things often; large ones show what a door or a sofa can be told by.
-            count = round(config.smallest * (count / config.smallest) ** rng.random())
         center = means[_draw(chances, config, rng)]
         looking = [view for view in range(len(cameras)) if in_frusta(center[None], cameras.select([view]))[0]]
         views = rng.permutation(looking or len(cameras))[: config.views]
-        rows = nearest(means, center, len(means) if everywhere else _AROUND * count)
+        rows = nearest(means, center, len(means) if everywhere else _AROUND * size)
         if not everywhere:
             chosen = cameras.select(views)
             rows = rows[in_frusta(means[rows], chosen)]
-            if len(rows) < count:
+            if len(rows) < size:
                 rows = np.flatnonzero(in_frusta(means, chosen))
-        rows = rows[nearest(means[rows], center, count)]
+        rows = rows[nearest(means[rows], center, size)]
     if not len(rows):
         raise InputError("sample: no Gaussian lies in the frusta of the chosen views; check poses and units")
     return tuple(int(view) for view in views), rows

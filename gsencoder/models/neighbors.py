@@ -31,15 +31,15 @@ def neighbor_table(cells: Int64[Tensor, "N 3"]) -> Int32[Tensor, "N 27"]:
     # Two entries that no key equals let the walk along a column run past the end.
     padded = torch.cat((keys, keys.new_full((2,), torch.iinfo(torch.int64).max)))
     nobody = torch.full((), n, dtype=torch.int32, device=cells.device)
-    ranks = torch.empty((CELLS, n), dtype=torch.int32, device=cells.device)
-    for column in range(9):
-        wanted = keys + ((column // 3 - 1) * stride_x + (column % 3 - 1) * stride_y - 1)
-        place = torch.searchsorted(keys, wanted, out_int32=True)
-        for step in range(3):
-            hit = padded.index_select(0, place) == wanted
-            torch.where(hit, place, nobody, out=ranks[3 * column + step])
-            place += hit
-            wanted += 1
+    column = torch.arange(9, device=cells.device)
+    wanted = keys + ((column // 3 - 1) * stride_x + (column % 3 - 1) * stride_y - 1)[:, None]
+    place = torch.searchsorted(keys, wanted, out_int32=True)
+    ranks = torch.empty((9, 3, n), dtype=torch.int32, device=cells.device)
+    for step in range(3):
+        hit = padded.index_select(0, place.flatten()).view(9, n) == wanted
+        ranks[:, step] = torch.where(hit, place, nobody)
+        place += hit
+        wanted += 1
     place_of = torch.empty_like(rows)
     place_of[rows] = torch.arange(n, device=rows.device)
     named = torch.cat((rows.int(), nobody[None])).index_select(0, ranks.flatten()).view(CELLS, n)

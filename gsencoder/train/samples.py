@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from gsencoder.data.augment import AugmentConfig, augment
-from gsencoder.data.batch import SamplingConfig, choose_part, thin_out
+from gsencoder.data.batch import SamplingConfig, choose_part, crop_size, thin_out
 from gsencoder.errors import InputError
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, Plan, join_plans
@@ -86,6 +86,8 @@ class SampleRecipe:
         losses: which rows are compared.
         rarity: how often targets of each kind occur.
         seed: of everything random.
+        step_samples: samples of one step, over all processes; they are of one size, so that no process waits for
+            another.
     """
 
     encoder: EncoderConfig
@@ -94,6 +96,7 @@ class SampleRecipe:
     losses: LossConfig
     rarity: Rarity
     seed: int
+    step_samples: int = 1
 
 
 class SampleDataset(Dataset[Sample]):
@@ -112,11 +115,13 @@ class SampleDataset(Dataset[Sample]):
         epoch, place = divmod(number, len(self.scenes))
         order = np.random.default_rng([self.recipe.seed, 0, epoch]).permutation(len(self.scenes))
         rng = np.random.default_rng([self.recipe.seed, 1, number])
+        step = np.random.default_rng([self.recipe.seed, 2, number // self.recipe.step_samples])
+        size = crop_size(self.recipe.sampling, step)
         which = int(order[place])
         scene, rarity = self.scenes[which], self.recipe.rarity
         if which not in self._codes:
             self._codes[which] = target_codes(scene, rarity)
-        return make_sample(scene, self._codes[which], self.recipe, rng)
+        return make_sample(scene, self._codes[which], self.recipe, size, rng)
 
 
 class StepSampler(Sampler[list[int]]):
@@ -157,7 +162,11 @@ def target_codes(scene: PreparedScene, rarity: Rarity) -> Int16[np.ndarray, " N"
 
 
 def make_sample(
-    scene: PreparedScene, codes: Int16[np.ndarray, " N"], recipe: SampleRecipe, rng: np.random.Generator
+    scene: PreparedScene,
+    codes: Int16[np.ndarray, " N"],
+    recipe: SampleRecipe,
+    size: int,
+    rng: np.random.Generator,
 ) -> Sample:
     """Cuts a part out of a scene and makes it ready for the encoder.
 
@@ -165,6 +174,7 @@ def make_sample(
         scene: to cut from.
         codes: of its Gaussians (`target_codes`).
         recipe: how.
+        size: most Gaussians; 0 = all that the views see.
         rng: everything random comes from it.
 
     Raises:
@@ -174,7 +184,7 @@ def make_sample(
     chances = np.append(recipe.rarity.each(1.0), np.float32(0))[codes]
     weights = np.append(recipe.rarity.each(recipe.losses.rarity), np.float32(0))[codes]
     try:
-        views, selected = choose_part(scene.means, scene.cameras, chances, recipe.sampling, rng)
+        views, selected = choose_part(scene.means, scene.cameras, chances, recipe.sampling, size, rng)
     except InputError as error:
         raise InputError(f"scene {scene.name}: {error}") from error
     change = recipe.augmentation

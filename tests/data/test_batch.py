@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from splats import front_camera
 
-from gsencoder.data.batch import SamplingConfig, choose_part, in_frusta, nearest, thin_out
+from gsencoder.data.batch import SamplingConfig, choose_part, crop_size, in_frusta, nearest, thin_out
 from gsencoder.errors import InputError
 from gsencoder.render import blend
 from gsencoder.types import Cameras, Gaussians
@@ -96,7 +96,7 @@ def cloud(count: int = 1000, places: int = 1) -> np.ndarray:
 def test_without_a_limit_a_sample_is_all_that_its_views_see() -> None:
     points, row = cloud(1000, 4), cameras(4)
     config = SamplingConfig(views=2, gaussians=0)
-    views, rows = choose_part(points, row, np.ones(1000, np.float32), config, RNG(0))
+    views, rows = choose_part(points, row, np.ones(1000, np.float32), config, 0, RNG(0))
     assert len(set(views)) == 2
     assert np.array_equal(rows, np.flatnonzero(in_frusta(points, row.select(views))))
 
@@ -104,8 +104,8 @@ def test_without_a_limit_a_sample_is_all_that_its_views_see() -> None:
 def test_the_views_of_a_crop_look_at_its_centre() -> None:
     points, row = cloud(1000, 4), cameras(4)
     for seed in range(8):
-        config = SamplingConfig(views=2, gaussians=50, smallest=0)
-        views, rows = choose_part(points, row, np.ones(1000, np.float32), config, RNG(seed))
+        config = SamplingConfig(views=2)
+        views, rows = choose_part(points, row, np.ones(1000, np.float32), config, 50, RNG(seed))
         assert len(views) == 1  # No other camera of the row sees the same place.
         assert len(rows) == 50
         assert in_frusta(points[rows], row.select(views)).all()
@@ -117,8 +117,8 @@ def test_a_crop_holds_the_gaussians_nearest_to_its_centre_that_the_views_see() -
     chances = np.zeros(1000, np.float32)
     visible = np.flatnonzero(in_frusta(points, camera))
     chances[visible[7]] = 1
-    config = SamplingConfig(views=1, gaussians=20, rare_centers=1.0)
-    _, rows = choose_part(points, camera, chances, config, RNG(0))
+    config = SamplingConfig(views=1, rare_centers=1.0)
+    _, rows = choose_part(points, camera, chances, config, 20, RNG(0))
     distances = np.linalg.norm(points[visible] - points[visible[7]], axis=1)
     assert set(rows) == set(visible[np.argsort(distances)[:20]])
 
@@ -128,28 +128,27 @@ def test_a_rare_target_is_often_the_centre_of_a_crop() -> None:
     chances = np.full(1000, 1e-3, np.float32)
     visible = np.flatnonzero(in_frusta(points, camera))
     chances[visible[0]] = 1e3
-    config = SamplingConfig(views=1, gaussians=5, rare_centers=1.0)
+    config = SamplingConfig(views=1, rare_centers=1.0)
     for seed in range(5):
-        assert visible[0] in choose_part(points, camera, chances, config, RNG(seed))[1]
+        assert visible[0] in choose_part(points, camera, chances, config, 5, RNG(seed))[1]
 
 
 def test_where_no_gaussian_has_a_target_any_may_be_the_centre() -> None:
-    config = SamplingConfig(views=1, gaussians=5)
-    assert len(choose_part(cloud(), cameras(1), np.zeros(1000, np.float32), config, RNG(0))[1])
+    config = SamplingConfig(views=1)
+    assert len(choose_part(cloud(), cameras(1), np.zeros(1000, np.float32), config, 5, RNG(0))[1])
 
 
 def test_the_whole_scene_may_be_taken() -> None:
-    everything = SamplingConfig(scope="scene", gaussians=0)
-    assert len(choose_part(cloud(100), cameras(2), np.ones(100, np.float32), everything, RNG(0))[1]) == 100
-    crop = SamplingConfig(scope="scene", gaussians=30)
-    assert len(choose_part(cloud(100), cameras(2), np.ones(100, np.float32), crop, RNG(0))[1]) == 30
+    config = SamplingConfig(scope="scene")
+    for size, expected in ((0, 100), (30, 30), (500, 100)):
+        assert len(choose_part(cloud(100), cameras(2), np.ones(100, np.float32), config, size, RNG(0))[1]) == expected
 
 
 def test_a_scene_behind_its_cameras_is_an_error() -> None:
     behind = cloud(10) - np.array([0, 0, 9], np.float32)
-    for gaussians in (0, 5):
+    for size in (0, 5):
         with pytest.raises(InputError, match="no Gaussian lies in the frusta"):
-            choose_part(behind, cameras(2), np.ones(10, np.float32), SamplingConfig(gaussians=gaussians), RNG(0))
+            choose_part(behind, cameras(2), np.ones(10, np.float32), SamplingConfig(), size, RNG(0))
 
 
 @given(st.integers(1, 40), st.floats(0, 0.9), st.integers(0, 50))
@@ -161,13 +160,13 @@ def test_thinning_out_leaves_something(count: int, most: float, seed: int) -> No
 
 
 def test_crops_are_of_sizes_in_equal_ratios() -> None:
-    config = SamplingConfig(views=1, gaussians=400, smallest=25, scope="scene")
-    sizes = [
-        len(choose_part(cloud(), cameras(1), np.ones(1000, np.float32), config, RNG(seed))[1]) for seed in range(99)
-    ]
+    config = SamplingConfig(gaussians=400, smallest=25)
+    sizes = [crop_size(config, RNG(seed)) for seed in range(99)]
     assert min(sizes) >= 25
     assert max(sizes) <= 400
     assert 70 < np.median(sizes) < 140  # 100 is as far from 25 as from 400.
+    assert crop_size(SamplingConfig(gaussians=400, smallest=0), RNG(0)) == 400
+    assert crop_size(SamplingConfig(gaussians=0), RNG(0)) == 0
 
 
 @pytest.mark.parametrize("change", [{"views": 0}, {"gaussians": -1}, {"rare_centers": 1.2}, {"smallest": -5}])
