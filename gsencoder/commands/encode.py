@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gsencoder.config import CommonConfig, settings
-from gsencoder.data.model_files import find_file
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.data.splats import READABLE
@@ -17,7 +16,7 @@ from gsencoder.infer.encode import EncodeConfig, encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.weights import WEIGHTS_FILE, load_weights
+from gsencoder.models.weights import find_weights, load_weights
 from gsencoder.outputs import output_folder
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
@@ -50,7 +49,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     keep_heap()
     paths = find_scenes(config.paths)
     with summary.step("weights"):
-        file = weights_file(config.weights)
+        file = find_weights(config.weights)
         encoder, outputs, _ = load_weights(file)
         words_file = file.with_name(WORDS_FILE)
         words = load_text_table(words_file) if words_file.is_file() else None
@@ -70,19 +69,6 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
             if words is not None:
                 save_text_table(folder / WORDS_FILE, words)
         screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
-
-
-def weights_file(given: str) -> Path:
-    """The weights that a user means: a file, a folder of `train`, or a name of the folder of models.
-
-    Raises:
-        InputError: there is no such file.
-    """
-    path = Path(given)
-    if path.is_dir():
-        return path / WEIGHTS_FILE
-    shipped = Path(__file__).resolve().parent.parent / "weights" / given / WEIGHTS_FILE
-    return shipped if shipped.is_file() else find_file(given, "weights")
 
 
 def _encode_into(

@@ -1,4 +1,4 @@
-"""`gsencoder evaluate SCENE… protocol=localization`: a paper's metric on labelled scenes."""
+"""`gsencoder evaluate SCENE… protocol=…`: a metric on labelled scenes, of fused features or of an encoder's."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +8,8 @@ from rich.table import Table
 from gsencoder.config import CommonConfig
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.text_table import TextTable
+from gsencoder.errors import InputError
 from gsencoder.evaluate.localization import (
     LocalizationProtocol,
     SceneOutcome,
@@ -15,11 +17,16 @@ from gsencoder.evaluate.localization import (
     scores,
     scores_by_name,
 )
+from gsencoder.evaluate.naming_protocol import NamingProtocol, evaluate_naming, naming_scores
+from gsencoder.evaluate.sources import Source, encoded, fused
 from gsencoder.evaluate.tables import csv_text
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.teachers.build import TeacherConfig
+from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.infer.encode import EncodeConfig
 from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.models.heap import keep_heap
+from gsencoder.models.weights import find_weights, load_weights
 from gsencoder.outputs import output_folder, write_bytes
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
@@ -35,37 +42,95 @@ class EvaluateConfig(CommonConfig):
         default=(),
         metadata={"help": "labelled scenes, or folders of scenes", "metavar": "SCENE", "required": True},
     )
-    protocol: LocalizationProtocol = field(default_factory=LocalizationProtocol)
+    weights: str = field(
+        default="", metadata={"help": "encoder whose features are judged (see encode); empty = the teacher's, fused"}
+    )
+    protocol: LocalizationProtocol | NamingProtocol = field(default_factory=LocalizationProtocol)
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    encode: EncodeConfig = field(default_factory=EncodeConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
 
 def run(config: EvaluateConfig, summary: Summary) -> None:
-    """Evaluates, prints the scores, and writes them with every hit beside them."""
+    """Evaluates, prints the scores, and writes them with their details beside them."""
+    words = text_table_of(config.teacher)
+    if words is None:
+        raise InputError(
+            f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words="
+        )
+    if config.weights:
+        keep_heap()
+        encoder, outputs, _ = load_weights(find_weights(config.weights))
+        source = encoded(encoder, outputs, config.encode)
+    else:
+        source = fused(config.teacher, words, config.fusion)
     out = config.out or Path("outputs") / "evaluate" / config.protocol.name
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-        outcomes = evaluate_localization(
-            find_scenes(config.paths),
-            teacher=config.teacher,
-            protocol=config.protocol,
-            data=config.data,
-            seeds=config.seeds,
-            fusion=config.fusion,
-            localization=config.localize,
-            track=Progress(quiet=config.quiet),
-        )
-        record(outcomes, summary)
-        hits = [hit for outcome in outcomes for hit in outcome.hits]
-        rows = [{"scene": h.scene, "name": h.name, "iou": h.iou, "oracle_iou": h.oracle_iou} for h in hits]
-        write_bytes(folder / "hits.csv", csv_text(rows).encode())
-        names = [{"name": name, **row} for name, row in scores_by_name(hits).items()]
-        write_bytes(folder / "names.csv", csv_text(names).encode())
+        if isinstance(config.protocol, NamingProtocol):
+            _naming(config, config.protocol, source, words, folder, summary)
+        else:
+            _localization(config, config.protocol, source, words, folder, summary)
     screen = console(config.quiet)
     screen.print(names_table(summary.results))
     screen.print(f"{out}: {scores_line(summary.results)}")
+
+
+def _localization(
+    config: EvaluateConfig,
+    protocol: LocalizationProtocol,
+    source: Source,
+    words: TextTable,
+    folder: Path,
+    summary: Summary,
+) -> None:
+    outcomes = evaluate_localization(
+        find_scenes(config.paths),
+        source,
+        words,
+        protocol=protocol,
+        data=config.data,
+        seeds=config.seeds,
+        localization=config.localize,
+        track=Progress(quiet=config.quiet),
+    )
+    record(outcomes, summary)
+    hits = [hit for outcome in outcomes for hit in outcome.hits]
+    rows = [{"scene": h.scene, "name": h.name, "iou": h.iou, "oracle_iou": h.oracle_iou} for h in hits]
+    write_bytes(folder / "hits.csv", csv_text(rows).encode())
+    names = [{"name": name, **row} for name, row in scores_by_name(hits).items()]
+    write_bytes(folder / "names.csv", csv_text(names).encode())
+
+
+def _naming(
+    config: EvaluateConfig,
+    protocol: NamingProtocol,
+    source: Source,
+    words: TextTable,
+    folder: Path,
+    summary: Summary,
+) -> None:
+    scenes = evaluate_naming(
+        find_scenes(config.paths),
+        source,
+        words,
+        data=config.data,
+        seeds=config.seeds,
+        fusion=config.fusion,
+        track=Progress(quiet=config.quiet),
+    )
+    scores = naming_scores(scenes, protocol)
+    for scene in scenes:
+        for step, seconds in scene.seconds.items():
+            summary.timings[step] = summary.timings.get(step, 0.0) + seconds
+    each = [
+        {"scene": scene.scene, "gaussians": sum(scene.total.values()), **naming_scores([scene])} for scene in scenes
+    ]
+    summary.results.update(protocol="naming", **scores, names_table="names.csv", scenes=each)
+    rows = [{"name": name, **row} for name, row in scores["by_name"].items()]
+    write_bytes(folder / "names.csv", csv_text(rows).encode())
 
 
 def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
@@ -97,6 +162,11 @@ def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
 
 def scores_line(results: dict) -> str:
     """The main figures in one line."""
+    if results["protocol"] == "naming":
+        return (
+            f"{results['names']} names in {len(results['scenes'])} scenes: accuracy {results['accuracy']:.3f} averaged "
+            f"over names, {results['accuracy_gaussians']:.3f} over Gaussians, centred cosine {results['cosine']:.3f}"
+        )
     return (
         f"{results['objects']} objects in {len(results['scenes'])} scenes: Acc@0.25 {results['acc_25']:.3f}, "
         f"Acc@0.5 {results['acc_50']:.3f}, mean IoU {results['mean_iou']:.3f} (best of all boxes: "
@@ -106,11 +176,16 @@ def scores_line(results: dict) -> str:
 
 def names_table(results: dict) -> Table:
     """The names that were found worst."""
-    names = results["names"]
+    naming = results["protocol"] == "naming"
+    names = results["by_name" if naming else "names"]
     table = Table(title="hardest names" if len(names) > SHOWN_NAMES else "names", title_justify="left")
-    for title in ("name", "objects", "Acc@0.25", "Acc@0.5", "mean IoU", "best box"):
+    columns = ("gaussians", "accuracy") if naming else ("objects", "Acc@0.25", "Acc@0.5", "mean IoU", "best box")
+    for title in ("name", *columns):
         table.add_column(title, justify="left" if title == "name" else "right")
     for name, row in list(names.items())[:SHOWN_NAMES]:
+        if naming:
+            table.add_row(name, f"{row['gaussians']:,}", f"{row['accuracy']:.3f}")
+            continue
         figures = (row["acc_25"], row["acc_50"], row["mean_iou"], row["oracle_mean_iou"])
         table.add_row(name, str(row["objects"]), *(f"{figure:.3f}" for figure in figures))
     return table

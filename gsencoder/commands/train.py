@@ -78,10 +78,10 @@ def run(config: TrainConfig, summary: Summary) -> None:
     """Prepares scenes, trains, and writes weights, log and scores into out=."""
     keep_heap()
     out = config.out or Path("outputs") / "train"
-    track = Progress(quiet=config.quiet)
     training, held_out = split(find_scenes(config.paths), config.holdout)
     words = text_table_of(config.teacher)
     with joined(config.device) as (place, device):
+        track = Progress(quiet=config.quiet or not place.first)
         with summary.step("prepare"):
             dataset = prepare(training, held_out, words, config, out, place, track)
         if config.prepare_only:

@@ -8,22 +8,23 @@ from gsencoder.errors import InputError
 MODELS_VARIABLE = "GSENCODER_MODELS"
 
 
-def find_file(name: str, option: str) -> Path:
+def find_file(name: str, option: str, *, folder: bool = False) -> Path:
     """The file at `name`, else the file of that name in the folder that GSENCODER_MODELS names.
 
     Args:
         name: a path, or a bare file name.
         option: what the user would set, for the error.
+        folder: whether a folder is sought, as models of several files have one.
 
     Raises:
         InputError: neither exists.
     """
-    folder = os.environ.get(MODELS_VARIABLE, "")
+    models = os.environ.get(MODELS_VARIABLE, "")
     tried = [Path(name)]
-    if folder and not tried[0].is_absolute():
-        tried.append(Path(folder) / name)
+    if models and not tried[0].is_absolute():
+        tried.append(Path(models) / name)
     for path in tried:
-        if path.is_file():
+        if path.is_dir() if folder else path.is_file():
             return path
-    hint = "" if folder else f", and {MODELS_VARIABLE} is not set (a folder to look for models in)"
-    raise InputError(f"{option}: no file at {' or '.join(map(str, tried))}{hint}")
+    hint = "" if models else f", and {MODELS_VARIABLE} is not set (a folder to look for models in)"
+    raise InputError(f"{option}: no {'folder' if folder else 'file'} at {' or '.join(map(str, tried))}{hint}")

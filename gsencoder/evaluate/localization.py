@@ -1,8 +1,8 @@
 """The localisation protocol: labelled scenes in, share of objects whose box was found out.
 
-For every scene: Gaussians (seeds where it has none), fusion, and one box search for the names of its small objects
-that are seen well enough. Settings are the same for all scenes; a name's first box is held against the nearest object
-of that name.
+For every scene: Gaussians (seeds where it has none), features (fused or encoded), and one box search for the names of
+its small objects that are seen well enough. Settings are the same for all scenes; a name's first box is held against
+the nearest object of that name.
 """
 
 import math
@@ -16,12 +16,11 @@ from typing import Any, Literal
 import numpy as np
 
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.evaluate.boxes import Hit, accuracy, asked_objects, score_boxes
-from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
+from gsencoder.evaluate.sources import Source, with_gaussians
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -54,7 +53,7 @@ class SceneOutcome:
         hits: one an object asked for.
         gaussians: how many it has.
         seen: how many have features.
-        rank: columns of the fused features.
+        rank: columns of the features.
         boxless: asked names without any box.
         seconds: by step.
     """
@@ -70,12 +69,12 @@ class SceneOutcome:
 
 def evaluate_localization(
     paths: Sequence[str | Path],
+    source: Source,
+    words: TextTable,
     *,
-    teacher: TeacherConfig,
     protocol: LocalizationProtocol = LocalizationProtocol(),
     data: SceneConfig = SceneConfig(),
     seeds: SeedConfig = SeedConfig(),
-    fusion: FuseConfig = FuseConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
     track: Track = lambda items, label: items,  # noqa: ARG005
 ) -> list[SceneOutcome]:
@@ -83,11 +82,11 @@ def evaluate_localization(
 
     Args:
         paths: scenes with labelled objects (`find_scenes` expands folders of them).
-        teacher: what is fused; it must come with words.
+        source: what gives a scene its features.
+        words: lead into their space.
         protocol: which objects are asked for.
         data: how scenes are read.
         seeds: how Gaussians are made for scenes without.
-        fusion: how maps become features.
         localization: how words become boxes.
         track: wraps the loop over scenes to show progress.
 
@@ -98,25 +97,14 @@ def evaluate_localization(
         SceneWarning: asked names without a box, and scenes in which nothing is asked for; one counted warning each.
 
     Raises:
-        InputError: a teacher without words, no object to ask for in any scene, or whatever is wrong with a scene.
+        InputError: no object to ask for in any scene, or whatever is wrong with a scene.
     """
-    words = text_table_of(teacher)
-    if words is None:
-        raise InputError(f"evaluate: no words lead into the space of teacher {teacher.name}; give teacher.words=")
     outcomes = []
     for path in track([Path(path) for path in paths], "scenes"):
         clock = time.perf_counter()
         scene = load_scene(path, options=data)
         loaded = time.perf_counter() - clock
-        outcome = evaluate_scene(
-            scene,
-            words,
-            teacher=teacher,
-            protocol=protocol,
-            seeds=seeds,
-            fusion=fusion,
-            localization=localization,
-        )
+        outcome = evaluate_scene(scene, source, words, protocol=protocol, seeds=seeds, localization=localization)
         outcomes.append(replace(outcome, seconds={"load": loaded, **outcome.seconds}))
     _warn_of_gaps(outcomes)
     return outcomes
@@ -124,35 +112,29 @@ def evaluate_localization(
 
 def evaluate_scene(
     scene: Scene,
+    source: Source,
     words: TextTable,
     *,
-    teacher: TeacherConfig,
     protocol: LocalizationProtocol = LocalizationProtocol(),
     seeds: SeedConfig = SeedConfig(),
-    fusion: FuseConfig = FuseConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
 ) -> SceneOutcome:
-    """The protocol on one loaded scene; see `evaluate_localization`. Nothing is fused where nothing is asked for."""
+    """The protocol on one loaded scene; see `evaluate_localization`. Nothing is made where nothing is asked for."""
     if not asked_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels):
         count = len(scene.gaussians) if scene.gaussians is not None else 0
         return SceneOutcome(scene=scene.name, hits=(), gaussians=count, seen=0, rank=0, boxless=0, seconds={})
-    seconds: dict[str, float] = {}
+    scene, seconds = with_gaussians(scene, seeds)
+    features, spent = source(scene)
     start = time.perf_counter()
-    if scene.gaussians is None:
-        scene = replace(scene, gaussians=seed(scene, seeds))
-        seconds["seeds"] = time.perf_counter() - start
-    fused = fuse(scene, build_teacher(teacher, scene, words), fusion)
-    start = time.perf_counter()
-    hits, boxless = ask(scene, fused.features, words, protocol, localization)
-    seconds |= {**fused.seconds, "localize": time.perf_counter() - start}
+    hits, boxless = ask(scene, features, words, protocol, localization)
     return SceneOutcome(
         scene=scene.name,
         hits=tuple(hits),
-        gaussians=len(fused.features),
-        seen=int(fused.features.seen.sum()),
-        rank=fused.features.features.shape[1],
+        gaussians=len(features),
+        seen=int(features.seen.sum()),
+        rank=features.features.shape[1],
         boxless=boxless,
-        seconds=seconds,
+        seconds={**seconds, **spent, "localize": time.perf_counter() - start},
     )
 
 

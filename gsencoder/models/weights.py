@@ -9,11 +9,27 @@ import numpy as np
 import torch
 
 from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.data.model_files import find_file
 from gsencoder.errors import InputError
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
 
 WEIGHTS_FILE = "encoder.safetensors"
+SHIPPED = Path(__file__).resolve().parent.parent / "weights"
+"""Encoders that come with the package, a folder each."""
+
+
+def find_weights(given: str) -> Path:
+    """The weights that a user means: the folder that `train` wrote, a file, or the name of some that come with the
+    package; files are also looked for in GSENCODER_MODELS.
+
+    Raises:
+        InputError: there are none.
+    """
+    if Path(given).is_dir():
+        return Path(given) / WEIGHTS_FILE
+    shipped = SHIPPED / given / WEIGHTS_FILE
+    return shipped if shipped.is_file() else find_file(given, "weights")
 
 
 def save_weights(

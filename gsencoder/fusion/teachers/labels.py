@@ -80,9 +80,9 @@ class LabelsTeacher:
         mean = embeddings.mean(axis=0, dtype=np.float64)
         other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)
         self.names = ("other", *used)
-        self._vectors = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)
+        self.vectors = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)
         self.cell = cell
-        self.table = self._vectors if cell == 1 else None
+        self.table = self.vectors if cell == 1 else None
         self.mean = mean.astype(np.float32)
         self.space = FeatureSpace(
             name=f"labels-{text_encoder}",
@@ -114,9 +114,9 @@ class LabelsTeacher:
             raise InputError(f"teacher labels: view {views.names[view]} is smaller than a cell of {self.cell} pixels")
         cells = codes[: h * self.cell, : w * self.cell].reshape(h, self.cell, w, self.cell)
         shares = np.stack([(cells == code).mean(axis=(1, 3)) for code in range(len(self.names))], axis=-1)
-        features = (shares @ self._vectors).astype(np.float32)
+        features = (shares @ self.vectors).astype(np.float32)
         return FeatureMap(features=features, grid_from_image=affine, space=self.space)
 
     def settings(self) -> dict[str, Any]:
-        digest = hashlib.sha256(self._vectors.tobytes() + repr(sorted(self._code.items())).encode()).hexdigest()[:16]
+        digest = hashlib.sha256(self.vectors.tobytes() + repr(sorted(self._code.items())).encode()).hexdigest()[:16]
         return {"name": "labels", "table": digest, "cell": self.cell}

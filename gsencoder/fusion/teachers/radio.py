@@ -50,7 +50,7 @@ class RadioTeacher:
         """
         if not config.model:
             raise InputError("teacher radio: teacher.model= is missing: the folder of a RADIO model")
-        folder = Path(config.model) if Path(config.model).is_dir() else find_file(config.model, "teacher.model")
+        folder = find_file(config.model, "teacher.model", folder=True)
         try:
             import torch
             from transformers import AutoModel

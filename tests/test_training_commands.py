@@ -1,0 +1,201 @@
+"""`train`, `encode` and `evaluate weights=`, one after the other, as a user runs them."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsencoder import cli
+from gsencoder.data.synthetic import make_room
+from gsencoder.data.synthetic_write import write_room
+from gsencoder.data.text_table import load_text_table, make_text_table, save_text_table
+from gsencoder.fusion.store import load_features
+from gsencoder.models.weights import load_weights
+
+QUICK = (
+    "quiet=true",
+    "train.steps=6",
+    "train.warmup=2",
+    "train.log_every=2",
+    "sampling.gaussians=3000",
+    "sampling.smallest=500",
+    "transformer.encoder_channels=[32,32,32,32]",
+    "transformer.decoder_channels=[32,32,32]",
+)
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return found
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line that a refused command prints."""
+    capsys.readouterr()
+    assert cli.main([*arguments, "quiet=true"]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three rooms and the words of all that is in them."""
+    folder = tmp_path_factory.mktemp("rooms")
+    names: set[str] = set()
+    for number in range(3):
+        room = make_room(number, objects=4, views=4, width=120, height=90)
+        write_room(room, folder / f"room_{number}")
+        names |= {thing.name for thing in room.objects if thing.name}
+    vectors = np.eye(len(names), dtype=np.float32)
+    save_text_table(folder / "words.safetensors", make_text_table(sorted(names), vectors, "room-words"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(rooms: Path) -> Path:
+    out = rooms.parent / "encoder"
+    scenes = [str(rooms / f"room_{number}") for number in range(3)]
+    words = f"teacher.words={rooms / 'words.safetensors'}"
+    assert cli.main(["train", *scenes, "holdout=room_2", words, f"out={out}", *QUICK]) == 0
+    return out
+
+
+def test_training_leaves_weights_words_a_log_and_pictures(trained: Path) -> None:
+    results = summary_of(trained)["results"]
+    assert results["steps"] == 6
+    assert 0 <= results["validation"]["names"] <= 1
+    encoder, outputs, made_by = load_weights(trained / results["weights"])
+    assert made_by["steps"] == 6
+    assert outputs.space.text_encoder == "room-words"
+    assert encoder.channels == outputs.channels
+    assert (trained / "words.safetensors").is_file()
+    assert (trained / "log.csv").read_text().splitlines()[0].startswith("step,loss")
+    assert list((trained / "validation").glob("features_*.png"))
+    assert list((trained / "tensorboard").iterdir())
+    assert not trained.with_name("encoder.training").exists()
+
+
+def test_what_was_prepared_serves_the_next_run(rooms: Path, trained: Path, tmp_path: Path) -> None:
+    prepared = trained.with_name("encoder.prepared")
+    before = {path.name: path.stat().st_mtime_ns for path in (prepared / "scenes").iterdir()}
+    assert len(before) == 3
+    scenes = [str(rooms / f"room_{number}") for number in range(3)]
+    words = f"teacher.words={rooms / 'words.safetensors'}"
+    again = ["train", *scenes, "holdout=room_2", words, f"prepared={prepared}", f"out={tmp_path / 'again'}", *QUICK]
+    assert cli.main([*again, "tensorboard=false"]) == 0
+    assert {path.name: path.stat().st_mtime_ns for path in (prepared / "scenes").iterdir()} == before
+    first, second = (load_weights(out / "encoder.safetensors")[0] for out in (trained, tmp_path / "again"))
+    for name, value in first.state_dict().items():
+        assert np.array_equal(value.numpy(), second.state_dict()[name].numpy())
+
+
+def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trained: Path, tmp_path: Path) -> None:
+    out, boxes = tmp_path / "features", tmp_path / "boxes"
+    encode = ["encode", str(rooms / "room_2"), f"weights={trained}", f"out={out}", "quiet=true"]
+    assert cli.main(encode) == 0
+    results = summary_of(out)["results"]
+    scene = load_features(out)
+    assert scene.gaussians is not None
+    assert results["gaussians"] == results["seen"] == len(scene.gaussians)
+    word = next(iter(sorted(thing.name for thing in make_room(2, objects=4, views=4).objects if thing.name)))
+    asked = ["localize", str(out), f"query={word}", f"out={boxes}", "pictures=0", "threshold.fixed=0.0", "quiet=true"]
+    assert cli.main(asked) == 0
+    # In chunks it is nearly the same, and for several scenes each has a folder of its own.
+    several = ["encode", str(rooms / "room_1"), str(rooms / "room_2"), f"weights={trained / 'encoder.safetensors'}"]
+    assert cli.main([*several, f"out={tmp_path / 'many'}", "encode.chunk=2000", "quiet=true"]) == 0
+    parts = next(iter(load_features(tmp_path / "many" / "room_2").features.values()))
+    whole = next(iter(scene.features.values()))
+    assert len(parts) == len(whole)
+
+
+def test_an_encoder_is_judged_by_either_protocol(rooms: Path, trained: Path, tmp_path: Path) -> None:
+    words = f"teacher.words={rooms / 'words.safetensors'}"
+    for protocol in ("naming", "localization"):
+        out = tmp_path / protocol
+        asked = ["evaluate", str(rooms / "room_2"), f"protocol={protocol}", f"weights={trained}", words, f"out={out}"]
+        extra = ["min_views=1", "min_pixels=1"] if protocol == "localization" else []
+        assert cli.main([*asked, *extra, "quiet=true"]) == 0
+    naming = summary_of(tmp_path / "naming")["results"]
+    assert 0 <= naming["accuracy"] <= 1
+    assert "other" in naming["by_name"]
+    # The teacher's own features name themselves.
+    itself = ["evaluate", str(rooms / "room_2"), "protocol=naming", words, f"out={tmp_path / 'self'}", "quiet=true"]
+    assert cli.main(itself) == 0
+    assert summary_of(tmp_path / "self")["results"]["accuracy"] == 1
+
+
+def test_preparing_alone_trains_nothing(rooms: Path, tmp_path: Path) -> None:
+    words = f"teacher.words={rooms / 'words.safetensors'}"
+    asked = ["train", str(rooms / "room_0"), words, f"out={tmp_path / 'out'}", "prepare_only=true", "quiet=true"]
+    assert cli.main(asked) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["out.prepared"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["holdout=kitchen_*"], "holdout: no scene is called 'kitchen_*'"),
+        (["holdout=room_*"], "matches every scene"),
+        (["train.steps=0"], "train.steps: expected 1 or more"),
+        (["loss.min_kept=2.0"], "loss.min_kept"),
+        (["transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry a level"),
+        (["teacher=radio"], "teacher.model= is missing"),
+        (["device=cuda"], "no GPU"),
+        (["experiment=kitchen"], "experiment: expected one of"),
+    ],
+)
+def test_a_training_that_cannot_be_is_refused_in_one_line(
+    rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    table = [] if "teacher=radio" in words else [f"teacher.words={rooms / 'words.safetensors'}"]
+    assert message in refusal(
+        capsys, "train", str(rooms / "room_0"), str(rooms / "room_1"), *table, f"out={tmp_path / 'out'}", *words
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_scenes_of_one_name_are_refused(rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(rooms / "room_0", tmp_path / "room_0")
+    table = f"teacher.words={rooms / 'words.safetensors'}"
+    line = refusal(capsys, "train", str(rooms / "room_0"), str(tmp_path / "room_0"), table, f"out={tmp_path / 'out'}")
+    assert "two scenes are called 'room_0'" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["weights=nowhere"], "weights: no file at nowhere"),
+        (["encode.chunk=-1"], "encode.chunk"),
+        (["encode.device=cuda"], "sees no GPU"),
+    ],
+)
+def test_an_encoding_that_cannot_be_is_refused_in_one_line(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    given = [] if any(word.startswith("weights=") for word in words) else [f"weights={trained}"]
+    line = refusal(capsys, "encode", str(rooms / "room_2"), *given, f"out={tmp_path / 'out'}", *words)
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_features_of_another_space_are_not_judged_by_these_words(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.safetensors"
+    table = load_text_table(rooms / "words.safetensors")
+    save_text_table(other, make_text_table(table.names, table.embeddings, "other-words"))
+    line = refusal(
+        capsys,
+        "evaluate",
+        str(rooms / "room_2"),
+        "protocol=naming",
+        f"weights={trained}",
+        f"teacher.words={other}",
+        f"out={tmp_path / 'out'}",
+    )
+    assert "room-words" in line
+    assert "other-words" in line
