@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import partial
@@ -14,6 +15,7 @@ import torch
 from gsencoder.config import CommonConfig, settings
 from gsencoder.data.augment import AugmentConfig
 from gsencoder.data.batch import SamplingConfig
+from gsencoder.data.model_files import find_file
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.data.text_table import TextTable, save_text_table
@@ -32,6 +34,7 @@ from gsencoder.outputs import output_folder
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
 from gsencoder.train.distributed import Place, joined, wait_for_all
+from gsencoder.train.heads import load_heads
 from gsencoder.train.log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
@@ -61,6 +64,10 @@ class TrainConfig(CommonConfig):
     prepare_only: bool = field(default=False, metadata={"help": "prepare the scenes and stop"})
     resume: bool = field(default=True, metadata={"help": "go on where a run that was cut off stopped"})
     tensorboard: bool = field(default=True, metadata={"help": "write TensorBoard events beside log.csv"})
+    heads: str = field(
+        default="",
+        metadata={"help": "file of the teacher's adapter heads, behind which cells are compared; empty = none"},
+    )
     store: Literal["float16", "float32"] = field(default="float16", metadata={"help": "type of the written weights"})
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where the encoder computes"})
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -78,80 +85,107 @@ def run(config: TrainConfig, summary: Summary) -> None:
     """Prepares scenes, trains, and writes weights, log and scores into out=."""
     keep_heap()
     out = config.out or Path("outputs") / "train"
+    work = out.with_name(f"{out.name}.training")
     training, held_out = split(find_scenes(config.paths), config.holdout)
     words = text_table_of(config.teacher)
-    with joined(config.device) as (place, device):
+    with joined(config.device) as (place, device), ExitStack() as results:
         track = Progress(quiet=config.quiet or not place.first)
+        folder = None
+        if place.first and not config.prepare_only:
+            # Opened now, so that an out= that cannot be written is told before hours of work.
+            folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
         with summary.step("prepare"):
             dataset = prepare(training, held_out, words, config, out, place, track)
         if config.prepare_only:
-            console(config.quiet or not place.first).print(
-                f"{dataset.folder}: {len(training)} scenes to train on, {len(held_out)} for validation"
-            )
+            counts = f"{len(training)} scenes to train on, {len(held_out)} for validation"
+            console(config.quiet or not place.first).print(f"{dataset.folder}: {counts}")
             return
-        work = out.with_name(f"{out.name}.training")
         if place.first:
             if not config.resume:
                 shutil.rmtree(work, ignore_errors=True)
             work.mkdir(parents=True, exist_ok=True)
         wait_for_all()
-        outputs, codebook = dataset.load_space()
-        torch.manual_seed(config.train.seed)
-        encoder = GaussianEncoder(config.model, outputs.channels)
-        rarity = dataset.load_rarity()
-        recipe = SampleRecipe(
-            encoder=config.model,
-            sampling=config.sampling,
-            augmentation=config.augment,
-            losses=config.loss,
-            rarity=rarity,
-            seed=config.train.seed,
-            step_samples=config.train.batch * config.train.accumulate * place.size,
-        )
-        validation = dataset.scenes([path.name for path in held_out])
-        kinds = codebook if codebook is not None else rarity.codebook
-        trainer = Trainer(
-            encoder,
-            SampleDataset(dataset.scenes([path.name for path in training]), recipe),
-            config.loss,
-            config.train,
-            folder=work,
-            settings=_identity(config),
-            place=place,
-            device=device,
-            tensorboard=config.tensorboard,
-            validate=partial(_validate, validation, outputs, kinds, config),
-        )
+        trainer, outputs = make_trainer(dataset, training, held_out, config, work, place, device)
         with summary.step("train"):
             done = trainer.run(track)
-        if not place.first:
+        if folder is None:
             return
-        with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-            judged = trainer.validated
-            if judged is None:  # A run that had been cut off after its last step.
-                judged = _validate(validation, outputs, kinds, config, encoder, done.step)
-            scores = dict(judged.scores)
-            made_by = {"settings": settings(config), "steps": done.step, "seconds": done.seconds, "validation": scores}
-            save_weights(folder / WEIGHTS_FILE, encoder, outputs, made_by, dtype=config.store)
-            if words is not None:
-                save_text_table(folder / WORDS_FILE, words)
-            shutil.copy(work / LOG_FILE, folder / LOG_FILE)
-            for name in (EVENTS_FOLDER, "validation"):
-                if (work / name).is_dir():
-                    shutil.copytree(work / name, folder / name)
-            summary.results.update(
-                steps=done.step,
-                seconds=done.seconds,
-                parameters=sum(value.numel() for value in encoder.parameters()),
-                validation=scores,
-                weights=WEIGHTS_FILE,
-                log=LOG_FILE,
-            )
-        shutil.rmtree(work, ignore_errors=True)
-        told = ", ".join(f"{name} {value:.3f}" for name, value in scores.items())
-        console(config.quiet).print(
-            f"{out}: {done.step} steps in {done.seconds / 60:.1f} minutes; {told or 'not validated'}"
-        )
+        write_results(folder, trainer, outputs, words, config, summary)
+    shutil.rmtree(work, ignore_errors=True)
+    scores = summary.results["validation"]
+    told = ", ".join(f"{name} {value:.3f}" for name, value in scores.items()) or "not validated"
+    console(config.quiet).print(f"{out}: {done.step} steps in {done.seconds / 60:.1f} minutes; {told}")
+
+
+def make_trainer(
+    dataset: PreparedDataset,
+    training: Sequence[Path],
+    held_out: Sequence[Path],
+    config: TrainConfig,
+    work: Path,
+    place: Place,
+    device: torch.device,
+) -> tuple[Trainer, OutputSpace]:
+    """The trainer of prepared scenes, and the space that its encoder learns."""
+    outputs, codebook = dataset.load_space()
+    rarity = dataset.load_rarity()
+    recipe = SampleRecipe(
+        encoder=config.model,
+        sampling=config.sampling,
+        augmentation=config.augment,
+        losses=config.loss,
+        rarity=rarity,
+        seed=config.train.seed,
+        step_samples=config.train.batch * config.train.accumulate * place.size,
+    )
+    kinds = codebook if codebook is not None else rarity.codebook
+    validation = dataset.scenes([path.name for path in held_out])
+    torch.manual_seed(config.train.seed)
+    trainer = Trainer(
+        GaussianEncoder(config.model, outputs.channels),
+        SampleDataset(dataset.scenes([path.name for path in training]), recipe),
+        config.loss,
+        config.train,
+        folder=work,
+        settings=_identity(config, place),
+        heads=load_heads(find_file(config.heads, "heads"), outputs) if config.heads else (),
+        place=place,
+        device=device,
+        tensorboard=config.tensorboard,
+        validate=partial(_validate, validation, outputs, kinds, config),
+    )
+    return trainer, outputs
+
+
+def write_results(
+    folder: Path,
+    trainer: Trainer,
+    outputs: OutputSpace,
+    words: TextTable | None,
+    config: TrainConfig,
+    summary: Summary,
+) -> None:
+    """Weights, words, log and pictures; what was reached goes into the summary."""
+    done, encoder = trainer.progress, trainer.encoder
+    # A run that had been cut off after its last step has not validated it.
+    judged = trainer.validated or trainer.validate(encoder, done.step)
+    scores = dict(judged.scores)
+    made_by = {"settings": settings(config), "steps": done.step, "seconds": done.seconds, "validation": scores}
+    save_weights(folder / WEIGHTS_FILE, encoder, outputs, made_by, dtype=config.store)
+    if words is not None:
+        save_text_table(folder / WORDS_FILE, words)
+    shutil.copy(trainer.folder / LOG_FILE, folder / LOG_FILE)
+    for name in (EVENTS_FOLDER, "validation"):
+        if (trainer.folder / name).is_dir():
+            shutil.copytree(trainer.folder / name, folder / name)
+    summary.results.update(
+        steps=done.step,
+        seconds=done.seconds,
+        parameters=sum(value.numel() for value in encoder.parameters()),
+        validation=scores,
+        weights=WEIGHTS_FILE,
+        log=LOG_FILE,
+    )
 
 
 def split(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[Path], list[Path]]:
@@ -232,9 +266,11 @@ def _validate(
     return Validated({"names": found.score, "cosine": found.cosine}, pictures)
 
 
-def _identity(config: TrainConfig) -> dict[str, Any]:
+def _identity(config: TrainConfig, place: Place) -> dict[str, Any]:
     """What a run must have in common with one that it continues."""
     chosen = {name: settings(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
-    for name in ("workers", "log_every", "validate_every", "checkpoint_every", "compile"):
+    for name in ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "batch", "accumulate"):
         del chosen["train"][name]
-    return {**chosen, "teacher": settings(config.teacher), "holdout": list(config.holdout)}
+    told = {"teacher": settings(config.teacher), "holdout": list(config.holdout), "heads": config.heads}
+    # How the samples of a step are spread over processes and micro-batches may change.
+    return {**chosen, **told, "samples_per_step": config.train.batch * config.train.accumulate * place.size}

@@ -64,6 +64,8 @@ class Head(nn.Module):
         scale: their root mean square distance from it.
         """
         super().__init__()
+        if not 0 < scale < float("inf"):
+            raise InputError(f"heads: expected a positive scale, got {scale}")
         self.body = body.requires_grad_(False)
         self.register_buffer("mean", mean)
         self.unit = scale / len(mean) ** 0.5

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from gsencoder.train.checkpoint import CHECKPOINT_FILE, Progress, load_checkpoin
 from gsencoder.train.distill import Distillation
 from gsencoder.train.distributed import Place, sum_over_processes, wait_for_all
 from gsencoder.train.log import Log
-from gsencoder.train.losses import LossConfig
+from gsencoder.train.losses import Head, LossConfig
 from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
 
 
@@ -88,10 +88,11 @@ class Trainer:
         *,
         folder: Path,
         settings: Mapping[str, Any],
+        heads: Sequence[tuple[Head, nn.Module]] = (),
         place: Place = Place(),
         device: torch.device = torch.device("cpu"),
         tensorboard: bool = False,
-        validate: Validation | None = None,
+        validate: Validation = lambda encoder, step: Validated({}),  # noqa: ARG005
     ) -> None:
         """Takes up what an earlier run with the same settings left in `folder`.
 
@@ -102,6 +103,7 @@ class Trainer:
             config: see there.
             folder: for checkpoint and log; exists.
             settings: what a run must have in common with one that it continues, as JSON values.
+            heads: a teacher's adapter heads, each with what decodes standard units for it.
             place: of this process.
             device: of this process.
             tensorboard: whether to write events.
@@ -117,6 +119,7 @@ class Trainer:
             _groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
         )
         self.progress = Progress()
+        self._in_between = False
         self.validated: Validated | None = None
         if (folder / CHECKPOINT_FILE).is_file():
             self.progress = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
@@ -126,16 +129,29 @@ class Trainer:
         if place.size > 1:
             ids = [device.index] if device.type == "cuda" else None
             network = self._parallel = nn.parallel.DistributedDataParallel(network, device_ids=ids)
-        self.distillation = Distillation(network, losses)
+        self.distillation = Distillation(network, losses, heads=[(a.to(device), b.to(device)) for a, b in heads])
         self._autocast = autocast_dtype(config.precision, device)
 
     def run(self, track: Track = lambda steps, label: iter(steps)) -> Progress:  # noqa: ARG005
-        """All steps that are left.
+        """All steps that are left. An interrupt leaves a checkpoint behind.
 
         Raises:
             InputError: a loss or gradient is not finite; the samples and the term are named, and the checkpoint is
                 that of the last step that was.
         """
+        try:
+            self._run(track)
+        except KeyboardInterrupt:
+            # What is between two steps is not saved: the checkpoint before it continues to the same losses.
+            if not self._in_between:
+                self.save()
+            raise
+        finally:
+            if self._log is not None:
+                self._log.close()
+        return self.progress
+
+    def _run(self, track: Track) -> None:
         config, start = self.config, time.monotonic() - self.progress.seconds
         first, saved = self.progress.step, time.monotonic()
         batches = iter(self._loader(first))
@@ -150,14 +166,12 @@ class Trainer:
             if done == config.steps or (config.validate_every and done % config.validate_every == 0):
                 row |= self._validated(done)
             self.progress = Progress(step=done, seconds=time.monotonic() - start)
+            self._in_between = False
             if row and self._log is not None:
                 self._log.add(step, row | {"seconds": self.progress.seconds})
             if time.monotonic() - saved >= config.checkpoint_every or done == config.steps:
                 self.save()
                 saved = time.monotonic()
-        if self._log is not None:
-            self._log.close()
-        return self.progress
 
     def save(self) -> None:
         """Writes the checkpoint; only the first process does."""
@@ -228,6 +242,7 @@ class Trainer:
                 f"training: {where} is not finite at step {step}; nothing was changed by it. Lower learning_rate, or "
                 "look at these scenes (`gsencoder inspect`)"
             )
+        self._in_between = True
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         losses = dict(zip(lambdas, sums[:-1], strict=True))
@@ -245,7 +260,7 @@ class Trainer:
 
     def _validated(self, done: int) -> dict[str, float]:
         scores: dict[str, float] = {}
-        if self.validate is not None and self._log is not None:
+        if self._log is not None:
             self.encoder.eval()
             self.validated = found = self.validate(self.encoder, done)
             scores = {f"validation/{name}": float(value) for name, value in found.scores.items()}
