@@ -22,8 +22,8 @@ QUICK = (
     "train.log_every=2",
     "sampling.gaussians=3000",
     "sampling.smallest=500",
-    "transformer.encoder_channels=[32,32,32,32]",
-    "transformer.decoder_channels=[32,32,32]",
+    "transformer.encoder_channels=[32,32,32,32,32]",
+    "transformer.decoder_channels=[32,32,32,32]",
 )
 
 
@@ -199,3 +199,33 @@ def test_features_of_another_space_are_not_judged_by_these_words(
     )
     assert "room-words" in line
     assert "other-words" in line
+
+
+def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(rooms: Path, tmp_path: Path) -> None:
+    transformers = pytest.importorskip("transformers")
+    shape = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 8, "image_size": 32}
+    transformers.RadioModel(transformers.RadioConfig(**shape, max_img_size=64)).save_pretrained(tmp_path / "radio")
+    scenes = [str(rooms / f"room_{number}") for number in range(2)]
+    asked = ["train", *scenes, "experiment=scannet", f"teacher.model={tmp_path / 'radio'}", "holdout=room_1"]
+    less = ["teacher.size=64", "train.steps=2", "train.warmup=1", "train.workers=0", "sampling.gaussians=1500"]
+    out = tmp_path / "scannet"
+    assert cli.main([*asked, *less, "tensorboard=false", f"out={out}", "quiet=true"]) == 0
+    encoder, outputs, _ = load_weights(out / "encoder.safetensors")
+    assert sum(value.numel() for value in encoder.parameters()) > 40e6
+    assert outputs.space.teacher == "radio"
+    assert summary_of(out)["results"]["steps"] == 2
+
+
+def test_a_sweep_trains_once_for_each_value(rooms: Path, tmp_path: Path) -> None:
+    words = f"teacher.words={rooms / 'words.safetensors'}"
+    asked = [
+        "train",
+        "-m",
+        str(rooms / "room_0"),
+        words,
+        f"prepared={tmp_path / 'prepared'}",
+        f"out={tmp_path / 'out'}",
+    ]
+    quick = [word for word in QUICK if not word.startswith("train.steps")]
+    assert cli.main([*asked, *quick, "tensorboard=false", "train.steps=1,2"]) == 0
+    assert [summary_of(tmp_path / "out" / str(run))["results"]["steps"] for run in range(2)] == [1, 2]

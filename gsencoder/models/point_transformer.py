@@ -17,10 +17,10 @@ from gsencoder.models.serialize import Order
 class TransformerConfig:
     """The shape of the network. Lists have one entry a level, finest first; the decoder has one fewer."""
 
-    encoder_depths: tuple[int, ...] = field(default=(1, 1, 2, 2), metadata={"help": "blocks on the way down"})
-    encoder_channels: tuple[int, ...] = field(default=(32, 64, 96, 128), metadata={"help": "channels on the way down"})
-    decoder_depths: tuple[int, ...] = field(default=(0, 1, 1), metadata={"help": "blocks on the way up"})
-    decoder_channels: tuple[int, ...] = field(default=(64, 64, 96), metadata={"help": "channels on the way up"})
+    encoder_depths: tuple[int, ...] = field(default=(1, 1, 2, 2, 1), metadata={"help": "blocks on the way down"})
+    encoder_channels: tuple[int, ...] = field(default=(32, 64, 96, 128, 128), metadata={"help": "channels on the way down"})
+    decoder_depths: tuple[int, ...] = field(default=(0, 1, 1, 1), metadata={"help": "blocks on the way up"})
+    decoder_channels: tuple[int, ...] = field(default=(64, 64, 96, 128), metadata={"help": "channels on the way up"})
     head_channels: int = field(default=32, metadata={"help": "channels of an attention head"})
     patch: int = field(default=128, metadata={"help": "most tokens that attend to one another"})
     orders: tuple[Order, ...] = field(
