@@ -117,7 +117,7 @@ def measure(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
             for function, args, kwargs in recorded.products:
                 function(*args, **kwargs)
 
-    seconds = {"gaussians": len(splat), "tokens": joined.items[0]}
+    seconds = {"gaussians": len(splat), "tokens": len(joined.counts)}
     seconds["products"], seconds["forward"] = best(products), best(forward)
     seconds["plan"] = best(lambda: encoder.join([plan()[2]], round_up=dtype is not None), 3)
     return seconds

@@ -18,6 +18,8 @@ _HOME = {
     "save_splat": "gsencoder.data.splats",
     "load_scene": "gsencoder.data.scenes",
     "fuse": "gsencoder.fusion.fuse",
+    "encode": "gsencoder.infer.encode",
+    "load_weights": "gsencoder.models.weights",
     "localize": "gsencoder.infer.localize",
 }
 

@@ -1,17 +1,16 @@
 """`gsencoder encode SPLAT weights=FILE`: features on every Gaussian in one pass, without photographs or teacher."""
 
-import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsencoder.config import CommonConfig, settings
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
-from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import load_text_table, save_text_table
-from gsencoder.errors import SceneWarning
+from gsencoder.fusion.complete import with_gaussians
 from gsencoder.fusion.store import WORDS_FILE, save_features
-from gsencoder.infer.boxes import scene_spacing
 from gsencoder.infer.encode import EncodeConfig, encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.heap import keep_heap
@@ -21,9 +20,6 @@ from gsencoder.outputs import output_folder
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
 from gsencoder.types import Scene
-
-SPACING_IN_VOXELS = 1.0
-"""Where no unit is known, a splat is taken to have about one Gaussian in each cell of a surface, as seeds have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +56,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
             scene = load_scene(path, splat=config.splat or None, options=config.data)
         if scene.gaussians is None:
             with one.step("seeds"):
-                scene = replace(scene, gaussians=seed(scene, config.seeds))
+                scene = with_gaussians(scene, config.seeds)
         out = config.out or Path("outputs") / scene.name / "features"
         if len(paths) > 1:
             out = out / scene.name
@@ -80,17 +76,7 @@ def _encode_into(
     summary: Summary,
 ) -> None:
     assert scene.gaussians is not None
-    unit = scene.metres_per_unit
-    if unit is None:
-        spacing = scene_spacing(scene.gaussians.means)
-        unit = SPACING_IN_VOXELS * encoder.config.voxel / spacing if spacing else 1.0
-        warnings.warn(
-            f"encode: the unit of {scene.name!r} is unknown; its Gaussians lie {spacing:.4g} units apart, taken "
-            f"for the encoder's grid of {encoder.config.voxel:g} m (data.metres_per_unit={unit:.4g}); give "
-            "data.metres_per_unit= if you know better",
-            SceneWarning,
-            stacklevel=2,
-        )
+    unit = unit_of(scene, encoder.config.voxel)
     with summary.step("encode"):
         features = encode(
             scene.gaussians,

@@ -8,6 +8,7 @@ from rich.table import Table
 from gsencoder.config import CommonConfig
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError
 from gsencoder.evaluate.localization import (
@@ -46,6 +47,7 @@ class EvaluateConfig(CommonConfig):
         default="", metadata={"help": "encoder whose features are judged (see encode); empty = the teacher's, fused"}
     )
     protocol: LocalizationProtocol | NamingProtocol = field(default_factory=LocalizationProtocol)
+    splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
@@ -92,6 +94,7 @@ def _localization(
         words,
         protocol=protocol,
         data=config.data,
+        splat=config.splat,
         seeds=config.seeds,
         localization=config.localize,
         track=Progress(quiet=config.quiet),
@@ -117,6 +120,7 @@ def _naming(
         source,
         words,
         data=config.data,
+        splat=config.splat,
         seeds=config.seeds,
         fusion=config.fusion,
         track=Progress(quiet=config.quiet),

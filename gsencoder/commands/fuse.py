@@ -1,27 +1,26 @@
 """`gsencoder fuse SCENE… teacher=…`: per-Gaussian features from a teacher's maps of the views."""
 
 import shutil
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from gsencoder.config import CommonConfig, settings
-from gsencoder.data.orbits import orbit_cameras
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
-from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
 from gsencoder.errors import InputError
+from gsencoder.fusion.complete import with_gaussians, with_views
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.store import WORDS_FILE, save_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.outputs import output_folder
 from gsencoder.progress import Progress, console
-from gsencoder.render.rgb import RenderedImages
 from gsencoder.summary import Summary
-from gsencoder.types import Scene, Views
+from gsencoder.types import Scene
 
 MOST_ORBITS = 10_000
 
@@ -76,14 +75,8 @@ def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Sce
         scene = load_scene(path, splat=config.splat or None, options=config.data)
     if scene.gaussians is None:
         with summary.step("seeds"):
-            scene = replace(scene, gaussians=seed(scene, config.seeds))
-    if scene.views is None:
-        assert scene.gaussians is not None
-        cameras = orbit_cameras(scene.gaussians, count=config.orbits, up=scene.up)
-        names = tuple(f"orbit_{view:03d}" for view in range(len(cameras)))
-        images = RenderedImages(scene.gaussians, cameras, config.fusion.blend)
-        scene = replace(scene, views=Views(cameras=cameras, names=names, images=images))
-    return scene
+            scene = with_gaussians(scene, config.seeds)
+    return with_views(scene, config.orbits, config.fusion.blend)
 
 
 def work_folder(out: Path) -> Path:

@@ -1,8 +1,9 @@
 """`gsencoder train SCENE… out=FOLDER`: distil a teacher into an encoder that needs neither photographs nor teacher."""
 
+import hashlib
 import shutil
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import partial
@@ -17,10 +18,13 @@ from gsencoder.data.augment import AugmentConfig
 from gsencoder.data.batch import SamplingConfig
 from gsencoder.data.model_files import find_file
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
-from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.spacing import unit_of
+from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
 from gsencoder.errors import InputError
 from gsencoder.evaluate.naming import naming
+from gsencoder.fusion.complete import with_gaussians, with_views
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
@@ -33,7 +37,7 @@ from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.outputs import output_folder
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
-from gsencoder.train.distributed import Place, joined, wait_for_all
+from gsencoder.train.distributed import Place, joined, together
 from gsencoder.train.heads import load_heads
 from gsencoder.train.log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.train.losses import LossConfig
@@ -70,6 +74,8 @@ class TrainConfig(CommonConfig):
     )
     store: Literal["float16", "float32"] = field(default="float16", metadata={"help": "type of the written weights"})
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where the encoder computes"})
+    splat: str = field(default="", metadata={"help": f"Gaussians of scenes with views; empty = seeds. {READABLE}"})
+    orbits: int = field(default=24, metadata={"help": "cameras put around a splat that has no views"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
@@ -91,20 +97,21 @@ def run(config: TrainConfig, summary: Summary) -> None:
     with joined(config.device) as (place, device), ExitStack() as results:
         track = Progress(quiet=config.quiet or not place.first)
         folder = None
-        if place.first and not config.prepare_only:
-            # Opened now, so that an out= that cannot be written is told before hours of work.
-            folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
+        with together():
+            if place.first and not config.prepare_only:
+                # Opened now, so that an out= that cannot be written is told before hours of work.
+                folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
         with summary.step("prepare"):
             dataset = prepare(training, held_out, words, config, out, place, track)
         if config.prepare_only:
             counts = f"{len(training)} scenes to train on, {len(held_out)} for validation"
             console(config.quiet or not place.first).print(f"{dataset.folder}: {counts}")
             return
-        if place.first:
-            if not config.resume:
-                shutil.rmtree(work, ignore_errors=True)
-            work.mkdir(parents=True, exist_ok=True)
-        wait_for_all()
+        with together():
+            if place.first:
+                if not config.resume:
+                    shutil.rmtree(work, ignore_errors=True)
+                work.mkdir(parents=True, exist_ok=True)
         trainer, outputs = make_trainer(dataset, training, held_out, config, work, place, device)
         with summary.step("train"):
             done = trainer.run(track)
@@ -147,7 +154,7 @@ def make_trainer(
         config.loss,
         config.train,
         folder=work,
-        settings=_identity(config, place),
+        settings=_identity(config, place, dataset),
         heads=load_heads(find_file(config.heads, "heads"), outputs) if config.heads else (),
         place=place,
         device=device,
@@ -217,37 +224,87 @@ def prepare(
     place: Place,
     track: Progress,
 ) -> PreparedDataset:
-    """Prepares what is not prepared yet; processes share the scenes."""
+    """Prepares what is not prepared yet; processes share the scenes.
 
-    def open_scene(path: Path) -> tuple[Scene, Teacher]:
-        scene = load_scene(path, options=config.data)
-        return scene, build_teacher(config.teacher, scene, words)
-
+    Raises:
+        InputError: of any process; the scene is named.
+    """
     made_with = {
-        "data": settings(config.data),
-        "seeds": settings(config.seeds),
-        "teacher": settings(config.teacher),
-        "prepare": settings(config.prepare),
-        "training": [path.name for path in training],
+        "scenes": {path.name: str(path.resolve()) for path in training},
+        "words": _digest_of(words),
+        **{name: settings(getattr(config, name)) for name in ("data", "seeds", "teacher", "prepare")},
+        **{"splat": config.splat, "orbits": config.orbits, "voxel": config.model.voxel},
     }
     folder = config.prepared or out.with_name(f"{out.name}.prepared")
-    if place.first:
-        dataset = PreparedDataset(folder, made_with)
-        dataset.find_space(training, open_scene, config.prepare)
-    wait_for_all()
+    opened = OpenScenes(config, words)
+    with together():
+        if place.first:
+            dataset = PreparedDataset(folder, made_with)
+            dataset.find_space(training, opened.look, config.prepare)
     dataset = PreparedDataset(folder, made_with)
     missing = [path for path in [*training, *held_out] if not dataset.path_of(path.name).is_file()]
-    wait_for_all()  # Nobody begins before everybody has seen what is missing.
-    for path in track(missing[place.rank :: place.size], "preparing scenes"):
-        scene, teacher = open_scene(path)
-        if scene.gaussians is None:
-            scene = replace(scene, gaussians=seed(scene, config.seeds))
-        dataset.prepare(replace(scene, name=path.name), teacher, config.prepare)
-    wait_for_all()
-    if place.first:
-        dataset.find_rarity([path.name for path in training], track)
-    wait_for_all()
+    with together():
+        pass  # Nobody begins before everybody has seen what is missing.
+    with together():
+        for path in track(missing[place.rank :: place.size], "preparing scenes"):
+            dataset.prepare(*opened.complete(path), config.prepare)
+    with together():
+        if place.first:
+            dataset.find_rarity([path.name for path in training], track)
     return dataset
+
+
+class OpenScenes:
+    """Reads scenes and gives each its teacher: one for all, unless it is made of the scene's own labels."""
+
+    def __init__(self, config: TrainConfig, words: TextTable | None) -> None:
+        self.config, self.words = config, words
+        self._shared: Teacher | None = None
+
+    def look(self, path: Path) -> tuple[Scene, Teacher]:
+        """A scene for a look at its maps, without Gaussians where it has views.
+
+        Raises:
+            InputError: whatever is wrong with the scene, which is named.
+        """
+        with _named(path):
+            scene = load_scene(path, splat=self.config.splat or None, options=self.config.data)
+            if scene.views is None:
+                scene = with_views(scene, self.config.orbits, self.config.prepare.fusion.blend)
+            return scene, self._teacher(scene)
+
+    def complete(self, path: Path) -> tuple[Scene, Teacher]:
+        """A scene with Gaussians, views and a unit, under the name of its folder.
+
+        Raises:
+            InputError: whatever is wrong with the scene, which is named.
+        """
+        scene, teacher = self.look(path)
+        with _named(path):
+            scene = with_gaussians(scene, self.config.seeds)
+            return replace(scene, name=path.name, metres_per_unit=unit_of(scene, self.config.model.voxel)), teacher
+
+    def _teacher(self, scene: Scene) -> Teacher:
+        if isinstance(self.config.teacher, LabelsConfig):
+            return build_teacher(self.config.teacher, scene, self.words)
+        if self._shared is None:
+            self._shared = build_teacher(self.config.teacher, scene, self.words)
+        return self._shared
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """An error in the block says which of many scenes it is about."""
+    try:
+        yield
+    except InputError as error:
+        raise error if path.name in str(error) else InputError(f"{path}: {error}") from error
+
+
+def _digest_of(words: TextTable | None) -> str:
+    if words is None:
+        return ""
+    return hashlib.sha256(repr(words.names).encode() + words.embeddings.tobytes()).hexdigest()[:16]
 
 
 def _validate(
@@ -266,11 +323,11 @@ def _validate(
     return Validated({"names": found.score, "cosine": found.cosine}, pictures)
 
 
-def _identity(config: TrainConfig, place: Place) -> dict[str, Any]:
+def _identity(config: TrainConfig, place: Place, dataset: PreparedDataset) -> dict[str, Any]:
     """What a run must have in common with one that it continues."""
     chosen = {name: settings(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
     for name in ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "batch", "accumulate"):
         del chosen["train"][name]
-    told = {"teacher": settings(config.teacher), "holdout": list(config.holdout), "heads": config.heads}
+    told = {"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": config.heads}
     # How the samples of a step are spread over processes and micro-batches may change.
     return {**chosen, **told, "samples_per_step": config.train.batch * config.train.accumulate * place.size}

@@ -109,6 +109,12 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     metadata = {"gsencoder": json.dumps({"version": VERSION, **header})}
     try:
         save_file({name: _contiguous(array) for name, array in arrays.items()}, temporary, metadata)
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        # safetensors writes files that nobody else may read.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error

@@ -37,7 +37,8 @@ class AugmentConfig:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         for name in ("mirror", "drop", "scale", "light", "tint"):
             if not 0 <= getattr(self, name) <= (1 if name == "mirror" else 0.9):
-                raise InputError(f"{name}: expected a share from 0, got {getattr(self, name)}")
+                most = 1 if name == "mirror" else 0.9
+                raise InputError(f"{name}: expected a share from 0 to {most}, got {getattr(self, name)}")
 
 
 def augment(

@@ -60,6 +60,15 @@ def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras, *, near: floa
     return inside
 
 
+def seen_by(point: Float32[np.ndarray, "3"], cameras: Cameras, *, near: float = 0.01) -> Bool[np.ndarray, " V"]:
+    """True for cameras in whose image a point lies, beyond the near plane."""
+    x, y, z = (cameras.cam_from_world[:, :3, :3] @ point + cameras.cam_from_world[:, :3, 3]).T
+    safe = np.where(z > near, z, 1)
+    u = cameras.Ks[:, 0, 0] * x / safe + cameras.Ks[:, 0, 2]
+    v = cameras.Ks[:, 1, 1] * y / safe + cameras.Ks[:, 1, 2]
+    return np.asarray((z > near) & (u >= 0) & (u < cameras.widths) & (v >= 0) & (v < cameras.heights))
+
+
 def nearest(means: Float32[np.ndarray, "n 3"], center: Float32[np.ndarray, "3"], count: int) -> Int64[np.ndarray, " m"]:
     """The `count` rows nearest to a point, in ascending order of rows; all of them where there are no more."""
     if len(means) <= count:
@@ -102,25 +111,35 @@ def choose_part(
         Views without repetition (all that there are, where there are no more than asked for), and rows, ascending.
 
     Raises:
-        InputError: no Gaussian lies in any frustum of the drawn views.
+        InputError: no Gaussian lies in the frustum of any view.
     """
     everywhere = config.scope == "scene"
     if not 0 < size < len(means):
-        views = rng.permutation(len(cameras))[: config.views]
+        drawn = rng.permutation(len(cameras))
+        views = drawn[: config.views]
         rows = np.arange(len(means)) if everywhere else np.flatnonzero(in_frusta(means, cameras.select(views)))
+        for view in drawn[config.views :]:
+            if len(rows):
+                break
+            # A camera that looks into the void is no reason to stop; another takes its place.
+            views = np.array([view])
+            rows = np.flatnonzero(in_frusta(means, cameras.select(views)))
     else:
         center = means[_draw(chances, config, rng)]
-        looking = [view for view in range(len(cameras)) if in_frusta(center[None], cameras.select([view]))[0]]
-        views = rng.permutation(looking or len(cameras))[: config.views]
+        looking = np.flatnonzero(seen_by(center, cameras))
+        views = rng.permutation(looking if len(looking) else len(cameras))[: config.views]
         rows = nearest(means, center, len(means) if everywhere else _AROUND * size)
         if not everywhere:
             chosen = cameras.select(views)
             rows = rows[in_frusta(means[rows], chosen)]
             if len(rows) < size:
                 rows = np.flatnonzero(in_frusta(means, chosen))
+            if not len(rows):  # Nobody looks at the centre, and these views see nothing: take whoever sees something.
+                views = rng.permutation(len(cameras))
+                rows = np.flatnonzero(in_frusta(means, cameras))
         rows = rows[nearest(means[rows], center, size)]
     if not len(rows):
-        raise InputError("sample: no Gaussian lies in the frusta of the chosen views; check poses and units")
+        raise InputError("sample: no Gaussian lies in the frustum of any view; check poses and units")
     return tuple(int(view) for view in views), rows
 
 

@@ -20,7 +20,8 @@ from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.evaluate.boxes import Hit, accuracy, asked_objects, score_boxes
-from gsencoder.evaluate.sources import Source, with_gaussians
+from gsencoder.evaluate.sources import Source
+from gsencoder.fusion.complete import with_gaussians
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -74,6 +75,7 @@ def evaluate_localization(
     *,
     protocol: LocalizationProtocol = LocalizationProtocol(),
     data: SceneConfig = SceneConfig(),
+    splat: str = "",
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
     track: Track = lambda items, label: items,  # noqa: ARG005
@@ -86,6 +88,7 @@ def evaluate_localization(
         words: lead into their space.
         protocol: which objects are asked for.
         data: how scenes are read.
+        splat: Gaussians of each scene, relative to its folder; empty = seeds.
         seeds: how Gaussians are made for scenes without.
         localization: how words become boxes.
         track: wraps the loop over scenes to show progress.
@@ -102,7 +105,7 @@ def evaluate_localization(
     outcomes = []
     for path in track([Path(path) for path in paths], "scenes"):
         clock = time.perf_counter()
-        scene = load_scene(path, options=data)
+        scene = load_scene(path, splat=splat or None, options=data)
         loaded = time.perf_counter() - clock
         outcome = evaluate_scene(scene, source, words, protocol=protocol, seeds=seeds, localization=localization)
         outcomes.append(replace(outcome, seconds={"load": loaded, **outcome.seconds}))
@@ -123,7 +126,9 @@ def evaluate_scene(
     if not asked_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels):
         count = len(scene.gaussians) if scene.gaussians is not None else 0
         return SceneOutcome(scene=scene.name, hits=(), gaussians=count, seen=0, rank=0, boxless=0, seconds={})
-    scene, seconds = with_gaussians(scene, seeds)
+    start = time.perf_counter()
+    scene = with_gaussians(scene, seeds)
+    seconds = {"seeds": time.perf_counter() - start}
     features, spent = source(scene)
     start = time.perf_counter()
     hits, boxless = ask(scene, features, words, protocol, localization)

@@ -1,11 +1,12 @@
-"""The naming protocol: is the nearest word of a Gaussian's predicted feature that of its fused one?
+"""How well an encoder does on prepared scenes while it is trained: is the kind of its feature that of the fused one?
 
-For every scene the choices are the kinds of target that occur in it (for a labels teacher its names and "other"; for
-other teachers clusters of their features). Scores are averaged over kinds, so that a floor counts no more than a spoon.
+Kinds are what occurs in the training scenes: the vectors of a labels teacher, clusters of another's features. For
+every scene the choices are the kinds of its targets, and scores are averaged over kinds, so that a floor counts no more
+than a spoon. A name that no training scene has is counted as the nearest that one has; `naming_protocol` knows better.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -120,8 +121,11 @@ def view_pictures(
     view = len(scene.cameras) // 2
     b = blend(gaussians, scene.cameras, view)
     colors = fit_pca_colors(targets)
+    # Rendering is linear: three columns are rendered, not all channels, and colours are read off them as they are.
+    plain = replace(colors, mean=np.zeros(3), axes=np.eye(3))
     found = [render_image(gaussians, scene.cameras, view, blended=b)]
     for features in (targets, predicted):
-        rendered = b.render(torch.from_numpy(features)).numpy()
-        found.append(pca_picture(rendered.reshape(*b.shape, -1), colors, b.alpha.reshape(b.shape).numpy()))
+        columns = ((features - colors.mean) @ colors.axes).astype(np.float32)
+        rendered = b.render(torch.from_numpy(columns)).numpy()
+        found.append(pca_picture(rendered.reshape(*b.shape, 3), plain, b.alpha.reshape(b.shape).numpy()))
     return found

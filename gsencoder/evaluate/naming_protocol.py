@@ -18,7 +18,8 @@ from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError
 from gsencoder.evaluate.cosine import field_error
-from gsencoder.evaluate.sources import Source, with_gaussians
+from gsencoder.evaluate.sources import Source
+from gsencoder.fusion.complete import with_gaussians
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
@@ -65,6 +66,7 @@ def evaluate_naming(
     words: TextTable,
     *,
     data: SceneConfig = SceneConfig(),
+    splat: str = "",
     seeds: SeedConfig = SeedConfig(),
     fusion: FuseConfig = FuseConfig(),
     track: Track = lambda items, label: items,  # noqa: ARG005
@@ -76,6 +78,7 @@ def evaluate_naming(
         source: what gives a scene the features that are judged.
         words: of the labels teacher.
         data: how scenes are read.
+        splat: Gaussians of each scene, relative to its folder; empty = seeds.
         seeds: how Gaussians are made for scenes without.
         fusion: how the truth is fused.
         track: wraps the loop over scenes to show progress.
@@ -85,7 +88,7 @@ def evaluate_naming(
     """
     found = []
     for path in track([Path(path) for path in paths], "scenes"):
-        scene, seconds = with_gaussians(load_scene(path, options=data), seeds)
+        scene = with_gaussians(load_scene(path, splat=splat or None, options=data), seeds)
         teacher = build_teacher(LabelsConfig(), scene, words)
         assert isinstance(teacher, LabelsTeacher)
         truth = fuse(scene, teacher, fusion).features
@@ -107,7 +110,7 @@ def evaluate_naming(
                 total={teacher.names[code]: int(total[code]) for code in there},
                 right={teacher.names[code]: int(right[code]) for code in there},
                 cosine=cosine,
-                seconds={**seconds, **spent},
+                seconds=spent,
             )
         )
     return found

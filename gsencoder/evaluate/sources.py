@@ -2,9 +2,8 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
-from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.spacing import unit_of
 from gsencoder.data.text_table import TextTable
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
@@ -15,14 +14,6 @@ from gsencoder.types import GaussianFeatures, Scene
 
 Source = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
 """From a scene with Gaussians to their features, and the seconds of each step."""
-
-
-def with_gaussians(scene: Scene, config: SeedConfig) -> tuple[Scene, dict[str, float]]:
-    """The scene with Gaussians, seeds where it has none, and the seconds that these took."""
-    if scene.gaussians is not None:
-        return scene, {}
-    start = time.perf_counter()
-    return replace(scene, gaussians=seed(scene, config)), {"seeds": time.perf_counter() - start}
 
 
 def fused(teacher: TeacherConfig, words: TextTable | None, config: FuseConfig = FuseConfig()) -> Source:
@@ -36,12 +27,12 @@ def fused(teacher: TeacherConfig, words: TextTable | None, config: FuseConfig = 
 
 
 def encoded(encoder: GaussianEncoder, outputs: OutputSpace, config: EncodeConfig = EncodeConfig()) -> Source:
-    """Features that an encoder predicts; a scene of unknown unit is taken to be in metres."""
+    """Features that an encoder predicts."""
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         assert scene.gaussians is not None
         start = time.perf_counter()
-        unit = scene.metres_per_unit or 1.0
+        unit = unit_of(scene, encoder.config.voxel)
         features = encode(scene.gaussians, encoder, outputs, config, metres_per_unit=unit)
         return features, {"encode": time.perf_counter() - start}
 

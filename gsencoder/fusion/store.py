@@ -17,6 +17,8 @@ from gsencoder.errors import InputError
 from gsencoder.types import Cameras, FeatureBasis, GaussianFeatures, Gaussians, Scene, Views
 
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
+BLOCK = 16_384
+"""Rows that are turned into half precision at a time."""
 WORDS_FILE = "words.safetensors"
 """The text table whose words lead into the features, beside them where there is one."""
 
@@ -42,15 +44,22 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
         header["views"] = list(scene.views.names)
     write_archive(folder / SCENE_FILE, arrays, header)
     rows = np.flatnonzero(features.weights > 0)
-    kept = features.features[rows]
-    if not np.isfinite(kept).all():
-        bad = int((~np.isfinite(kept).all(axis=1)).sum())
-        raise InputError(f"save_features: {bad} of {len(rows)} rows are not finite")
-    largest = np.abs(kept).max(axis=0, initial=0)
+    # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
+    blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
+    largest = np.zeros(features.features.shape[1], np.float32)
+    for block in blocks:
+        kept = features.features[block]
+        if not np.isfinite(kept).all():
+            bad = int((~np.isfinite(kept).all(axis=1)).sum())
+            raise InputError(f"save_features: {bad} or more of {len(rows)} rows are not finite")
+        largest = np.maximum(largest, np.abs(kept).max(axis=0))
     channel_scale = np.where(largest > 0, largest, 1).astype(np.float32)
+    halves = np.empty((len(rows), len(largest)), np.float16)
+    for number, block in enumerate(blocks):
+        halves[number * BLOCK : number * BLOCK + len(block)] = features.features[block] / channel_scale
     arrays = {
         "rows": rows.astype(np.int32),
-        "features": (kept / channel_scale).astype(np.float16),
+        "features": halves,
         "channel_scale": channel_scale,
         "weights": features.weights[rows],
         "mean": features.mean,

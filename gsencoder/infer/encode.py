@@ -82,16 +82,23 @@ def encode(
     encoder = encoder.to(device).eval()
     voxel = encoder.config.voxel / metres_per_unit
     result = np.zeros((len(gaussians), outputs.channels), np.float32)
+    bad = 0
     chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
     with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype is not None):
         for chunk in track(chunks, "encoding"):
             attributes, opacities, plan = encoder_inputs(gaussians.select(chunk.rows), encoder.config, voxel, device)
             found = encoder(attributes, opacities, encoder.join([plan], round_up=True))
-            result[chunk.own] = found[: len(chunk.own)].cpu().numpy()
-    bad = int((~np.isfinite(result).all(axis=1)).sum())
+            bad += int((~torch.isfinite(found[: len(chunk.own)]).all(dim=1)).sum())
+            result[chunk.own] = outputs.restore(found[: len(chunk.own)].cpu().numpy())
     if bad:
-        raise InputError(f"encode: {bad} of {len(result)} features are not finite; try encode.precision=float32")
-    return outputs.features(result, np.ones(len(gaussians), np.float32))
+        raise InputError(f"encode: {bad} of {len(result)} features are not finite; try precision=float32")
+    return GaussianFeatures(
+        features=result,
+        weights=np.ones(len(gaussians), np.float32),
+        mean=outputs.mean,
+        space=outputs.space,
+        basis=outputs.basis,
+    )
 
 
 def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chunk]:

@@ -9,8 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.data.spacing import scene_spacing
 from gsencoder.errors import InputError, SceneWarning
-from gsencoder.infer.boxes import box_around, cluster, scene_spacing, score_clusters
+from gsencoder.infer.boxes import box_around, cluster, score_clusters
 from gsencoder.infer.relevancy import ThresholdConfig, relevancy, threshold
 from gsencoder.infer.text import TextEncoder, check_space
 from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scene
@@ -18,7 +19,7 @@ from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scen
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizeConfig:
-    """How words become boxes. Lengths in units of the scene's spacing (`infer.boxes.scene_spacing`)."""
+    """How words become boxes. Lengths in units of the scene's spacing (`data.spacing.scene_spacing`)."""
 
     mode: Literal["centred", "raw"] = field(
         default="centred", metadata={"help": "cosines after removing each side's mean, or as they are"}

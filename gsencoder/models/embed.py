@@ -3,8 +3,8 @@ file happened to choose.
 
 A rotation is given as a quaternion and an order of axes, and the same ellipsoid has 48 such descriptions; a network
 would have to learn that they are one. The logarithm of the covariance has one value for each ellipsoid, is linear in
-log-scales, and stays within a few units where scales run from 1e-9 to 1e4. Its mean (the size) and its rest (shape and
-direction) are separate inputs, so that each can be left out.
+log-scales, and stays within a few units where scales run from 1e-9 to 1e4. `rotation` is the part of it that has a
+direction; `scale` the sorted log-scales themselves, so that either can be left out.
 """
 
 import math

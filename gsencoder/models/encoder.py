@@ -62,7 +62,7 @@ class GaussianEncoder(nn.Module):
     def forward(
         self, attributes: Float[Tensor, "N A"], opacities: Float[Tensor, " N"], plan: Plan
     ) -> Float[Tensor, "N channels"]:
-        """Features in standard units (see `TargetSpace`), float32 whatever the network computed in.
+        """Features in standard units (see `OutputSpace`), float32 whatever the network computed in.
 
         Args:
             attributes: of `embed`, with the configuration's inputs.

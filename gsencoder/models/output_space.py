@@ -15,7 +15,7 @@ from jaxtyping import Float32
 
 from gsencoder.data.archive import Archive, space_from_json, space_to_json
 from gsencoder.errors import InputError
-from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
+from gsencoder.types import FeatureBasis, FeatureSpace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,14 +61,6 @@ class OutputSpace:
         """The inverse of `standardize`."""
         scaled = outputs * np.float32(self.unit)
         return np.asarray(scaled if self.basis is not None else scaled + self.mean, dtype=np.float32)
-
-    def features(
-        self, outputs: Float32[np.ndarray, "N channels"], weights: Float32[np.ndarray, " N"]
-    ) -> GaussianFeatures:
-        """Outputs on Gaussians as features, in the form that fused ones have."""
-        return GaussianFeatures(
-            features=self.restore(outputs), weights=weights, mean=self.mean, space=self.space, basis=self.basis
-        )
 
 
 def write_outputs(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -48,14 +48,12 @@ class Plan(NamedTuple):
         members: the Gaussians sorted by token.
         counts: how many of them each token has.
         levels: finest first.
-        items: T of each cloud at the finest level.
     """
 
     token_of: Int64[Tensor, " N"]
     members: Int64[Tensor, " N"]
     counts: Int64[Tensor, " T"]
     levels: tuple[Level, ...]
-    items: tuple[int, ...]
 
     def to(self, device: str | torch.device) -> "Plan":
         """The same on another device."""
@@ -162,7 +160,6 @@ def join_plans(clouds: Sequence[CloudPlan], patch: int, *, round_up: bool = Fals
         members=_shifted([cloud.members for cloud in clouds], gaussians),
         counts=torch.cat([cloud.counts for cloud in clouds]),
         levels=tuple(levels),
-        items=tuple(tokens),
     )
 
 
@@ -232,10 +229,3 @@ def _patches(
     # A patch of nothing attends to a token again and again, without a mask; nobody reads the result.
     patches = size(len(used))
     return _grown(places, patches).flatten(), slots, _grown(used, patches, 1)
-
-
-def make_plan(
-    means: Float[Tensor, "N 3"], voxel: float, *, levels: int, patch: int, orders: Sequence[Order] = ORDERS
-) -> Plan:
-    """The plan of one cloud on its own; see `plan_cloud` and `join_plans`."""
-    return join_plans([plan_cloud(means, voxel, levels=levels, orders=orders)], patch)

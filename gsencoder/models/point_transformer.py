@@ -18,7 +18,9 @@ class TransformerConfig:
     """The shape of the network. Lists have one entry a level, finest first; the decoder has one fewer."""
 
     encoder_depths: tuple[int, ...] = field(default=(1, 1, 2, 2, 1), metadata={"help": "blocks on the way down"})
-    encoder_channels: tuple[int, ...] = field(default=(32, 64, 96, 128, 128), metadata={"help": "channels on the way down"})
+    encoder_channels: tuple[int, ...] = field(
+        default=(32, 64, 96, 128, 128), metadata={"help": "channels on the way down"}
+    )
     decoder_depths: tuple[int, ...] = field(default=(0, 1, 1, 1), metadata={"help": "blocks on the way up"})
     decoder_channels: tuple[int, ...] = field(default=(64, 64, 96, 128), metadata={"help": "channels on the way up"})
     head_channels: int = field(default=32, metadata={"help": "channels of an attention head"})
@@ -93,7 +95,8 @@ class PointTransformer(nn.Module):
             self.up.append(_blocks(config, up[level], [config.drop_path * level / config.levels] * depth))
 
     def forward(self, x: Float[Tensor, "T C"], plan: Plan) -> Float[Tensor, "T D"]:
-        """Each level's blocks follow the orders in turn; in training the turn begins at random in a random order.
+        """Blocks follow the orders in turn, from the first on the way down to the last on the way up; in training the
+        orders are shuffled.
 
         Args:
             x: embedded tokens, C = encoder_channels[0].
@@ -102,19 +105,22 @@ class PointTransformer(nn.Module):
         count = len(self.config.orders)
         turn = torch.randperm(count).tolist() if self.training else list(range(count))
         skips: list[Tensor] = []
+        before = 0
         for level, blocks in enumerate(self.down):
             if level:
                 skips.append(x)
                 x = self.pools[level - 1](x, plan.levels[level - 1].children)
-            x = self._run(blocks, x, plan.levels[level], turn)
+            x = self._run(blocks, x, plan.levels[level], turn, before)
+            before += self.config.encoder_depths[level]
         for level in reversed(range(len(self.up))):
             x = self.unpools[level](x, skips[level], plan.levels[level].parents)
-            x = self._run(self.up[level], x, plan.levels[level], turn)
+            x = self._run(self.up[level], x, plan.levels[level], turn, before)
+            before += self.config.decoder_depths[level]
         return x
 
-    def _run(self, blocks: nn.Module, x: Tensor, level: Level, turn: list[int]) -> Tensor:
+    def _run(self, blocks: nn.Module, x: Tensor, level: Level, turn: list[int], before: int) -> Tensor:
         assert isinstance(blocks, nn.ModuleList)
-        for number, block in enumerate(blocks):
+        for number, block in enumerate(blocks, start=before):
             order = turn[number % len(turn)]
             places = (level.neighbors, level.gathers[order], level.scatters[order], level.padding, level.width)
             if self.config.checkpoint and self.training:

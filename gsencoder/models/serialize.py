@@ -86,17 +86,13 @@ def morton_codes(cells: Int64[Tensor, "N 3"]) -> Int64[Tensor, " N"]:
     return (spread[:, 0] << 2) | (spread[:, 1] << 1) | spread[:, 2]
 
 
-def hilbert_codes(cells: Int64[Tensor, "N 3"], bits: int) -> Int64[Tensor, " N"]:
-    """Positions along Hilbert's curve, which only ever steps to a face neighbour, for coordinates below 2^bits.
+def _hilbert_from_morton(morton: Int64[Tensor, " N"], bits: int) -> Int64[Tensor, " N"]:
+    """Positions along Hilbert's curve, which only ever steps to a face neighbour.
 
+    Hamilton 2006, "Compact Hilbert indices": the curve within a cell is one of 24 orientations, and a table gives,
+    for an orientation and the octants of the next two levels, their places on the curve and the orientation inside.
     `bits` says how far to look and changes nothing else, so that a part of a scene is ordered as in the whole.
     """
-    return _hilbert_from_morton(morton_codes(cells), bits)
-
-
-def _hilbert_from_morton(morton: Int64[Tensor, " N"], bits: int) -> Int64[Tensor, " N"]:
-    """Hamilton 2006, "Compact Hilbert indices": the curve within a cell is one of 24 orientations, and a table gives,
-    for an orientation and the octants of the next two levels, their places on the curve and the orientation inside."""
     table = _hilbert_table().to(morton.device)
     code, state = torch.zeros_like(morton), torch.zeros_like(morton)
     levels = bits + bits % 2

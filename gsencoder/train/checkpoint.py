@@ -4,7 +4,7 @@ The schedule, the order of samples and everything random are functions of the se
 that has to be kept of them.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,12 @@ class Progress:
     Attributes:
         step: steps that are done.
         seconds: that they took.
+        unlogged: losses of the last steps, which the next line of the log stands for too.
     """
 
     step: int = 0
     seconds: float = 0.0
+    unlogged: tuple[dict[str, float], ...] = ()
 
 
 def save_checkpoint(
@@ -52,7 +54,7 @@ def save_checkpoint(
     for name, parameter in model.named_parameters():
         for key, value in optimizer.state.get(parameter, {}).items():
             arrays[f"optimizer.{key}.{name}"] = value.detach().float().cpu().numpy()
-    header = {"step": progress.step, "seconds": progress.seconds, "settings": settings}
+    header = {**asdict(progress), "settings": settings}
     write_archive(path, arrays, header)
 
 
@@ -88,11 +90,11 @@ def load_checkpoint(
         progress = Progress(
             step=file.value("step", int),
             seconds=float(file.value("seconds", float, int)),
+            unlogged=tuple(file.value("unlogged", list)),
         )
     model.load_state_dict(state)
     for parameter, values in moments.items():
-        on_device = {key: value if key == "step" else value.to(parameter.device) for key, value in values.items()}
-        optimizer.state[parameter] = on_device
+        optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in values.items()}
     return progress
 
 

@@ -90,8 +90,8 @@ def _coded_space(
 
 
 def _dense_space(moments: Moments, teacher: Teacher, config: FuseConfig) -> OutputSpace:
-    mean = teacher.mean if teacher.mean is not None else moments.mean.astype(np.float32)
-    covariance = moments.covariance()
+    # The mean of what was looked at, and not one that the teacher states: moments are taken about it.
+    mean, covariance = moments.mean.astype(np.float32), moments.covariance()
     basis = None
     if config.basis and teacher.space.channels > config.narrow:
         basis = fit_basis(

@@ -39,11 +39,13 @@ class Distillation:
         }
 
     def __call__(self, batch: Batch) -> dict[str, Sum]:
-        """Totals and weights of the terms that the batch has."""
+        """Totals and weights of the terms that count; a batch without rows has a render loss of nothing."""
         predicted = self.encoder(batch.attributes, batch.opacities, batch.plan)
+        terms = {}
         with torch.autocast(predicted.device.type, enabled=False):
-            terms = {"field": field_loss(predicted, batch.targets, batch.weights, self.config)}
-            if self.config.render_weight and len(batch.rows.row_weights):
+            if self.config.field_weight:
+                terms["field"] = field_loss(predicted, batch.targets, batch.weights, self.config)
+            if self.config.render_weight:
                 terms["render"] = self._render(predicted, batch.rows)
         return terms
 

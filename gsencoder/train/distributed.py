@@ -84,12 +84,13 @@ def _number(environment: Mapping[str, str], name: str, default: str) -> int:
 
 
 @contextmanager
-def joined(device: str = "auto", *, timeout_minutes: float = 60.0) -> Iterator[tuple[Place, torch.device]]:
+def joined(device: str = "auto", *, timeout_hours: float = 24.0) -> Iterator[tuple[Place, torch.device]]:
     """Meets the other processes for the block; yields the place and the device of this one.
 
     Args:
         device: "auto" (a GPU for each process of a machine where there are enough, else the CPU), "cpu" or "cuda".
-        timeout_minutes: how long to wait for the others: validation and preparation may keep one busy.
+        timeout_hours: how long to wait for the others: preparation may keep one busy. A process that dies is noticed by
+            the launcher, not by this.
 
     Raises:
         InputError: no such device, or the others cannot be met.
@@ -106,15 +107,14 @@ def joined(device: str = "auto", *, timeout_minutes: float = 60.0) -> Iterator[t
             init_method=meeting,
             rank=place.rank,
             world_size=place.size,
-            timeout=timedelta(minutes=timeout_minutes),
+            timeout=timedelta(hours=timeout_hours),
         )
     except (RuntimeError, ValueError) as error:
         message = " ".join(str(error).split())[:200]
         raise InputError(f"training: process {place.rank} of {place.size} cannot meet the others: {message}") from error
-    try:
-        yield place, chosen
-    finally:
-        distributed.destroy_process_group()
+    yield place, chosen
+    # Not after an error: the others may be waiting for a sum, and leaving the group would wait for them.
+    distributed.destroy_process_group()
 
 
 def _device(name: str, place: Place) -> torch.device:
@@ -139,9 +139,24 @@ def sum_over_processes(values: Tensor) -> Tensor:
     return values
 
 
-def wait_for_all() -> None:
-    """Returns when every process has come here."""
-    if distributed.is_available() and distributed.is_initialized():
-        # A sum rather than a barrier: it needs no device to be named.
-        device = "cuda" if distributed.get_backend() == "nccl" else "cpu"
-        distributed.all_reduce(torch.zeros(1, device=device))
+@contextmanager
+def together() -> Iterator[None]:
+    """A block that processes go through on their own, one of them perhaps doing all the work. They leave it together,
+    and if one of them fails in it, all do: none is left waiting.
+
+    Raises:
+        InputError: this process's own, or that another failed.
+    """
+    failure: InputError | None = None
+    try:
+        yield
+    except InputError as error:
+        failure = error
+    failed = torch.tensor([float(failure is not None)])
+    if distributed.is_available() and distributed.is_initialized() and distributed.get_backend() == "nccl":
+        failed = failed.cuda()
+    count = int(sum_over_processes(failed).item())
+    if failure is not None:
+        raise failure
+    if count:
+        raise InputError("training: another process stopped; its own message says why")

@@ -2,13 +2,14 @@
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from gsencoder.data.atomic import atomic_file
 from gsencoder.errors import InputError
 
 LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
@@ -17,10 +18,10 @@ LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
 class Log:
     """Rows of numbers by step. The file is closed after every row, so that a kill loses none."""
 
-    def __init__(self, folder: Path, *, first_step: int, events: bool) -> None:
+    def __init__(self, folder: Path, *, done: int, events: bool) -> None:
         """Args:
         folder: where the log lies; rows of steps that will be done again are taken out.
-        first_step: the step that comes next.
+        done: steps that are done; a row carries the number of steps that were done when it was written.
         events: whether to write TensorBoard events too.
 
         Raises:
@@ -36,21 +37,19 @@ class Log:
                 raise InputError(
                     "tensorboard=true needs the package tensorboard (pip install tensorboard), or tensorboard=false"
                 ) from error
-            # Events of steps at or after this one, left by a run that was killed, are no longer shown.
-            self._writer = SummaryWriter(str(folder / EVENTS_FOLDER), purge_step=first_step)
+            # Events of later steps, left by a run that was killed, are no longer shown.
+            self._writer = SummaryWriter(str(folder / EVENTS_FOLDER), purge_step=done + 1)
         try:
-            self._keep_before(first_step)
+            self._keep_until(done)
         except (OSError, ValueError, KeyError) as error:
             raise InputError(f"{self.path}: cannot be continued: {error}") from error
 
-    def _keep_before(self, step: int) -> None:
+    def _keep_until(self, done: int) -> None:
         if not self.path.is_file():
             return
-        rows = read_log(self.path)
-        kept = [row for row in rows if int(row["step"]) < step]
-        self.path.unlink()
-        for row in kept:
-            self._append(row)
+        kept = [row for row in read_log(self.path) if int(row["step"]) <= done]
+        self._columns = list(dict.fromkeys(name for row in kept for name in row))
+        self._rewrite(kept)
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
         """One row; every number is also a TensorBoard scalar.
@@ -83,15 +82,18 @@ class Log:
         try:
             if new and self._columns:
                 # Validation adds columns: the file is written anew, once, with empty cells before.
-                rows = read_log(self.path)
                 self._columns += new
-                self.path.write_text(_text(self._columns, [*rows, row], header=True), encoding="utf-8")
+                self._rewrite([*read_log(self.path), row])
                 return
             self._columns += new
             with self.path.open("a", encoding="utf-8", newline="") as stream:
                 stream.write(_text(self._columns, [row], header=bool(new)))
         except OSError as error:
             raise InputError(f"{self.path}: cannot write: {error.strerror or error}") from error
+
+    def _rewrite(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        with atomic_file(self.path) as stream:
+            stream.write((_text(self._columns, rows, header=True) if rows else "").encode())
 
     def close(self) -> None:
         """Writes what TensorBoard still holds."""
@@ -100,12 +102,12 @@ class Log:
 
 
 def read_log(path: Path) -> list[dict[str, str]]:
-    """The rows of a log, as text; empty cells are left out."""
-    with path.open(encoding="utf-8", newline="") as stream:
-        return [{name: cell for name, cell in row.items() if name and cell} for row in csv.DictReader(stream)]
+    """The rows of a log, as text; empty cells are left out, and so is a last line that a kill left unfinished."""
+    whole = path.read_text(encoding="utf-8").rpartition("\n")[0]
+    return [{name: cell for name, cell in row.items() if name and cell} for row in csv.DictReader(whole.splitlines())]
 
 
-def _text(columns: list[str], rows: list[Mapping[str, Any]] | list[dict[str, str]], *, header: bool) -> str:
+def _text(columns: Sequence[str], rows: Sequence[Mapping[str, Any]], *, header: bool) -> str:
     stream = io.StringIO()
     writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
     if header:

@@ -1,13 +1,15 @@
 """Making scenes ready for training: everything that does not depend on the encoder is worked out once, and kept."""
 
+import hashlib
 import json
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32
 
 from gsencoder.data.archive import open_archive, write_archive
 from gsencoder.data.atomic import atomic_file
@@ -22,11 +24,11 @@ from gsencoder.render import blend
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.prepared import PreparedScene, ViewRows, write_prepared
 from gsencoder.train.rarity import Rarity, cluster_targets, count_targets
-from gsencoder.types import FeatureMap, Scene
+from gsencoder.types import FeatureMap, Scene, Views
 
 SPACE_FILE, SETTINGS_FILE, RARITY_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
-SAMPLED_TARGETS = 2048
-"""Targets of each scene that clusters are sought in."""
+SAMPLED_TARGETS = 200_000
+"""Targets of all scenes together that clusters are sought in."""
 
 Track = Callable[[Iterable[Any], str], Iterable[Any]]
 
@@ -53,6 +55,36 @@ class PrepareConfig:
             raise InputError(f"render_min_weight: expected a number in [0, 1), got {self.render_min_weight}")
 
 
+class KeptMaps:
+    """A teacher whose maps are wanted twice, for the targets and for the rows: a dear one's are kept as files.
+
+    They are kept in half the precision, and the kept ones are what is given, so that both uses see the same.
+    """
+
+    def __init__(self, teacher: Teacher, folder: Path) -> None:
+        self.teacher, self.folder = teacher, folder
+        self.space, self.table, self.mean = teacher.space, teacher.table, teacher.mean
+        self.needs_images, self.cheap = teacher.needs_images, teacher.cheap
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """The teacher's map of a view, from its file where there is one."""
+        path = self.folder / f"{view}.npz"
+        if self.cheap:
+            return self.teacher.feature_map(views, view)
+        if not path.is_file():
+            found = self.teacher.feature_map(views, view)
+            if found.features is None:
+                return found
+            np.savez(path, features=found.features.astype(np.float16), grid=found.grid_from_image)
+        with np.load(path, allow_pickle=False) as kept:
+            return FeatureMap(
+                features=kept["features"].astype(np.float32), grid_from_image=kept["grid"], space=self.space
+            )
+
+    def settings(self) -> dict[str, Any]:
+        return self.teacher.settings()
+
+
 class PreparedDataset:
     """A folder of prepared scenes that share an output space.
 
@@ -69,7 +101,7 @@ class PreparedDataset:
             InputError: it was made with others, or cannot be used.
         """
         self.folder = folder
-        wanted = json.loads(json.dumps(settings, default=str))
+        self.settings = wanted = json.loads(json.dumps(settings, default=str))
         path = folder / SETTINGS_FILE
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -97,6 +129,10 @@ class PreparedDataset:
             arrays["codebook"] = codebook
         write_archive(self.folder / SPACE_FILE, arrays, header)
 
+    def fingerprint(self) -> str:
+        """Of the output space: what was trained towards another one cannot go on towards this."""
+        return hashlib.sha256((self.folder / SPACE_FILE).read_bytes()).hexdigest()[:16]
+
     def load_space(self) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
         """The output space, and the vectors of a coded teacher's codes.
 
@@ -121,7 +157,8 @@ class PreparedDataset:
         outputs, _ = self.load_space()
         path = self.path_of(scene.name)
         path.parent.mkdir(exist_ok=True)
-        prepare_scene(path, scene, teacher, outputs, config)
+        with tempfile.TemporaryDirectory(dir=self.folder, prefix=".maps.") as maps:
+            prepare_scene(path, scene, KeptMaps(teacher, Path(maps)), outputs, config)
 
     def find_rarity(self, names: Sequence[str], track: Track) -> None:
         """Counts how often each kind of target occurs in the training scenes, unless that has been done."""
@@ -132,10 +169,13 @@ class PreparedDataset:
 
         def seen_targets(scene: PreparedScene, most: int = 0) -> Float32[np.ndarray, "n channels"]:
             rows = np.flatnonzero(scene.weights)
-            return scene.targets(rows[:: max(1, len(rows) // most)] if most else rows)
+            targets = scene.targets(rows[:: -(-len(rows) // most)] if most else rows)
+            scene.close()
+            return targets
 
         if codebook is None:
-            codebook = cluster_targets(np.concatenate([seen_targets(scene, SAMPLED_TARGETS) for scene in scenes]))
+            share = max(1, SAMPLED_TARGETS // len(scenes))
+            codebook = cluster_targets(np.concatenate([seen_targets(scene, share) for scene in scenes]))
         rarity = count_targets((seen_targets(scene) for scene in track(scenes, "counting targets")), codebook)
         write_archive(self.folder / RARITY_FILE, {"codebook": rarity.codebook, "counts": rarity.counts}, {})
 
@@ -200,19 +240,24 @@ def _pooled(
         raise InputError(f"prepare: a map of {feature_map.width}×{feature_map.height} has no cell of {cell} pixels")
     if feature_map.codes is not None:
         assert feature_map.table is not None
-        codes = feature_map.codes
-        table = np.concatenate((_standard(feature_map.table, outputs), np.full((1, outputs.channels), np.nan)))
-        grid = table.astype(np.float32)[codes]
+        # Shares of the codes in each cell, and not vectors in each pixel: the same by linearity, and far smaller.
+        codes = feature_map.codes[: height * factor, : width * factor]
+        line, column = np.divmod(np.arange(codes.size), codes.shape[1])
+        cell_of = (line // factor) * width + column // factor
+        count = len(feature_map.table) + 1
+        counts = np.bincount(cell_of * count + codes.ravel() + 1, minlength=height * width * count)
+        shares = counts.reshape(height * width, count) / factor**2
+        valid = shares[:, 0] == 0
+        vectors = (shares[:, 1:] @ _standard(feature_map.table, outputs)).astype(np.float32)
     else:
         assert feature_map.features is not None
-        grid = _standard(feature_map.features, outputs)
-    cells = grid[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
-    vectors = cells.mean(axis=(1, 3)).reshape(height * width, -1)
-    valid = np.isfinite(vectors).all(axis=1)
-    scaled: Float64[np.ndarray, "2 3"] = affine / factor
+        grid = _standard(feature_map.features, outputs)[: height * factor, : width * factor]
+        vectors = grid.reshape(height, factor, width, factor, -1).mean(axis=(1, 3)).reshape(height * width, -1)
+        valid = np.isfinite(vectors).all(axis=1)
     like = FeatureMap(
-        features=np.zeros((height, width, feature_map.space.channels), np.float32),
-        grid_from_image=scaled,
+        codes=np.zeros((height, width), np.int32),
+        table=np.zeros((1, feature_map.space.channels), np.float32),
+        grid_from_image=affine / factor,
         space=feature_map.space,
     )
     return np.where(valid[:, None], vectors, np.float32(0)), valid, like

@@ -76,6 +76,10 @@ class PreparedScene:
             names = tuple(str(name) for name in file.value("views", list))
             return cameras, file.value("metres_per_unit", float, int, None), file.value("up", list, None), names
 
+    def close(self) -> None:
+        """Lets go of the file, which is opened again when something is asked for."""
+        self.__dict__.pop("_arrays", None)
+
     def __len__(self) -> int:
         return len(self._arrays["means"])
 

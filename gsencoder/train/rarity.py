@@ -62,6 +62,7 @@ def cluster_targets(sample: Float32[np.ndarray, "n channels"], *, seed: int = 0)
     """A codebook for targets that have no names: means of clusters of a sample of them."""
     from sklearn.cluster import MiniBatchKMeans
 
-    count = min(CLUSTERS, len(np.unique(sample, axis=0)))
+    some = sample[:: max(1, len(sample) // 4096)]
+    count = min(CLUSTERS, len(np.unique(some, axis=0)))
     found = MiniBatchKMeans(n_clusters=count, random_state=seed, batch_size=4096, n_init=3).fit(sample)
     return np.asarray(found.cluster_centers_, dtype=np.float32)

@@ -5,6 +5,7 @@ there are, or on what was made before, so that a run may be cut off and resumed,
 through the same samples.
 """
 
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -25,6 +26,9 @@ from gsencoder.render.lattice import Lattice
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepared import PreparedScene, ViewRows
 from gsencoder.train.rarity import Rarity, nearest_codes
+
+OPEN_SCENES = 256
+"""Scenes that a process keeps open, the latest used."""
 
 
 class Rows(NamedTuple):
@@ -109,19 +113,39 @@ class SampleDataset(Dataset[Sample]):
         if not scenes:
             raise InputError("training: no scenes to train on")
         self.scenes, self.recipe = list(scenes), recipe
-        self._codes: dict[int, np.ndarray] = {}
+        self._codes: OrderedDict[int, np.ndarray] = OrderedDict()
 
-    def __getitem__(self, number: int) -> Sample:
+    def __getitem__(self, number: int) -> Sample | InputError:  # type: ignore[override]
+        """Sample `number`, or why there is none: from another process an error would come as a heap of text."""
+        try:
+            return self.make(number)
+        except InputError as error:
+            return error
+
+    def make(self, number: int) -> Sample:
+        """Sample `number`.
+
+        Raises:
+            InputError: a scene that cannot be read, or whose views see nothing.
+        """
         epoch, place = divmod(number, len(self.scenes))
         order = np.random.default_rng([self.recipe.seed, 0, epoch]).permutation(len(self.scenes))
         rng = np.random.default_rng([self.recipe.seed, 1, number])
         step = np.random.default_rng([self.recipe.seed, 2, number // self.recipe.step_samples])
         size = crop_size(self.recipe.sampling, step)
         which = int(order[place])
-        scene, rarity = self.scenes[which], self.recipe.rarity
+        scene = self.scenes[which]
+        return make_sample(scene, self._codes_of(which), self.recipe, size, rng)
+
+    def _codes_of(self, which: int) -> Int16[np.ndarray, " N"]:
+        """Kinds of a scene's targets. Only so many scenes are kept open: each holds a file descriptor."""
         if which not in self._codes:
-            self._codes[which] = target_codes(scene, rarity)
-        return make_sample(scene, self._codes[which], self.recipe, size, rng)
+            self._codes[which] = target_codes(self.scenes[which], self.recipe.rarity)
+        self._codes.move_to_end(which)
+        if len(self._codes) > OPEN_SCENES:
+            oldest, _ = self._codes.popitem(last=False)
+            self.scenes[oldest].close()
+        return self._codes[which]
 
 
 class StepSampler(Sampler[list[int]]):
@@ -203,7 +227,7 @@ def make_sample(
         plan=plan,
         targets=torch.from_numpy(scene.targets(kept)),
         weights=torch.from_numpy(weights[kept]),
-        rows=_stack(rows, [0] * len(rows), scene.channels, recipe),
+        rows=_stack(rows, scene.channels, recipe),
     )
 
 
@@ -254,29 +278,33 @@ def _row_sums(values: np.ndarray, starts: np.ndarray, crow: np.ndarray) -> np.nd
     return np.where(np.diff(crow) > 0, total, 0)
 
 
-def _stack(views: Sequence[ViewRows], shifts: Sequence[int], channels: int, recipe: SampleRecipe) -> Rows:
-    """Rows of several views as one matrix; `shifts` are added to columns."""
+def _stack(views: Sequence[ViewRows], channels: int, recipe: SampleRecipe) -> Rows:
+    """Rows of several views as one matrix."""
     entries = np.cumsum([0, *(len(view.col) for view in views)])
     crows = [view.crow[:-1] + start for view, start in zip(views, entries[:-1], strict=True)]
     targets = np.concatenate([np.zeros((0, channels), np.float32), *(view.targets for view in views)])
     weights = recipe.rarity.weights(targets, recipe.losses.rarity)
-    cols = [view.col + np.int32(shift) for view, shift in zip(views, shifts, strict=True)]
     return Rows(
         crow=torch.from_numpy(np.concatenate([*crows, entries[-1:]]).astype(np.int64)),
-        col=torch.from_numpy(np.concatenate([np.zeros(0, np.int32), *cols])),
+        col=torch.from_numpy(np.concatenate([np.zeros(0, np.int32), *(view.col for view in views)])),
         weight=torch.from_numpy(np.concatenate([np.zeros(0, np.float32), *(view.weight for view in views)])),
         targets=torch.from_numpy(targets),
         row_weights=torch.from_numpy(weights),
     )
 
 
-def join_samples(samples: Sequence[Sample], patch: int) -> Batch:
-    """Puts samples side by side.
+def join_samples(parts: Sequence[Sample | InputError], patch: int) -> Batch | InputError:
+    """Puts samples side by side; if one could not be made, that is what comes back.
 
     Args:
-        samples: at least one.
+        parts: at least one.
         patch: of the encoder's attention.
     """
+    samples = []
+    for part in parts:
+        if isinstance(part, InputError):
+            return part
+        samples.append(part)
     sizes = [len(sample.attributes) for sample in samples]
     starts = [sum(sizes[:i]) for i in range(len(sizes))]
     entries = [sum(len(sample.rows.col) for sample in samples[:i]) for i in range(len(samples) + 1)]

@@ -18,7 +18,7 @@ from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.precision import Precision, autocast_dtype
 from gsencoder.train.checkpoint import CHECKPOINT_FILE, Progress, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
-from gsencoder.train.distributed import Place, sum_over_processes, wait_for_all
+from gsencoder.train.distributed import Place, sum_over_processes, together
 from gsencoder.train.log import Log
 from gsencoder.train.losses import Head, LossConfig
 from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
@@ -123,7 +123,7 @@ class Trainer:
         self.validated: Validated | None = None
         if (folder / CHECKPOINT_FILE).is_file():
             self.progress = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
-        self._log = Log(folder, first_step=self.progress.step, events=tensorboard) if place.first else None
+        self._log = Log(folder, done=self.progress.step, events=tensorboard) if place.first else None
         network: nn.Module = torch.compile(encoder, dynamic=True) if config.compile else encoder  # type: ignore[assignment]
         self._parallel: nn.parallel.DistributedDataParallel | None = None
         if place.size > 1:
@@ -141,9 +141,10 @@ class Trainer:
         """
         try:
             self._run(track)
-        except KeyboardInterrupt:
-            # What is between two steps is not saved: the checkpoint before it continues to the same losses.
-            if not self._in_between:
+        except BaseException as stop:
+            # An interrupt or a signal, not an error. What is between two steps is not saved: the checkpoint before it
+            # continues to the same losses.
+            if not isinstance(stop, Exception) and not self._in_between:
                 self.save()
             raise
         finally:
@@ -155,20 +156,21 @@ class Trainer:
         config, start = self.config, time.monotonic() - self.progress.seconds
         first, saved = self.progress.step, time.monotonic()
         batches = iter(self._loader(first))
-        recent: list[dict[str, float]] = []
+        recent = list(self.progress.unlogged)
         for step in track(range(first, config.steps), "training"):
-            recent.append(self._step(step, [next(batches) for _ in range(config.accumulate)]))
+            recent.append(self._step(step, [_checked(next(batches)) for _ in range(config.accumulate)]))
             done = step + 1
             row: dict[str, float] = {}
             if done % config.log_every == 0 or done == config.steps:
                 row = {name: float(np.mean([each[name] for each in recent])) for name in recent[-1]}
                 recent = []
-            if done == config.steps or (config.validate_every and done % config.validate_every == 0):
-                row |= self._validated(done)
-            self.progress = Progress(step=done, seconds=time.monotonic() - start)
+            self.progress = Progress(step=done, seconds=time.monotonic() - start, unlogged=tuple(recent))
             self._in_between = False
+            if done == config.steps or (config.validate_every and done % config.validate_every == 0):
+                with together():
+                    row |= self._validated(done)
             if row and self._log is not None:
-                self._log.add(step, row | {"seconds": self.progress.seconds})
+                self._log.add(done, row | {"seconds": self.progress.seconds})
             if time.monotonic() - saved >= config.checkpoint_every or done == config.steps:
                 self.save()
                 saved = time.monotonic()
@@ -216,24 +218,26 @@ class Trainer:
             last = micro + 1 == len(batches)
             # What is random in the network follows the step and the micro-batch, not what was drawn before.
             number = (step * len(batches) + micro) * self.place.size + self.place.rank
-            torch.manual_seed((self.config.seed << 40) + number)
+            state = np.random.SeedSequence([self.config.seed, number]).generate_state(1, np.uint64)
+            torch.manual_seed(int(state[0] >> np.uint64(1)))
             if self._parallel is not None:
                 self._parallel.require_backward_grad_sync = last
             with torch.autocast(self.device.type, self._autocast, enabled=self._autocast is not None):
                 terms = self.distillation(_on(batch, self.device))
             loss = torch.zeros((), device=self.device)
             for place, name in enumerate(lambdas):
-                if name in terms:
-                    share = terms[name].total / divisors[name]
-                    loss = loss + lambdas[name] * share
-                    totals[place] += share.detach().double()
-                    if not math.isfinite(share.item()):
-                        blame = blame or f"the {name} loss of {'; '.join(batch.names)}"
+                share = terms[name].total / divisors[name]
+                loss = loss + lambdas[name] * share
+                totals[place] += share.detach().double()
+                if not math.isfinite(share.item()):
+                    blame = blame or f"the {name} loss of {'; '.join(batch.names)}"
             # Gradients of several processes are averaged; what is wanted is their sum.
             (loss * self.place.size).backward()
         norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), self.config.clip or math.inf)
         if not blame and not math.isfinite(norm.item()):
-            blame = f"the gradient of {'; '.join(name for batch in batches for name in batch.names)}"
+            # Gradients have been summed by now: with several processes any of their samples may be the cause.
+            names = "; ".join(name for batch in batches for name in batch.names)
+            blame = f"the gradient of {names}{' or of samples of other processes' if self.place.size > 1 else ''}"
         totals[-1] = float(bool(blame))
         sums = sum_over_processes(totals).tolist()
         if sums[-1]:
@@ -266,7 +270,6 @@ class Trainer:
             scores = {f"validation/{name}": float(value) for name, value in found.scores.items()}
             for name, pixels in found.pictures.items():
                 self._log.picture(done, f"validation/{name}", pixels)
-        wait_for_all()
         return scores
 
 
@@ -274,6 +277,13 @@ def _groups(encoder: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
     matrices = [value for value in encoder.parameters() if value.ndim > 1]
     rest = [value for value in encoder.parameters() if value.ndim <= 1]
     return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+
+
+def _checked(batch: Batch | InputError) -> Batch:
+    """What a worker made; what it refused is raised here, in its own words."""
+    if isinstance(batch, InputError):
+        raise batch
+    return batch
 
 
 def _on(batch: Batch, device: torch.device) -> Batch:

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gsencoder.infer.boxes import Extents, box_around, cluster, oriented_axes, scene_spacing, score_clusters
+from gsencoder.data.spacing import scene_spacing
+from gsencoder.infer.boxes import Extents, box_around, cluster, oriented_axes, score_clusters
 from gsencoder.types import Gaussians
 
 

@@ -13,7 +13,8 @@ from gsencoder.models.neighbors import NeighborConv, convolve_reference, neighbo
 
 def distinct_cells(count: int, extent: int, seed: int = 0) -> torch.Tensor:
     torch.manual_seed(seed)
-    return torch.unique(torch.randint(0, extent, (count, 3)), dim=0)[torch.randperm(1)[0] :]
+    cells = torch.unique(torch.randint(0, extent, (count, 3)), dim=0)
+    return cells[torch.randperm(len(cells))]
 
 
 def slow_table(cells: torch.Tensor) -> torch.Tensor:

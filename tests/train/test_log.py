@@ -10,14 +10,14 @@ from gsencoder.train.log import LOG_FILE, Log, read_log
 
 
 def test_rows_are_read_back(tmp_path: Path) -> None:
-    log = Log(tmp_path, first_step=0, events=False)
+    log = Log(tmp_path, done=0, events=False)
     log.add(0, {"loss": 1.5})
     log.add(1, {"loss": 0.5})
     assert read_log(tmp_path / LOG_FILE) == [{"step": "0", "loss": "1.5"}, {"step": "1", "loss": "0.5"}]
 
 
 def test_columns_may_be_added_on_the_way(tmp_path: Path) -> None:
-    log = Log(tmp_path, first_step=0, events=False)
+    log = Log(tmp_path, done=0, events=False)
     log.add(0, {"loss": 1.0})
     log.add(1, {"loss": 0.5, "score": 0.9})
     log.add(2, {"loss": 0.4})
@@ -25,29 +25,31 @@ def test_columns_may_be_added_on_the_way(tmp_path: Path) -> None:
 
 
 def test_a_continued_log_has_every_step_once(tmp_path: Path) -> None:
-    log = Log(tmp_path, first_step=0, events=False)
-    for step in range(5):
+    log = Log(tmp_path, done=0, events=False)
+    for step in range(1, 5):
         log.add(step, {"loss": float(step)})
-    again = Log(tmp_path, first_step=3, events=False)
+    with (tmp_path / LOG_FILE).open("a") as stream:
+        stream.write("5,3.")  # What a kill in the middle of a line leaves.
+    again = Log(tmp_path, done=2, events=False)
     again.add(3, {"loss": 9.0})
-    assert [row["loss"] for row in read_log(tmp_path / LOG_FILE)] == ["0.0", "1.0", "2.0", "9.0"]
+    assert [row["loss"] for row in read_log(tmp_path / LOG_FILE)] == ["1.0", "2.0", "9.0"]
 
 
 def test_a_log_that_begins_anew_keeps_nothing(tmp_path: Path) -> None:
-    Log(tmp_path, first_step=0, events=False).add(0, {"loss": 1.0})
-    Log(tmp_path, first_step=0, events=False)
-    assert not (tmp_path / LOG_FILE).exists()
+    Log(tmp_path, done=0, events=False).add(1, {"loss": 1.0})
+    Log(tmp_path, done=0, events=False)
+    assert read_log(tmp_path / LOG_FILE) == []
 
 
 def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / LOG_FILE).write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match=r"log\.csv: cannot be continued"):
-        Log(tmp_path, first_step=1, events=False)
+        Log(tmp_path, done=1, events=False)
 
 
 def test_events_and_pictures_are_written_for_tensorboard(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
-    log = Log(tmp_path, first_step=0, events=True)
+    log = Log(tmp_path, done=0, events=True)
     log.add(0, {"loss": 1.0})
     log.picture(0, "validation/sheet", np.zeros((4, 4, 3), np.uint8))
     log.close()

@@ -1,0 +1,29 @@
+"""What a scene needs before its views can be fused: Gaussians where it has none, cameras where it has none."""
+
+from dataclasses import replace
+
+from gsencoder.data.orbits import orbit_cameras
+from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.render import BlendConfig
+from gsencoder.render.rgb import RenderedImages
+from gsencoder.types import Scene, Views
+
+
+def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig()) -> Scene:
+    """The scene, with seeds where it has no splat.
+
+    Raises:
+        InputError: there is nothing to seed from.
+    """
+    return scene if scene.gaussians is not None else replace(scene, gaussians=seed(scene, config))
+
+
+def with_views(scene: Scene, count: int, config: BlendConfig = BlendConfig()) -> Scene:
+    """The scene; a bare splat is seen by `count` cameras around it, whose pictures are rendered when asked for."""
+    if scene.views is not None:
+        return scene
+    assert scene.gaussians is not None
+    cameras = orbit_cameras(scene.gaussians, count=count, up=scene.up)
+    names = tuple(f"orbit_{view:03d}" for view in range(len(cameras)))
+    images = RenderedImages(scene.gaussians, cameras, config)
+    return replace(scene, views=Views(cameras=cameras, names=names, images=images))
