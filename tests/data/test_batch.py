@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from splats import front_camera
 
-from gsencoder.data.batch import SamplingConfig, choose_part, crop_size, in_frusta, nearest, thin_out
+from gsencoder.data.batch import SamplingConfig, choose_part, crop_size, in_frusta, nearest, seen_by, thin_out
 from gsencoder.errors import InputError
 from gsencoder.render import blend
 from gsencoder.types import Cameras, Gaussians
@@ -144,10 +144,26 @@ def test_the_whole_scene_may_be_taken() -> None:
         assert len(choose_part(cloud(100), cameras(2), np.ones(100, np.float32), config, size, RNG(0))[1]) == expected
 
 
+def test_a_camera_that_looks_into_the_void_gives_way_to_one_that_sees_something() -> None:
+    points, row = cloud(50), cameras(3)  # All before the first camera.
+    for size in (0, 5):
+        for seed in range(6):
+            views, rows = choose_part(points, row, np.ones(50, np.float32), SamplingConfig(views=1), size, RNG(seed))
+            assert len(rows)
+            assert 0 in views
+
+
+def test_one_point_is_seen_by_the_cameras_in_whose_frusta_it_lies() -> None:
+    row, points = cameras(4), cloud(60, 4)
+    for point in points:
+        expected = [bool(in_frusta(point[None], row.select([view]))[0]) for view in range(4)]
+        assert seen_by(point, row).tolist() == expected
+
+
 def test_a_scene_behind_its_cameras_is_an_error() -> None:
     behind = cloud(10) - np.array([0, 0, 9], np.float32)
     for size in (0, 5):
-        with pytest.raises(InputError, match="no Gaussian lies in the frusta"):
+        with pytest.raises(InputError, match="no Gaussian lies in the frustum of any view"):
             choose_part(behind, cameras(2), np.ones(10, np.float32), SamplingConfig(), size, RNG(0))
 
 

@@ -51,7 +51,7 @@ def test_the_spacing_of_a_sample_does_not_depend_on_order(
 ) -> None:
     points = rng.random((4000, 3)).astype(np.float32)
     whole = scene_spacing(points)
-    monkeypatch.setattr("gsencoder.infer.boxes.SPACING_SAMPLE", 500)
+    monkeypatch.setattr("gsencoder.data.spacing.SPACING_SAMPLE", 500)
     sampled = scene_spacing(points)
     assert sampled == scene_spacing(rng.permutation(points))
     assert sampled == pytest.approx(whole, rel=0.1)

@@ -183,5 +183,8 @@ def test_views_that_see_nothing_are_named(dataset: tuple[PreparedDataset, list[s
     scene._header[0].cam_from_world[:, 2, 3] -= 1000  # Both cameras now stand behind the wall and look away.
     data = SampleDataset([scene], replace(data.recipe, augmentation=AugmentConfig()))
     with pytest.raises(InputError, match=r"scene wall_0: sample: no Gaussian"):
-        data[0]
+        data.make(0)
+    # From a worker it comes back as a value, and through the batch, so that it can be raised in its own words.
+    assert isinstance(data[0], InputError)
+    assert isinstance(join_samples([data[0]], SMALL.transformer.patch), InputError)
     scene._header[0].cam_from_world[:, 2, 3] += 1000

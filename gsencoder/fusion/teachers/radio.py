@@ -53,6 +53,7 @@ class RadioTeacher:
         folder = find_file(config.model, "teacher.model", folder=True)
         try:
             import torch
+            from safetensors import SafetensorError
             from transformers import AutoModel
         except ImportError as error:
             raise InputError(
@@ -60,7 +61,7 @@ class RadioTeacher:
             ) from error
         try:
             model = AutoModel.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
-        except (OSError, ValueError, RuntimeError, KeyError) as error:
+        except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
             message = " ".join(str(error).split())[:160]
             raise InputError(f"teacher radio: {folder} holds no model that transformers reads: {message}") from error
         if model.config.model_type != "radio":
