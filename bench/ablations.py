@@ -26,13 +26,13 @@ GROUPS: dict[str, dict[str, list[str]]] = {
         "whole scenes": ["sampling.scope=scene", "sampling.gaussians=0"],
     },
     "views": {f"{views} target views": [f"sampling.views={views}"] for views in (1, 3, 8)},
-    "patch": {f"patch {patch}": [f"transformer.patch={patch}"] for patch in (32, 128, 512)},
+    "patch": {f"patch {patch}": [f"model.transformer.patch={patch}"] for patch in (32, 128, 512)},
     "inputs": {
         "all attributes": [],
-        "colour alone": ["inputs=[color]"],
-        "colour and offset": ["inputs=[color,offset]"],
-        "without colour": ["inputs=[offset,opacity,scale,rotation]"],
-        "without rotation": ["inputs=[offset,color,opacity,scale]"],
+        "colour alone": ["model.inputs=[color]"],
+        "colour and offset": ["model.inputs=[color,offset]"],
+        "without colour": ["model.inputs=[offset,opacity,scale,rotation]"],
+        "without rotation": ["model.inputs=[offset,color,opacity,scale]"],
     },
 }
 SHARE_OF_STEPS = {"whole frusta": 0.35, "whole scenes": 0.1}

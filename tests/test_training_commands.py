@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +24,8 @@ QUICK = (
     "train.log_every=2",
     "sampling.gaussians=3000",
     "sampling.smallest=500",
-    "transformer.encoder_channels=[32,32,32,32,32]",
-    "transformer.decoder_channels=[32,32,32,32]",
+    "model.transformer.encoder_channels=[32,32,32,32,32]",
+    "model.transformer.decoder_channels=[32,32,32,32]",
 )
 
 
@@ -102,7 +104,7 @@ def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trai
     assert scene.gaussians is not None
     assert results["gaussians"] == results["seen"] == len(scene.gaussians)
     word = next(iter(sorted(thing.name for thing in make_room(2, objects=4, views=4).objects if thing.name)))
-    asked = ["localize", str(out), f"query={word}", f"out={boxes}", "pictures=0", "threshold.fixed=0.0", "quiet=true"]
+    asked = ["localize", str(out), f"query={word}", f"out={boxes}", "pictures=0", "localize.threshold.fixed=0.0", "quiet=true"]
     assert cli.main(asked) == 0
     # In chunks it is nearly the same, and for several scenes each has a folder of its own.
     several = ["encode", str(rooms / "room_1"), str(rooms / "room_2"), f"weights={trained / 'encoder.safetensors'}"]
@@ -142,7 +144,7 @@ def test_preparing_alone_trains_nothing(rooms: Path, tmp_path: Path) -> None:
         (["holdout=room_*"], "matches every scene"),
         (["train.steps=0"], "train.steps: expected 1 or more"),
         (["loss.min_kept=2.0"], "loss.min_kept"),
-        (["transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry a level"),
+        (["model.transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry a level"),
         (["teacher=radio"], "teacher.model= is missing"),
         (["device=cuda"], "no GPU"),
         (["experiment=kitchen"], "experiment: expected one of"),
@@ -229,3 +231,15 @@ def test_a_sweep_trains_once_for_each_value(rooms: Path, tmp_path: Path) -> None
     quick = [word for word in QUICK if not word.startswith("train.steps")]
     assert cli.main([*asked, *quick, "tensorboard=false", "train.steps=1,2"]) == 0
     assert [summary_of(tmp_path / "out" / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
+
+
+def test_the_submitit_launcher_runs_a_sweep_as_jobs(rooms: Path, tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    words, quick = f"teacher.words={rooms / 'words.safetensors'}", [word for word in QUICK if "steps" not in word]
+    out, prepared = tmp_path / "out", tmp_path / "prepared"
+    asked = ["train", "-m", str(rooms / "room_0"), words, f"prepared={prepared}", f"out={out}", "tensorboard=false"]
+    launcher = ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=10", "hydra.launcher.tasks_per_node=1"]
+    # In a process of its own: the launcher sets signal handlers and environment variables for good.
+    command = [sys.executable, "-W", "ignore", "-m", "gsencoder", *asked, *quick, *launcher, "train.steps=1,2"]
+    subprocess.run(command, check=True, timeout=500)
+    assert [summary_of(out / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
