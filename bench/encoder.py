@@ -21,10 +21,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gsencoder.commands.train import TrainConfig
 from gsencoder.compose import compose
 from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.models.device import autocast_dtype
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.precision import autocast_dtype
 from gsencoder.train.losses import LossConfig, match_loss
 from gsencoder.types import FeatureSpace, Gaussians
 

@@ -104,7 +104,15 @@ def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trai
     assert scene.gaussians is not None
     assert results["gaussians"] == results["seen"] == len(scene.gaussians)
     word = next(iter(sorted(thing.name for thing in make_room(2, objects=4, views=4).objects if thing.name)))
-    asked = ["localize", str(out), f"query={word}", f"out={boxes}", "pictures=0", "localize.threshold.fixed=0.0", "quiet=true"]
+    asked = [
+        "localize",
+        str(out),
+        f"query={word}",
+        f"out={boxes}",
+        "pictures=0",
+        "localize.threshold.fixed=0.0",
+        "quiet=true",
+    ]
     assert cli.main(asked) == 0
     # In chunks it is nearly the same, and for several scenes each has a folder of its own.
     several = ["encode", str(rooms / "room_1"), str(rooms / "room_2"), f"weights={trained / 'encoder.safetensors'}"]

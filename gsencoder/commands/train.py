@@ -30,6 +30,7 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode import EncodeConfig
+from gsencoder.models.device import Device
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.output_space import OutputSpace
@@ -73,7 +74,7 @@ class TrainConfig(CommonConfig):
         metadata={"help": "file of the teacher's adapter heads, behind which cells are compared; empty = none"},
     )
     store: Literal["float16", "float32"] = field(default="float16", metadata={"help": "type of the written weights"})
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where the encoder computes"})
+    device: Device = field(default="auto", metadata={"help": "where the encoder computes"})
     splat: str = field(default="", metadata={"help": f"Gaussians of scenes with views; empty = seeds. {READABLE}"})
     orbits: int = field(default=24, metadata={"help": "cameras put around a splat that has no views"})
     data: SceneConfig = field(default_factory=SceneConfig)

@@ -3,16 +3,16 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 
 from gsencoder.errors import InputError
+from gsencoder.models.device import Device, Precision, autocast_dtype, choose_device
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.precision import Precision, autocast_dtype
 from gsencoder.types import GaussianFeatures, Gaussians
 
 
@@ -28,7 +28,7 @@ class EncodeConfig:
         default="auto",
         metadata={"help": "what the encoder computes in; auto = bfloat16 where the device multiplies it"},
     )
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where it computes"})
+    device: Device = field(default="auto", metadata={"help": "where it computes"})
 
     def __post_init__(self) -> None:
         if self.chunk < 0:
@@ -77,7 +77,7 @@ def encode(
     """
     if not len(gaussians):
         raise InputError("encode: the splat has no Gaussians")
-    device = torch.device(_device(config.device))
+    device = choose_device(config.device)
     dtype = autocast_dtype(config.precision, device)
     encoder = encoder.to(device).eval()
     voxel = encoder.config.voxel / metres_per_unit
@@ -144,9 +144,3 @@ def _around(means: np.ndarray, own: np.ndarray, low: np.ndarray, high: np.ndarra
     near = np.asarray(((means >= low - halo) & (means <= high + halo)).all(axis=1))
     near[own] = False
     return np.flatnonzero(near)
-
-
-def _device(name: str) -> str:
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("device: cuda was asked for, and this torch sees no GPU")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name

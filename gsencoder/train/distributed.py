@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, distributed
 
 from gsencoder.errors import InputError
+from gsencoder.models.device import Device, choose_device
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +85,7 @@ def _number(environment: Mapping[str, str], name: str, default: str) -> int:
 
 
 @contextmanager
-def joined(device: str = "auto", *, timeout_hours: float = 24.0) -> Iterator[tuple[Place, torch.device]]:
+def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[tuple[Place, torch.device]]:
     """Meets the other processes for the block; yields the place and the device of this one.
 
     Args:
@@ -96,7 +97,9 @@ def joined(device: str = "auto", *, timeout_hours: float = 24.0) -> Iterator[tup
         InputError: no such device, or the others cannot be met.
     """
     place, meeting = place_from(os.environ)
-    chosen = _device(device, place)
+    chosen = choose_device(device, place.local_rank)
+    if chosen.type == "cuda":
+        torch.cuda.set_device(chosen)
     if place.size == 1:
         yield place, chosen
         return
@@ -115,21 +118,6 @@ def joined(device: str = "auto", *, timeout_hours: float = 24.0) -> Iterator[tup
     yield place, chosen
     # Not after an error: the others may be waiting for a sum, and leaving the group would wait for them.
     distributed.destroy_process_group()
-
-
-def _device(name: str, place: Place) -> torch.device:
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cpu":
-        return torch.device("cpu")
-    if name != "cuda":
-        raise InputError(f"device: expected auto, cpu or cuda, got {name!r}")
-    count = torch.cuda.device_count()
-    if place.local_rank >= count:
-        raise InputError(f"device: process {place.local_rank} of this machine has no GPU; there are {count}")
-    device = torch.device("cuda", place.local_rank)
-    torch.cuda.set_device(device)
-    return device
 
 
 def sum_over_processes(values: Tensor) -> Tensor:

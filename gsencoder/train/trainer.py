@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from gsencoder.errors import InputError
+from gsencoder.models.device import Precision, autocast_dtype
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.precision import Precision, autocast_dtype
 from gsencoder.train.checkpoint import CHECKPOINT_FILE, Progress, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
 from gsencoder.train.distributed import Place, sum_over_processes, together

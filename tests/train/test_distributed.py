@@ -3,7 +3,7 @@
 import pytest
 
 from gsencoder.errors import InputError
-from gsencoder.train.distributed import Place, first_host, joined, place_from
+from gsencoder.train.distributed import Place, first_host, joined, place_from, together
 
 SLURM = {
     "SLURM_STEP_ID": "0",
@@ -67,5 +67,15 @@ def test_an_environment_that_contradicts_itself_is_refused(environment: dict[str
 def test_a_device_that_is_not_there_is_refused() -> None:
     with pytest.raises(InputError, match="no GPU"), joined("cuda"):
         pass
-    with pytest.raises(InputError, match="expected auto, cpu or cuda"), joined("tpu"):
+
+
+def test_an_unknown_device_is_refused(no_jaxtyping: None) -> None:
+    with pytest.raises(InputError, match="expected auto, cpu or cuda"), joined("tpu"):  # type: ignore[arg-type]
         pass
+
+
+def test_one_process_leaves_a_block_as_it_entered_it() -> None:
+    with together():
+        pass
+    with pytest.raises(InputError, match="its own"), together():
+        raise InputError("its own")
