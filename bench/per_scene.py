@@ -30,7 +30,7 @@ from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.models.heap import keep_heap
-from gsencoder.models.weights import find_weights, load_weights
+from gsencoder.models.weights import load_weights
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import FeatureMap, GaussianFeatures, Scene
 
@@ -112,7 +112,7 @@ def main() -> None:
     chosen = parser.parse_args()
     keep_heap()
     words = load_text_table(find_file(chosen.words, "words"))
-    encoder, outputs, _ = load_weights(find_weights(chosen.weights))
+    encoder, outputs, _ = load_weights(chosen.weights)
     table: dict[str, list[tuple[float, float, float]]] = {}
     for path in chosen.scenes:
         scene = load_scene(Path(path))

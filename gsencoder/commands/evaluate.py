@@ -27,7 +27,7 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode import EncodeConfig
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.models.heap import keep_heap
-from gsencoder.models.weights import find_weights, load_weights
+from gsencoder.models.weights import load_weights
 from gsencoder.outputs import output_folder, write_bytes
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
@@ -65,7 +65,7 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
         )
     if config.weights:
         keep_heap()
-        encoder, outputs, _ = load_weights(find_weights(config.weights))
+        encoder, outputs, _ = load_weights(config.weights)
         source = encoded(encoder, outputs, config.encode)
     else:
         source = fused(config.teacher, words, config.fusion)

@@ -61,13 +61,16 @@ def save_weights(
     write_archive(path, arrays, header)
 
 
-def load_weights(path: Path) -> tuple[GaussianEncoder, OutputSpace, dict[str, Any]]:
+def load_weights(given: str | Path) -> tuple[GaussianEncoder, OutputSpace, dict[str, Any]]:
     """The encoder, in evaluation mode, its output space, and what made it.
+
+    Args:
+        given: a file, a folder of `train`, or a name; see `find_weights`.
 
     Raises:
         InputError: missing, damaged, of another version, or not the parameters that its configuration needs.
     """
-    with open_archive(path) as file:
+    with open_archive(find_weights(str(given))) as file:
         config = _config(file.value("encoder", dict))
         outputs = read_outputs(file)
         dtype = file.value("dtype", str)
