@@ -31,7 +31,7 @@ class TradeoffConfig(CommonConfig):
     )
     sweep: SweepConfig = field(default_factory=SweepConfig)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
-    protocol: LocalizationProtocol = field(default_factory=LocalizationProtocol)
+    asked: LocalizationProtocol = field(default_factory=LocalizationProtocol)
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
@@ -50,7 +50,7 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
                 teacher=config.teacher,
                 sweep=config.sweep,
                 base=config.fusion,
-                protocol=config.protocol,
+                protocol=config.asked,
                 data=config.data,
                 seeds=config.seeds,
                 localization=config.localize,

@@ -90,7 +90,7 @@ def test_the_command_measures_writes_and_advises(
 ) -> None:
     out = tmp_path / "out"
     sweep = ["sweep.rays_per_patch=[1]", "sweep.min_weight=[0.2]", "sweep.stop_transmittance=[]", "sweep.energy=[]"]
-    sweep += ["sweep.max_rank=[1]", "sweep.views=[2]", "sweep.rounds=1", "protocol.min_views=1"]
+    sweep += ["sweep.max_rank=[1]", "sweep.views=[2]", "sweep.rounds=1", "asked.min_views=1"]
     teacher = [f"teacher.words={scene / 'words.safetensors'}", "teacher.cell=8"]
     assert cli.main(["tradeoff", str(scene), *teacher, *sweep, "seeds.voxel=0.05", "budget.error=2", f"out={out}"]) == 0
     with open(out / "tradeoff.csv", newline="") as stream:
