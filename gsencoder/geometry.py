@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsencoder.types import SH_C0
+
 ALPHA_MIN = 1 / 255
 """Below this a Gaussian does not mark a pixel (Kerbl et al. 2023; gsplat)."""
 
@@ -133,10 +135,6 @@ def project(
     limit = torch.tensor([width, height], dtype=means.dtype, device=means.device)
     inside = ((means2d + extents > 0) & (means2d - extents < limit)).all(dim=-1)
     return Projected(means2d, conics, z, mahalanobis2, extents, front & visible & inside)
-
-
-SH_C0 = 0.5 / math.sqrt(math.pi)
-"""A colour is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction."""
 
 
 def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n K"]:

@@ -130,6 +130,11 @@ class Summary:
         finally:
             self.timings[name] += time.perf_counter() - start
 
+    def add_seconds(self, steps: Mapping[str, float]) -> None:
+        """Adds what steps took that were timed elsewhere."""
+        for name, seconds in steps.items():
+            self.timings[name] = self.timings.get(name, 0.0) + seconds
+
     def to_dict(self) -> dict[str, Any]:
         """The record in JSON's terms. `non_finite` lists the results that were not finite and are null."""
         lost: list[str] = []

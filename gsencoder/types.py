@@ -15,6 +15,9 @@ from jaxtyping import Bool, Float32, Float64, Int32, Integer, UInt8
 
 from gsencoder.errors import InputError
 
+SH_C0 = 0.5 / math.sqrt(math.pi)
+"""A colour is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction."""
+
 UNIT_TOLERANCE = 1e-3
 """How far from 1 the norm of a quaternion, and from 0 an entry of RᵀR − I, may be."""
 

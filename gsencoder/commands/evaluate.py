@@ -127,8 +127,7 @@ def _naming(
     )
     scores = naming_scores(scenes, protocol)
     for scene in scenes:
-        for step, seconds in scene.seconds.items():
-            summary.timings[step] = summary.timings.get(step, 0.0) + seconds
+        summary.add_seconds(scene.seconds)
     each = [
         {"scene": scene.scene, "gaussians": sum(scene.total.values()), **naming_scores([scene])} for scene in scenes
     ]
@@ -141,8 +140,7 @@ def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
     """Puts scores, scenes and seconds into the summary."""
     hits = [hit for outcome in outcomes for hit in outcome.hits]
     for outcome in outcomes:
-        for step, seconds in outcome.seconds.items():
-            summary.timings[step] = summary.timings.get(step, 0.0) + seconds
+        summary.add_seconds(outcome.seconds)
     summary.results.update(
         protocol="localization",
         **scores(hits),

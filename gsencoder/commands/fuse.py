@@ -11,8 +11,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
-from gsencoder.errors import InputError
-from gsencoder.fusion.complete import with_gaussians, with_views
+from gsencoder.fusion.complete import check_orbits, with_gaussians, with_views
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.store import WORDS_FILE, save_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
@@ -21,8 +20,6 @@ from gsencoder.outputs import output_folder
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
 from gsencoder.types import Scene
-
-MOST_ORBITS = 10_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +38,7 @@ class FuseCommandConfig(CommonConfig):
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.orbits <= MOST_ORBITS:
-            raise InputError(f"orbits: expected 1 to {MOST_ORBITS} cameras, got {self.orbits}")
+        check_orbits(self.orbits)
 
 
 def run(config: FuseCommandConfig, summary: Summary) -> None:
@@ -96,8 +92,7 @@ def fuse_scene(
     built = build_teacher(teacher, scene, words)
     work = None if built.cheap else work_folder(out)
     fusion = fuse(scene, built, config.fusion, work=work, track=Progress(quiet=config.quiet))
-    for step, seconds in fusion.seconds.items():
-        summary.timings[step] = summary.timings.get(step, 0.0) + seconds
+    summary.add_seconds(fusion.seconds)
     return fusion
 
 

@@ -24,7 +24,7 @@ from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
 from gsencoder.errors import InputError
 from gsencoder.evaluate.naming import naming
-from gsencoder.fusion.complete import with_gaussians, with_views
+from gsencoder.fusion.complete import check_orbits, with_gaussians, with_views
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
@@ -87,6 +87,9 @@ class TrainConfig(CommonConfig):
     loss: LossConfig = field(default_factory=LossConfig)
     train: TrainerConfig = field(default_factory=TrainerConfig)
 
+    def __post_init__(self) -> None:
+        check_orbits(self.orbits)
+
 
 def run(config: TrainConfig, summary: Summary) -> None:
     """Prepares scenes, trains, and writes weights, log and scores into out=."""
@@ -144,7 +147,7 @@ def make_trainer(
         losses=config.loss,
         rarity=rarity,
         seed=config.train.seed,
-        step_samples=config.train.batch * config.train.accumulate * place.size,
+        step_samples=config.train.samples_per_step(place.size),
     )
     kinds = codebook if codebook is not None else rarity.codebook
     validation = dataset.scenes([path.name for path in held_out])
@@ -174,7 +177,7 @@ def write_results(
     summary: Summary,
 ) -> None:
     """Weights, words, log and pictures; what was reached goes into the summary."""
-    done, encoder = trainer.progress, trainer.encoder
+    done, encoder = trainer.state, trainer.encoder
     # A run that had been cut off after its last step has not validated it.
     judged = trainer.validated or trainer.validate(encoder, done.step)
     scores = dict(judged.scores)
@@ -331,4 +334,4 @@ def _identity(config: TrainConfig, place: Place, dataset: PreparedDataset) -> di
         del chosen["train"][name]
     told = {"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": config.heads}
     # How the samples of a step are spread over processes and micro-batches may change.
-    return {**chosen, **told, "samples_per_step": config.train.batch * config.train.accumulate * place.size}
+    return {**chosen, **told, "samples_per_step": config.train.samples_per_step(place.size)}

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from gsencoder.errors import InputError
-from gsencoder.types import FeatureSpace
 
 VERSION = 1
 DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", "I64": "int64", "U8": "uint8"}
@@ -38,10 +37,7 @@ class Archive:
         Raises:
             InputError: missing, of another type or size, or not finite.
         """
-        if name not in self._names:
-            raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
-        stored = self._file.get_slice(name)
-        got_dtype, got = DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
+        got_dtype, got = self._stored(name)
         wanted = tuple(self.sizes.get(side, side) if isinstance(side, str) else side for side in shape)
         same = len(got) == len(wanted) and all(isinstance(w, str) or w == g for w, g in zip(wanted, got, strict=True))
         if got_dtype != dtype or not same:
@@ -62,16 +58,20 @@ class Archive:
         Raises:
             InputError: missing, of another type, or with another number of axes.
         """
-        if name not in self._names:
-            raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
-        stored = self._file.get_slice(name)
-        got_dtype, shape = DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
+        got_dtype, shape = self._stored(name)
         if got_dtype != dtype or len(shape) != axes:
             raise InputError(
                 f"{self.path}: expected {name} {dtype} with {axes} axes, got {got_dtype}[{_listed(shape)}]; "
                 "the file is damaged or from another program"
             )
         return shape
+
+    def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
+        """Type and size of an array as the file states them."""
+        if name not in self._names:
+            raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
+        stored = self._file.get_slice(name)
+        return DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
 
     def value(self, key: str, *kinds: type | None) -> Any:
         """A value of the header, of one of these types.
@@ -177,19 +177,3 @@ def map_arrays(path: Path, wanted: Mapping[str, tuple[str, int]]) -> dict[str, n
         first, last = entries[name]["data_offsets"]
         mapped[name] = raw[begin + first : begin + last].view(dtype).reshape(sizes[name])
     return mapped
-
-
-def space_to_json(space: FeatureSpace) -> dict[str, Any]:
-    """A feature space as the header of a file holds it."""
-    return {name: getattr(space, name) for name in space.__dataclass_fields__}
-
-
-def space_from_json(values: dict[str, Any]) -> FeatureSpace:
-    """The feature space that a header holds.
-
-    Raises:
-        InputError: other fields than a feature space has.
-    """
-    if set(values) != set(FeatureSpace.__dataclass_fields__):
-        raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
-    return FeatureSpace(**values)

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float32, Float64
 
 from gsencoder.errors import InputError
-from gsencoder.geometry import SH_C0, sh_basis
-from gsencoder.types import Gaussians
+from gsencoder.geometry import sh_basis
+from gsencoder.types import SH_C0, Gaussians
 
 _DIRECTIONS = 64
 """Directions over which harmonics are turned: more than enough for the 16 coefficients of degree 3."""

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.types import Gaussians
+from gsencoder.types import SH_C0, Gaussians
 
 SIZE = 0.6
 """In-plane standard deviation as a share of the spacing. Rendered against the photographs of RGB-D rooms 0.55 is
@@ -23,7 +23,6 @@ OVER_ANY = 1.5
 scrap of surface with no like neighbour must not swell over the others."""
 STRETCH = 3.0
 """A spacing may be so many times the median of the neighbours' own: a stray point must not become a great blob."""
-SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2√π)."""
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.data.splat_ply import PlyHeader, element_start
-from gsencoder.data.splat_raw import SH_C0, RawSplat, logits_from_opacities, quats_from_smallest_three
+from gsencoder.data.splat_raw import RawSplat, logits_from_opacities, quats_from_smallest_three
 from gsencoder.errors import InputError
+from gsencoder.types import SH_C0
 
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

@@ -5,8 +5,9 @@ from typing import BinaryIO
 
 import numpy as np
 
-from gsencoder.data.splat_raw import SH_C0, RawSplat, logits_from_opacities, logs_from_scales
+from gsencoder.data.splat_raw import RawSplat, logits_from_opacities, logs_from_scales
 from gsencoder.errors import InputError
+from gsencoder.types import SH_C0
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 

@@ -12,9 +12,6 @@ from jaxtyping import Bool, Float, Float32, Float64, Integer
 
 from gsencoder.errors import InputError
 
-SH_C0 = 0.28209479177387814
-"""The constant of SH degree 0: colour = 0.5 + SH_C0 · f_dc."""
-
 LOGIT_LIMIT = 20.0
 """Opacities 0 and 1 are written as this logit: 2e-9 away from the true value, and finite."""
 

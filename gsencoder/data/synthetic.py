@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.data.seeds_flat import OPACITY, SH_C0, SIZE, THICKNESS, quats_from_normals
+from gsencoder.data.seeds_flat import OPACITY, SIZE, THICKNESS, quats_from_normals
 from gsencoder.data.synthetic_plan import COLORS, HALF_ROOM, TABLE, PlannedObject, plan_room
 from gsencoder.data.synthetic_shapes import Solid
 from gsencoder.data.synthetic_write import write_room
 from gsencoder.errors import InputError
-from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views
+from gsencoder.types import SH_C0, Cameras, Gaussians, Scene, SceneObject, Views
 
 __all__ = ["color_words", "make_room", "plan_room", "write_room"]
 

@@ -4,9 +4,22 @@ from dataclasses import replace
 
 from gsencoder.data.orbits import orbit_cameras
 from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.errors import InputError
 from gsencoder.render import BlendConfig
 from gsencoder.render.rgb import RenderedImages
 from gsencoder.types import Scene, Views
+
+MOST_ORBITS = 10_000
+
+
+def check_orbits(count: int) -> None:
+    """Complains of a number of cameras that nobody means.
+
+    Raises:
+        InputError: fewer than one, or more than 10,000.
+    """
+    if not 1 <= count <= MOST_ORBITS:
+        raise InputError(f"orbits: expected 1 to {MOST_ORBITS} cameras, got {count}")
 
 
 def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig()) -> Scene:

@@ -4,17 +4,19 @@ Arrays are safetensors files, memory-mapped on load; features are float16 for se
 localisation needs: no photographs, no teacher.
 """
 
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsencoder.data.archive import Archive, open_archive, space_from_json, space_to_json, write_archive
+from gsencoder.data.archive import Archive, open_archive, write_archive
+from gsencoder.data.archived import camera_arrays, read_cameras, read_space, space_parts
 from gsencoder.data.images import PIXEL_LIMIT
 from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
-from gsencoder.types import Cameras, FeatureBasis, GaussianFeatures, Gaussians, Scene, Views
+from gsencoder.types import GaussianFeatures, Gaussians, Scene, Views
 
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 BLOCK = 16_384
@@ -39,35 +41,31 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
     header: dict[str, Any] = {"name": scene.name, "metres_per_unit": scene.metres_per_unit}
     header["up"] = None if scene.up is None else scene.up.tolist()
     if scene.views is not None:
-        cameras = scene.views.cameras
-        arrays |= {name: getattr(cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights")}
+        arrays |= camera_arrays(scene.views.cameras)
         header["views"] = list(scene.views.names)
     write_archive(folder / SCENE_FILE, arrays, header)
     rows = np.flatnonzero(features.weights > 0)
     # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
     blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
-    largest = np.zeros(features.features.shape[1], np.float32)
+    largest, bad = np.zeros(features.features.shape[1], np.float32), 0
     for block in blocks:
         kept = features.features[block]
-        if not np.isfinite(kept).all():
-            bad = int((~np.isfinite(kept).all(axis=1)).sum())
-            raise InputError(f"save_features: {bad} or more of {len(rows)} rows are not finite")
+        bad += int((~np.isfinite(kept).all(axis=1)).sum())
         largest = np.maximum(largest, np.abs(kept).max(axis=0))
+    if bad:
+        raise InputError(f"save_features: {bad} of {len(rows)} rows are not finite")
     channel_scale = np.where(largest > 0, largest, 1).astype(np.float32)
     halves = np.empty((len(rows), len(largest)), np.float16)
     for number, block in enumerate(blocks):
         halves[number * BLOCK : number * BLOCK + len(block)] = features.features[block] / channel_scale
-    arrays = {
+    arrays, header = space_parts(features.space, features.mean, features.basis)
+    arrays |= {
         "rows": rows.astype(np.int32),
         "features": halves,
         "channel_scale": channel_scale,
         "weights": features.weights[rows],
-        "mean": features.mean,
     }
-    header = {"space": space_to_json(features.space), "settings": settings, "fingerprint": fingerprint(gaussians)}
-    if features.basis is not None:
-        arrays["components"] = features.basis.components
-        header["energy_kept"] = features.basis.energy_kept
+    header |= {"settings": settings, "fingerprint": fingerprint(gaussians)}
     write_archive(folder / FEATURES_FILE, arrays, header)
 
 
@@ -79,7 +77,7 @@ def load_features(folder: Path) -> Scene:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of features made by `gsencoder fuse` or `encode`")
-    with open_archive(folder / SCENE_FILE) as file:
+    with _open(folder, SCENE_FILE) as file:
         gaussians = Gaussians(
             means=file.array("means", "float32", ("N", 3)),
             quats=file.array("quats", "float32", ("N", 4)),
@@ -108,21 +106,22 @@ def load_settings(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: not such a folder, or damaged.
     """
-    with open_archive(folder / FEATURES_FILE) as file:
+    with _open(folder, FEATURES_FILE) as file:
         found: dict[str, Any] = file.value("settings", dict)
         return found
+
+
+def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
+    if not (folder / name).is_file():
+        raise InputError(f"{folder}: {name} is missing; this is no folder of gsencoder features")
+    return open_archive(folder / name)
 
 
 def _load_views(file: Archive) -> Views:
     names = file.value("views", list)
     if not all(isinstance(name, str) for name in names):
         raise InputError("expected the names of views to be text")
-    cameras = Cameras(
-        cam_from_world=file.array("cam_from_world", "float32", ("V", 4, 4)),
-        Ks=file.array("Ks", "float32", ("V", 3, 3)),
-        widths=file.array("widths", "int32", ("V",)),
-        heights=file.array("heights", "int32", ("V",)),
-    )
+    cameras = read_cameras(file)
     pixels = cameras.widths.astype(np.int64) * cameras.heights
     if len(pixels) and pixels.max() > PIXEL_LIMIT:
         raise InputError(f"expected views of at most {PIXEL_LIMIT:,} pixels, got one of {pixels.max():,}")
@@ -130,7 +129,7 @@ def _load_views(file: Archive) -> Views:
 
 
 def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:
-    with open_archive(folder / FEATURES_FILE) as file:
+    with _open(folder, FEATURES_FILE) as file:
         belongs, actual = file.value("fingerprint", str), fingerprint(gaussians)
         if belongs != actual:
             raise InputError(
@@ -147,9 +146,5 @@ def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:
         values, weights = np.zeros((n, len(scale)), np.float32), np.zeros(n, np.float32)
         values[rows] = file.array("features", "float16", ("n", "R")).astype(np.float32) * scale
         weights[rows] = seen
-        space, mean = space_from_json(file.value("space", dict)), file.array("mean", "float32", ("D",))
-        basis = None
-        if "components" in file or "energy_kept" in file:
-            components, kept = file.array("components", "float32", ("R", "D")), file.value("energy_kept", float, int)
-            basis = FeatureBasis(mean=mean, components=components, energy_kept=kept, space=space)
+        space, mean, basis = read_space(file)
         return GaussianFeatures(features=values, weights=weights, mean=mean, space=space, basis=basis)

@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsencoder.geometry import SH_C0, rotmats_from_quats
+from gsencoder.geometry import rotmats_from_quats
+from gsencoder.types import SH_C0
 
 Attribute = Literal["offset", "color", "opacity", "scale", "rotation"]
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.data.archive import Archive, space_from_json, space_to_json
+from gsencoder.data.archive import Archive
+from gsencoder.data.archived import read_space, space_parts
 from gsencoder.errors import InputError
 from gsencoder.types import FeatureBasis, FeatureSpace
 
@@ -65,12 +66,8 @@ class OutputSpace:
 
 def write_outputs(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the header values that hold an output space in a file."""
-    arrays: dict[str, np.ndarray] = {"mean": outputs.mean}
-    header: dict[str, Any] = {"space": space_to_json(outputs.space), "scale": outputs.scale}
-    if outputs.basis is not None:
-        arrays["components"] = outputs.basis.components
-        header["energy_kept"] = outputs.basis.energy_kept
-    return arrays, header
+    arrays, header = space_parts(outputs.space, outputs.mean, outputs.basis)
+    return arrays, {**header, "scale": outputs.scale}
 
 
 def read_outputs(file: Archive) -> OutputSpace:
@@ -79,10 +76,5 @@ def read_outputs(file: Archive) -> OutputSpace:
     Raises:
         InputError: damaged, or from another program.
     """
-    space = space_from_json(file.value("space", dict))
-    mean, basis = file.array("mean", "float32", (space.channels,)), None
-    if "components" in file:
-        components = file.array("components", "float32", ("R", space.channels))
-        kept = file.value("energy_kept", float, int)
-        basis = FeatureBasis(mean=mean, components=components, energy_kept=kept, space=space)
+    space, mean, basis = read_space(file)
     return OutputSpace(space=space, mean=mean, scale=file.value("scale", float, int), basis=basis)

@@ -9,7 +9,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gsencoder.errors import InputError
 from gsencoder.models.blocks import Block, Pool, Unpool
-from gsencoder.models.plan import Level, Plan
+from gsencoder.models.plan import ORDERS, Level, Plan
 from gsencoder.models.serialize import Order
 
 
@@ -26,7 +26,7 @@ class TransformerConfig:
     head_channels: int = field(default=32, metadata={"help": "channels of an attention head"})
     patch: int = field(default=128, metadata={"help": "most tokens that attend to one another"})
     orders: tuple[Order, ...] = field(
-        default=("z", "z-trans", "hilbert", "hilbert-trans"),
+        default=ORDERS,
         metadata={"help": "curves that patches are cut along, block by block in turn"},
     )
     mlp_ratio: float = field(default=4.0, metadata={"help": "hidden channels of a block's perceptron, in its channels"})

@@ -17,7 +17,7 @@ CHECKPOINT_FILE = "checkpoint.safetensors"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Progress:
+class TrainingState:
     """What a checkpoint says beside its tensors.
 
     Attributes:
@@ -35,7 +35,7 @@ def save_checkpoint(
     path: Path,
     model: torch.nn.Module,
     optimizer: torch.optim.Optimizer,
-    progress: Progress,
+    state: TrainingState,
     settings: dict[str, Any],
 ) -> None:
     """Writes a checkpoint; the one before stays until the new one is whole.
@@ -44,7 +44,7 @@ def save_checkpoint(
         path: the file.
         model: whose parameters are trained.
         optimizer: over parameters of `model`, with state tensors of their shapes, as AdamW has them.
-        progress: see there.
+        state: see there.
         settings: what a run must have in common to go on from here, as JSON values.
 
     Raises:
@@ -54,13 +54,13 @@ def save_checkpoint(
     for name, parameter in model.named_parameters():
         for key, value in optimizer.state.get(parameter, {}).items():
             arrays[f"optimizer.{key}.{name}"] = value.detach().float().cpu().numpy()
-    header = {**asdict(progress), "settings": settings}
+    header = {**asdict(state), "settings": settings}
     write_archive(path, arrays, header)
 
 
 def load_checkpoint(
     path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, settings: dict[str, Any]
-) -> Progress:
+) -> TrainingState:
     """Puts model and optimiser where the checkpoint was made.
 
     Raises:
@@ -74,7 +74,7 @@ def load_checkpoint(
                 f"{path}: was made with {key}={old!r}, and this run has {new!r}; "
                 "give the same settings, another out=, or resume=false to begin anew"
             )
-        state = {
+        parameters = {
             name: torch.from_numpy(file.array(f"model.{name}", "float32", tuple(value.shape)))
             for name, value in model.state_dict().items()
         }
@@ -87,15 +87,15 @@ def load_checkpoint(
                     key: torch.from_numpy(file.array(f"optimizer.{key}.{name}", "float32", size).copy())
                     for key, size in keys
                 }
-        progress = Progress(
+        state = TrainingState(
             step=file.value("step", int),
             seconds=float(file.value("seconds", float, int)),
             unlogged=tuple(file.value("unlogged", list)),
         )
-    model.load_state_dict(state)
+    model.load_state_dict(parameters)
     for parameter, values in moments.items():
         optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in values.items()}
-    return progress
+    return state
 
 
 def _difference(old: Any, new: Any, path: str = "") -> tuple[str, Any, Any]:

@@ -8,8 +8,6 @@ from torch import Tensor, nn
 from gsencoder.train.losses import Head, LossConfig, Sum, field_loss, render_loss
 from gsencoder.train.samples import Batch, Rows
 
-TERMS = ("field", "render")
-
 
 class Distillation:
     """The loss L = λ_3D · L_3D + λ_render · L_render, in parts that are summed before they are divided.
@@ -28,14 +26,15 @@ class Distillation:
 
     @property
     def lambdas(self) -> dict[str, float]:
-        """How much each term counts."""
-        return {"field": self.config.field_weight, "render": self.config.render_weight}
+        """How much each term counts, of those that do."""
+        both = {"field": self.config.field_weight, "render": self.config.render_weight}
+        return {name: weight for name, weight in both.items() if weight}
 
     def weights(self, batch: Batch) -> dict[str, float]:
         """The sum of weights of each term in a batch: what its total will be divided by."""
         return {
             "field": float(batch.weights.double().sum()),
-            "render": float(batch.rows.row_weights.double().sum()) if self.config.render_weight else 0.0,
+            "render": float(batch.rows.row_weights.double().sum()),
         }
 
     def __call__(self, batch: Batch) -> dict[str, Sum]:

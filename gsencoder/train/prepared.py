@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.data.archive import map_arrays, open_archive, write_archive
+from gsencoder.data.archived import camera_arrays, read_cameras
 from gsencoder.errors import InputError
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene
@@ -67,14 +68,13 @@ class PreparedScene:
     @cached_property
     def _header(self) -> tuple[Cameras, float | None, list[float] | None, tuple[str, ...]]:
         with open_archive(self.path) as file:
-            cameras = Cameras(
-                cam_from_world=file.array("cam_from_world", "float32", ("V", 4, 4)),
-                Ks=file.array("Ks", "float32", ("V", 3, 3)),
-                widths=file.array("widths", "int32", ("V",)),
-                heights=file.array("heights", "int32", ("V",)),
-            )
             names = tuple(str(name) for name in file.value("views", list))
-            return cameras, file.value("metres_per_unit", float, int, None), file.value("up", list, None), names
+            return (
+                read_cameras(file),
+                file.value("metres_per_unit", float, int, None),
+                file.value("up", list, None),
+                names,
+            )
 
     def close(self) -> None:
         """Lets go of the file, which is opened again when something is asked for."""
@@ -164,7 +164,7 @@ def write_prepared(
         raise InputError(
             f"prepare: expected features of ({outputs.space.describe()}), got ({features.space.describe()})"
         )
-    gaussians, cameras = scene.gaussians, scene.views.cameras
+    gaussians = scene.gaussians
     sizes = [len(view.valid) for view in views]
     entries = np.cumsum([0, *(len(view.col) for view in views)])
     arrays = {
@@ -183,10 +183,7 @@ def write_prepared(
         "weight": np.concatenate([view.weight for view in views]).astype(np.float16),
         "row_targets": np.concatenate([view.targets for view in views]).astype(np.float16),
         "row_valid": np.concatenate([view.valid for view in views]).astype(np.uint8),
-        "cam_from_world": cameras.cam_from_world,
-        "Ks": cameras.Ks,
-        "widths": cameras.widths,
-        "heights": cameras.heights,
+        **camera_arrays(scene.views.cameras),
     }
     header = {
         "views": list(scene.views.names),

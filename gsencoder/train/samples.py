@@ -219,7 +219,9 @@ def make_sample(
         gaussians = augment(gaussians, rng, change, voxel=voxel, up=scene.up)
     attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
     shape = recipe.losses
-    rows = [restrict(scene.view(view), len(scene), selected, kept, shape) for view in views if shape.render_weight]
+    rows = [_no_rows(scene.channels)]
+    for view in views if shape.render_weight else ():
+        rows.append(_rows_of(restrict(scene.view(view), len(scene), selected, kept, shape), recipe))
     return Sample(
         name=f"{scene.name} ({', '.join(scene.view_names[view] for view in views)})",
         attributes=attributes,
@@ -227,7 +229,7 @@ def make_sample(
         plan=plan,
         targets=torch.from_numpy(scene.targets(kept)),
         weights=torch.from_numpy(weights[kept]),
-        rows=_stack(rows, scene.channels, recipe),
+        rows=join_rows(rows, [0] * len(rows)),
     )
 
 
@@ -278,18 +280,33 @@ def _row_sums(values: np.ndarray, starts: np.ndarray, crow: np.ndarray) -> np.nd
     return np.where(np.diff(crow) > 0, total, 0)
 
 
-def _stack(views: Sequence[ViewRows], channels: int, recipe: SampleRecipe) -> Rows:
-    """Rows of several views as one matrix."""
-    entries = np.cumsum([0, *(len(view.col) for view in views)])
-    crows = [view.crow[:-1] + start for view, start in zip(views, entries[:-1], strict=True)]
-    targets = np.concatenate([np.zeros((0, channels), np.float32), *(view.targets for view in views)])
-    weights = recipe.rarity.weights(targets, recipe.losses.rarity)
+def _rows_of(view: ViewRows, recipe: SampleRecipe) -> Rows:
+    """Rows of one view as tensors, with their weights in the loss."""
     return Rows(
-        crow=torch.from_numpy(np.concatenate([*crows, entries[-1:]]).astype(np.int64)),
-        col=torch.from_numpy(np.concatenate([np.zeros(0, np.int32), *(view.col for view in views)])),
-        weight=torch.from_numpy(np.concatenate([np.zeros(0, np.float32), *(view.weight for view in views)])),
-        targets=torch.from_numpy(targets),
-        row_weights=torch.from_numpy(weights),
+        crow=torch.from_numpy(view.crow),
+        col=torch.from_numpy(view.col),
+        weight=torch.from_numpy(view.weight),
+        targets=torch.from_numpy(view.targets),
+        row_weights=torch.from_numpy(recipe.rarity.weights(view.targets, recipe.losses.rarity)),
+    )
+
+
+def _no_rows(channels: int) -> Rows:
+    nothing = torch.zeros(0)
+    crow, col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int32)
+    return Rows(crow=crow, col=col, weight=nothing, targets=nothing.view(0, channels), row_weights=nothing)
+
+
+def join_rows(parts: Sequence[Rows], shifts: Sequence[int]) -> Rows:
+    """Rows below one another as one matrix; `shifts` are added to the columns of each."""
+    entries = np.cumsum([0, *(len(part.col) for part in parts)]).tolist()
+    crows = [part.crow[:-1] + entry for part, entry in zip(parts, entries, strict=False)]
+    return Rows(
+        crow=torch.cat([*crows, torch.tensor(entries[-1:])]),
+        col=torch.cat([part.col + shift for part, shift in zip(parts, shifts, strict=True)]),
+        weight=torch.cat([part.weight for part in parts]),
+        targets=torch.cat([part.targets for part in parts]),
+        row_weights=torch.cat([part.row_weights for part in parts]),
     )
 
 
@@ -307,15 +324,6 @@ def join_samples(parts: Sequence[Sample | InputError], patch: int) -> Batch | In
         samples.append(part)
     sizes = [len(sample.attributes) for sample in samples]
     starts = [sum(sizes[:i]) for i in range(len(sizes))]
-    entries = [sum(len(sample.rows.col) for sample in samples[:i]) for i in range(len(samples) + 1)]
-    crows = [sample.rows.crow[:-1] + entry for sample, entry in zip(samples, entries, strict=False)]
-    rows = Rows(
-        crow=torch.cat([*crows, torch.tensor(entries[-1:])]),
-        col=torch.cat([sample.rows.col + start for sample, start in zip(samples, starts, strict=True)]),
-        weight=torch.cat([sample.rows.weight for sample in samples]),
-        targets=torch.cat([sample.rows.targets for sample in samples]),
-        row_weights=torch.cat([sample.rows.row_weights for sample in samples]),
-    )
     return Batch(
         names=tuple(sample.name for sample in samples),
         attributes=torch.cat([sample.attributes for sample in samples]),
@@ -323,5 +331,5 @@ def join_samples(parts: Sequence[Sample | InputError], patch: int) -> Batch | In
         plan=join_plans([sample.plan for sample in samples], patch, round_up=True),
         targets=torch.cat([sample.targets for sample in samples]),
         weights=torch.cat([sample.weights for sample in samples]),
-        rows=rows,
+        rows=join_rows([sample.rows for sample in samples], starts),
     )

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from gsencoder.errors import InputError
 from gsencoder.models.device import Precision, autocast_dtype
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.train.checkpoint import CHECKPOINT_FILE, Progress, load_checkpoint, save_checkpoint
+from gsencoder.train.checkpoint import CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
 from gsencoder.train.distributed import Place, sum_over_processes, together
 from gsencoder.train.log import Log
@@ -58,6 +58,10 @@ class TrainerConfig:
             raise InputError(f"learning_rate: expected a positive number, got {self.learning_rate}")
         if not 0 <= self.final_rate <= 1:
             raise InputError(f"final_rate: expected a share in [0, 1], got {self.final_rate}")
+
+    def samples_per_step(self, processes: int) -> int:
+        """Samples of one optimiser step, over all processes."""
+        return self.batch * self.accumulate * processes
 
 
 class Validated(NamedTuple):
@@ -118,12 +122,12 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(
             _groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
         )
-        self.progress = Progress()
+        self.state = TrainingState()
         self._in_between = False
         self.validated: Validated | None = None
         if (folder / CHECKPOINT_FILE).is_file():
-            self.progress = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
-        self._log = Log(folder, done=self.progress.step, events=tensorboard) if place.first else None
+            self.state = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
+        self._log = Log(folder, done=self.state.step, events=tensorboard) if place.first else None
         network: nn.Module = torch.compile(encoder, dynamic=True) if config.compile else encoder  # type: ignore[assignment]
         self._parallel: nn.parallel.DistributedDataParallel | None = None
         if place.size > 1:
@@ -132,7 +136,7 @@ class Trainer:
         self.distillation = Distillation(network, losses, heads=[(a.to(device), b.to(device)) for a, b in heads])
         self._autocast = autocast_dtype(config.precision, device)
 
-    def run(self, track: Track = lambda steps, label: iter(steps)) -> Progress:  # noqa: ARG005
+    def run(self, track: Track = lambda steps, label: iter(steps)) -> TrainingState:  # noqa: ARG005
         """All steps that are left. An interrupt leaves a checkpoint behind.
 
         Raises:
@@ -150,13 +154,13 @@ class Trainer:
         finally:
             if self._log is not None:
                 self._log.close()
-        return self.progress
+        return self.state
 
     def _run(self, track: Track) -> None:
-        config, start = self.config, time.monotonic() - self.progress.seconds
-        first, saved = self.progress.step, time.monotonic()
+        config, start = self.config, time.monotonic() - self.state.seconds
+        first, saved = self.state.step, time.monotonic()
         batches = iter(self._loader(first))
-        recent = list(self.progress.unlogged)
+        recent = list(self.state.unlogged)
         for step in track(range(first, config.steps), "training"):
             recent.append(self._step(step, [_checked(next(batches)) for _ in range(config.accumulate)]))
             done = step + 1
@@ -164,13 +168,13 @@ class Trainer:
             if done % config.log_every == 0 or done == config.steps:
                 row = {name: float(np.mean([each[name] for each in recent])) for name in recent[-1]}
                 recent = []
-            self.progress = Progress(step=done, seconds=time.monotonic() - start, unlogged=tuple(recent))
+            self.state = TrainingState(step=done, seconds=time.monotonic() - start, unlogged=tuple(recent))
             self._in_between = False
             if done == config.steps or (config.validate_every and done % config.validate_every == 0):
                 with together():
                     row |= self._validated(done)
             if row and self._log is not None:
-                self._log.add(done, row | {"seconds": self.progress.seconds})
+                self._log.add(done, row | {"seconds": self.state.seconds})
             if time.monotonic() - saved >= config.checkpoint_every or done == config.steps:
                 self.save()
                 saved = time.monotonic()
@@ -178,7 +182,7 @@ class Trainer:
     def save(self) -> None:
         """Writes the checkpoint; only the first process does."""
         if self.place.first:
-            save_checkpoint(self.folder / CHECKPOINT_FILE, self.encoder, self.optimizer, self.progress, self.settings)
+            save_checkpoint(self.folder / CHECKPOINT_FILE, self.encoder, self.optimizer, self.state, self.settings)
 
     def _loader(self, first: int) -> "DataLoader[Any]":
         config = self.config
@@ -207,7 +211,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.encoder.train()
-        lambdas = {name: weight for name, weight in self.distillation.lambdas.items() if weight}
+        lambdas = self.distillation.lambdas
         own = [self.distillation.weights(batch) for batch in batches]
         counts = [sum(weights[name] for weights in own) for name in lambdas]
         counts = sum_over_processes(torch.tensor(counts, dtype=torch.float64, device=self.device)).tolist()

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from gsencoder.data.augment import AugmentConfig, augment, turn
 from gsencoder.errors import InputError
-from gsencoder.geometry import SH_C0, colors_from_sh, covariances
-from gsencoder.types import Gaussians
+from gsencoder.geometry import colors_from_sh, covariances
+from gsencoder.types import SH_C0, Gaussians
 
 NOTHING = AugmentConfig(turn=0.0, tilt=0.0, mirror=0.0, scale=0.0, jitter=0.0, drop=0.0, light=0.0, tint=0.0, noise=0.0)
 
