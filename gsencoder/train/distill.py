@@ -3,37 +3,50 @@
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from gsencoder.train.losses import Head, LossConfig, Sum, field_loss, render_loss
+from gsencoder.train.losses import Head, LossConfig, Sum, contrast_loss, field_loss, render_loss
 from gsencoder.train.samples import Batch, Rows
 
 
 class Distillation:
-    """The loss L = λ_3D · L_3D + λ_render · L_render, in parts that are summed before they are divided.
+    """The loss L = λ_3D · L_3D + λ_render · L_render + λ_contrast · L_contrast, in parts that are summed before they are
+    divided.
 
     A step's loss is Σ total / Σ weight of each term over all its micro-batches on all processes. The weights are known
     before anything is computed, so every micro-batch can divide by the step's own and simply be added.
     """
 
-    def __init__(self, encoder: nn.Module, config: LossConfig, *, heads: Sequence[tuple[Head, nn.Module]] = ()) -> None:
+    def __init__(
+        self,
+        encoder: nn.Module,
+        config: LossConfig,
+        codebook: Float[Tensor, "K C"],
+        *,
+        heads: Sequence[tuple[Head, nn.Module]] = (),
+    ) -> None:
         """Args:
         encoder: a `GaussianEncoder`, or one wrapped for several processes.
         config: what is compared.
+        codebook: kinds of target, which the codes of a batch are rows of.
         heads: a teacher's adapter heads, each with what decodes standard units for it.
         """
-        self.encoder, self.config, self.heads = encoder, config, heads
+        self.encoder, self.config, self.codebook, self.heads = encoder, config, codebook, heads
 
     @property
     def lambdas(self) -> dict[str, float]:
         """How much each term counts, of those that do."""
-        both = {"field": self.config.field_weight, "render": self.config.render_weight}
-        return {name: weight for name, weight in both.items() if weight}
+        config = self.config
+        terms = {"field": config.field_weight, "render": config.render_weight, "contrast": config.contrast_weight}
+        return {name: weight for name, weight in terms.items() if weight}
 
     def weights(self, batch: Batch) -> dict[str, float]:
         """The sum of weights of each term in a batch: what its total will be divided by."""
+        gaussians = float(batch.weights.double().sum())
         return {
-            "field": float(batch.weights.double().sum()),
+            "field": gaussians,
+            "contrast": gaussians,
             "render": float(batch.rows.row_weights.double().sum()),
         }
 
@@ -46,6 +59,8 @@ class Distillation:
                 terms["field"] = field_loss(predicted, batch.targets, batch.weights, self.config)
             if self.config.render_weight:
                 terms["render"] = self._render(predicted, batch.rows)
+            if self.config.contrast_weight:
+                terms["contrast"] = contrast_loss(predicted, batch.codes, batch.weights, self.codebook, self.config)
         return terms
 
     def _render(self, predicted: Tensor, rows: Rows) -> Sum:

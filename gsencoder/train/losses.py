@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -30,6 +30,12 @@ class LossConfig:
     smooth_l1: float = field(default=0.1, metadata={"help": "β: weight of the smooth L1 distance in it"})
     field_weight: float = field(default=1.0, metadata={"help": "λ of the loss on Gaussians"})
     render_weight: float = field(default=0.2, metadata={"help": "λ of the loss on rendered cells; 0 = not rendered"})
+    contrast_weight: float = field(
+        default=0.0, metadata={"help": "λ of telling a target's kind from the dataset's others; 0 = not asked"}
+    )
+    temperature: float = field(
+        default=0.1, metadata={"help": "of the contrast: how much nearer its own kind must be, in typical distances²"}
+    )
     rarity: float = field(
         default=0.5, metadata={"help": "targets of a kind with n Gaussians in the dataset count n^−this; 0 = all alike"}
     )
@@ -39,14 +45,18 @@ class LossConfig:
     )
 
     def __post_init__(self) -> None:
-        for name in ("cosine", "smooth_l1", "field_weight", "render_weight", "rarity"):
+        for name in ("cosine", "smooth_l1", "field_weight", "render_weight", "contrast_weight", "rarity"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if not 0 < self.temperature < float("inf"):
+            raise InputError(f"temperature: expected a positive number, got {self.temperature}")
         for name in ("min_alpha", "min_kept"):
             if not 0 < getattr(self, name) <= 1:
                 raise InputError(f"{name}: expected a share in (0, 1], got {getattr(self, name)}")
-        if not self.field_weight + self.render_weight > 0:
-            raise InputError("field_weight and render_weight: expected at least one above 0, there is no loss left")
+        if not self.field_weight + self.render_weight + self.contrast_weight > 0:
+            raise InputError(
+                "field_weight, render_weight and contrast_weight: expected one above 0, there is no loss left"
+            )
 
 
 class Head(nn.Module):
@@ -105,6 +115,33 @@ def field_loss(
     """L_3D: over Gaussians; those of weight 0 were never seen and have no target."""
     rows = torch.nonzero(weights).squeeze(1)
     losses = match_loss(predicted.index_select(0, rows), target.index_select(0, rows), config)
+    chosen = weights.index_select(0, rows)
+    return Sum((losses * chosen).sum(), chosen.sum())
+
+
+def contrast_loss(
+    predicted: Float[Tensor, "N C"],
+    codes: Int64[Tensor, " N"],
+    weights: Float[Tensor, " N"],
+    codebook: Float[Tensor, "K C"],
+    config: LossConfig,
+) -> Sum:
+    """Cross-entropy of a target's kind among all kinds, softmax_k(−|predicted − c_k|² / (2·C·temperature)).
+
+    Where two kinds look alike, what fits both best under L_3D is their mean, which may be nearest to a third. This term
+    makes the likelier one win, by as much as the features are told apart by later: their nearest vector.
+
+    Args:
+        predicted: standard units.
+        codes: for each Gaussian the row of the codebook that its target is nearest to.
+        weights: in the loss; 0 where a Gaussian has no target, and whatever its code is is not looked at.
+        codebook: kinds of target, standard units.
+        config: for the temperature.
+    """
+    rows = torch.nonzero(weights).squeeze(1)
+    half = 0.5 * (codebook * codebook).sum(dim=1)
+    logits = (predicted.index_select(0, rows) @ codebook.T - half) / (codebook.shape[1] * config.temperature)
+    losses = functional.cross_entropy(logits, codes.index_select(0, rows), reduction="none")
     chosen = weights.index_select(0, rows)
     return Sum((losses * chosen).sum(), chosen.sum())
 

@@ -55,6 +55,7 @@ class Sample(NamedTuple):
     opacities: Float[Tensor, " N"]
     plan: CloudPlan
     targets: Float[Tensor, "N C"]
+    codes: Int64[Tensor, " N"]
     weights: Float[Tensor, " N"]
     rows: Rows
 
@@ -66,6 +67,7 @@ class Batch(NamedTuple):
         names: scene and views of each sample, for messages.
         attributes, opacities, plan: what the encoder takes.
         targets: standard units.
+        codes: of each target the nearest row of the codebook; −1 where there is no target.
         weights: of each Gaussian in the loss; 0 where it has no target.
         rows: of the render loss.
     """
@@ -75,6 +77,7 @@ class Batch(NamedTuple):
     opacities: Float[Tensor, " N"]
     plan: Plan
     targets: Float[Tensor, "N C"]
+    codes: Int64[Tensor, " N"]
     weights: Float[Tensor, " N"]
     rows: Rows
 
@@ -228,6 +231,7 @@ def make_sample(
         opacities=opacities,
         plan=plan,
         targets=torch.from_numpy(scene.targets(kept)),
+        codes=torch.from_numpy(codes[kept].astype(np.int64)),
         weights=torch.from_numpy(weights[kept]),
         rows=join_rows(rows, [0] * len(rows)),
     )
@@ -330,6 +334,7 @@ def join_samples(parts: Sequence[Sample | InputError], patch: int) -> Batch | In
         opacities=torch.cat([sample.opacities for sample in samples]),
         plan=join_plans([sample.plan for sample in samples], patch, round_up=True),
         targets=torch.cat([sample.targets for sample in samples]),
+        codes=torch.cat([sample.codes for sample in samples]),
         weights=torch.cat([sample.weights for sample in samples]),
         rows=join_rows([sample.rows for sample in samples], starts),
     )

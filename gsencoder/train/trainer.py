@@ -133,7 +133,9 @@ class Trainer:
         if place.size > 1:
             ids = [device.index] if device.type == "cuda" else None
             network = self._parallel = nn.parallel.DistributedDataParallel(network, device_ids=ids)
-        self.distillation = Distillation(network, losses, heads=[(a.to(device), b.to(device)) for a, b in heads])
+        codebook = torch.from_numpy(dataset.recipe.rarity.codebook).to(device)
+        heads = [(head.to(device), decode.to(device)) for head, decode in heads]
+        self.distillation = Distillation(network, losses, codebook, heads=heads)
         self._autocast = autocast_dtype(config.precision, device)
 
     def run(self, track: Track = lambda steps, label: iter(steps)) -> TrainingState:  # noqa: ARG005
@@ -303,6 +305,7 @@ def _on(batch: Batch, device: torch.device) -> Batch:
         opacities=move(batch.opacities),
         plan=batch.plan.to(device),
         targets=move(batch.targets),
+        codes=move(batch.codes),
         weights=move(batch.weights),
         rows=type(batch.rows)(*map(move, batch.rows)),
     )
