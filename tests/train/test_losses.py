@@ -9,7 +9,7 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.errors import InputError
 from gsencoder.render import blend
-from gsencoder.train.losses import Head, LossConfig, field_loss, match_loss, render_loss
+from gsencoder.train.losses import Head, LossConfig, contrast_loss, field_loss, match_loss, render_loss
 
 CONFIG = LossConfig()
 
@@ -135,3 +135,57 @@ def test_units_of_numpy_and_torch_agree() -> None:
     standard = outputs.standardize(vectors)
     assert abs(np.square(standard).mean() - 1) < 1e-5
     np.testing.assert_allclose(outputs.restore(standard), vectors, atol=1e-5)
+
+
+def test_the_contrast_is_a_cross_entropy_over_squared_distances_to_the_kinds() -> None:
+    codebook, predicted, codes = typical(5), torch.randn(7, 8), torch.tensor([0, 1, 2, 3, 4, 4, 0])
+    weights = torch.tensor([1.0, 2.0, 0.5, 1.0, 3.0, 1.0, 1.0])
+    found = contrast_loss(predicted, codes, weights, codebook, CONFIG)
+    logits = -torch.cdist(predicted.double(), codebook.double()) ** 2 / (2 * 8 * CONFIG.temperature)
+    expected = (torch.nn.functional.cross_entropy(logits, codes, reduction="none") * weights).sum()
+    torch.testing.assert_close(found.total.double(), expected, atol=1e-4, rtol=1e-5)
+    assert found.weight == weights.sum()
+
+
+def test_where_kinds_look_alike_the_contrast_ends_nearer_to_the_likelier_one_by_the_logarithm_of_the_odds() -> None:
+    codebook, codes = typical(3).double(), torch.tensor([0] * 6 + [1] * 4)
+    guess = torch.zeros(1, 8, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.LBFGS([guess], max_iter=300, line_search_fn="strong_wolfe", tolerance_change=1e-12)
+
+    def closure() -> torch.Tensor:
+        optimizer.zero_grad()
+        found = contrast_loss(guess.expand(10, 8), codes, torch.ones(10, dtype=torch.float64), codebook, CONFIG)
+        found.total.backward()
+        return found.total
+
+    optimizer.step(closure)
+    squares = (guess.detach() - codebook).square().sum(dim=1)
+    gap = (squares[1] - squares[0]) / (2 * 8 * CONFIG.temperature)
+    torch.testing.assert_close(gap, torch.tensor(6 / 4).log().double(), atol=1e-4, rtol=0)
+    assert squares[2] > squares[1]
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-20, 1e6, 1e15])
+def test_the_contrast_is_finite_for_predictions_of_any_length(size: float) -> None:
+    predicted = (torch.randn(5, 8) * size).requires_grad_()
+    found = contrast_loss(predicted, torch.arange(5), torch.ones(5), typical(5), CONFIG)
+    (gradient,) = torch.autograd.grad(found.total, [predicted])
+    assert torch.isfinite(found.total)
+    assert torch.isfinite(gradient).all()
+
+
+def test_unseen_gaussians_have_no_kind_and_no_part_in_the_contrast() -> None:
+    predicted = torch.randn(4, 8, requires_grad=True)
+    weights, codes = torch.tensor([1.0, 0.0, 1.0, 0.0]), torch.tensor([1, -1, 0, -1])
+    contrast_loss(predicted, codes, weights, typical(3), CONFIG).total.backward()
+    assert predicted.grad is not None
+    assert (predicted.grad[codes < 0] == 0).all()
+    assert (predicted.grad[codes >= 0] != 0).any(dim=1).all()
+
+
+def test_a_loss_of_no_term_and_a_temperature_of_zero_are_refused() -> None:
+    with pytest.raises(InputError, match="contrast_weight: expected one above 0"):
+        LossConfig(field_weight=0.0, render_weight=0.0)
+    LossConfig(field_weight=0.0, render_weight=0.0, contrast_weight=1.0)
+    with pytest.raises(InputError, match="temperature"):
+        LossConfig(temperature=0.0)
