@@ -1,10 +1,12 @@
 """What an encoder costs: time and memory by size, beside its matrix products alone, its plan, and the parts of a step.
 
     python bench/encoder.py [--model tiny|small|base] [--sizes 10000,100000] [--precision float32|bfloat16]
-    python bench/encoder.py --chunked 1000000
+    python bench/encoder.py --chunked 1000000 [--chunk 250000]
+    python bench/encoder.py --step PREPARED [--steps 40]
 
 Splats are seeds of a long random floor with things on it, at the spacing that the encoder's grid expects. Every figure
-is the best of several runs in this process; ratios are of times taken in turn.
+is the best of several runs in this process; ratios are of times taken in turn. The parts of a step are means over
+samples of `experiment=house_cpu`.
 """
 
 import argparse
@@ -12,6 +14,7 @@ import resource
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +28,11 @@ from gsencoder.models.device import autocast_dtype
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.losses import LossConfig, match_loss
+from gsencoder.models.plan import plan_cloud
+from gsencoder.train import samples
+from gsencoder.train.distill import Distillation
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.samples import SampleDataset, SampleRecipe
 from gsencoder.types import FeatureSpace, Gaussians
 
 CHANNELS = 64
@@ -98,10 +105,10 @@ def measure(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
     dtype = autocast_dtype(precision, torch.device("cpu"))  # type: ignore[arg-type]
     voxel = config.model.voxel
 
-    def plan() -> Any:
+    def inputs() -> Any:
         return encoder_inputs(splat, config.model, voxel)
 
-    attributes, opacities, cloud = plan()
+    attributes, opacities, cloud = inputs()
     joined = encoder.join([cloud], round_up=dtype is not None)
 
     def forward() -> None:
@@ -119,38 +126,85 @@ def measure(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
 
     seconds = {"gaussians": len(splat), "tokens": len(joined.counts)}
     seconds["products"], seconds["forward"] = best(products), best(forward)
-    seconds["plan"] = best(lambda: encoder.join([plan()[2]], round_up=dtype is not None), 3)
+    means, shape = torch.from_numpy(splat.means), config.model.transformer
+
+    def planned() -> None:
+        encoder.join([plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders)], round_up=dtype is not None)
+
+    seconds["plan"] = best(planned)
+    seconds["inputs"] = best(inputs) - seconds["plan"]
     return seconds
 
 
-def step_parts(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
-    """Seconds of plan, forward, loss and backward of a training step."""
-    splat = surface(size)
-    encoder = GaussianEncoder(config.model, CHANNELS).train()
+def timed(module: Any, name: str, spent: dict[str, float], label: str) -> None:
+    """Adds what every call of a module's function takes to `spent`."""
+    function = getattr(module, name)
+
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        start = time.perf_counter()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            spent[label] = spent.get(label, 0.0) + time.perf_counter() - start
+
+    setattr(module, name, wrapped)
+
+
+def step_parts(config: TrainConfig, prepared: Path, steps: int) -> dict[str, float]:
+    """Mean seconds of the parts of a training step on prepared scenes, one sample a step."""
+    folder = PreparedDataset.__new__(PreparedDataset)
+    folder.folder = prepared
+    outputs, _ = folder.load_space()
+    recipe = SampleRecipe(
+        encoder=config.model,
+        sampling=config.sampling,
+        augmentation=config.augment,
+        losses=config.loss,
+        rarity=folder.load_rarity(),
+        seed=0,
+    )
+    dataset = SampleDataset(folder.scenes(sorted(path.stem for path in (prepared / "scenes").iterdir())), recipe)
+    spent: dict[str, float] = {}
+    timed(samples, "choose_part", spent, "selection")
+    timed(samples, "augment", spent, "augmentation")
+    timed(samples, "encoder_inputs", spent, "plan")
+    timed(samples, "restrict", spent, "rows of B")
+    encoder = GaussianEncoder(config.model, outputs.channels).train()
     optimizer = torch.optim.AdamW(encoder.parameters(), lr=1e-3, fused=True)
-    dtype = autocast_dtype(precision, torch.device("cpu"))  # type: ignore[arg-type]
-    target = torch.randn(len(splat), CHANNELS)
-    parts: dict[str, list[float]] = {}
-    for _ in range(6):
+    distillation = Distillation(encoder, config.loss, torch.from_numpy(recipe.rarity.codebook))
+    dtype = autocast_dtype(config.train.precision, torch.device("cpu"))
+    gaussians = 0
+    for step in range(-10, steps):
+        if step == 0:
+            spent.clear()
+            gaussians = 0
+        start = time.perf_counter()
+        sample = dataset.make(step + 10)
+        made = time.perf_counter()
+        batch = samples.join_samples([sample], config.model.transformer.patch)
+        assert isinstance(batch, samples.Batch)
+        gaussians += len(batch.attributes)
         marks = [time.perf_counter()]
-        attributes, opacities, cloud = encoder_inputs(splat, config.model, config.model.voxel)
-        joined = encoder.join([cloud], round_up=True)
-        marks.append(time.perf_counter())
         with torch.autocast("cpu", dtype, enabled=dtype is not None):
-            found = encoder(attributes, opacities, joined)
+            encoder_only = encoder(batch.attributes, batch.opacities, batch.plan)
         marks.append(time.perf_counter())
-        loss = match_loss(found, target, LossConfig()).mean()
+        distillation.encoder = lambda *_, found=encoder_only: found
+        terms = distillation(batch)
+        loss = sum(weight * terms[name].total / terms[name].weight for name, weight in distillation.lambdas.items())
         marks.append(time.perf_counter())
+        assert isinstance(loss, torch.Tensor)
         loss.backward()
         marks.append(time.perf_counter())
         optimizer.step()
         optimizer.zero_grad()
         marks.append(time.perf_counter())
-        for name, first, last in zip(
-            ("plan", "forward", "loss", "backward", "optimizer"), marks, marks[1:], strict=False
-        ):
-            parts.setdefault(name, []).append(last - first)
-    return {name: min(values[1:]) for name, values in parts.items()}
+        parts = {"plan": marks[0] - made, "sample": made - start}
+        parts |= dict(zip(("forward", "loss", "backward", "optimiser"), np.diff(marks), strict=True))
+        for name, value in parts.items():
+            spent[name] = spent.get(name, 0.0) + float(value)
+    inner = ("selection", "augmentation", "rows of B")
+    spent["rest of the sample"] = spent.pop("sample") - sum(spent[name] for name in inner) - spent["plan"]
+    return {"gaussians": gaussians / steps} | {name: value / steps for name, value in spent.items()}
 
 
 def main() -> None:
@@ -160,6 +214,8 @@ def main() -> None:
     parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
     parser.add_argument("--patch", type=int, default=0)
     parser.add_argument("--chunked", type=int, default=0)
+    parser.add_argument("--step", default="", help="prepared scenes: what the parts of a training step take")
+    parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--chunk", type=int, default=250_000)
     chosen = parser.parse_args()
     keep_heap()
@@ -183,6 +239,15 @@ def main() -> None:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
         print(f"{len(splat):,} Gaussians in chunks of {chosen.chunk:,}: {took:.1f} s, {peak:.2f} GiB at most")
         return
+    if chosen.step:
+        config = compose("train", TrainConfig, ["scene", "experiment=house_cpu"])
+        parts = step_parts(config, Path(chosen.step), chosen.steps)
+        size = parts.pop("gaussians")
+        total = sum(parts.values())
+        print(f"a step of {size:,.0f} Gaussians takes {total:.3f} s on {torch.get_num_threads()} threads")
+        for name, seconds in parts.items():
+            print(f"  {name}: {seconds * 1e3:.1f} ms, {seconds / total:.0%}")
+        return
     rows = []
     for size in map(int, chosen.sizes.split(",")):
         row = measure(config, size, chosen.precision)
@@ -190,7 +255,7 @@ def main() -> None:
         print(
             f"{row['gaussians']:>9,} Gaussians {row['tokens']:>9,} tokens: products {row['products']:.3f} s, forward "
             f"{row['forward']:.3f} s ({row['forward'] / row['products']:.2f}×), plan {row['plan']:.3f} s "
-            f"({row['plan'] / row['forward']:.1%} of the forward)",
+            f"({row['plan'] / row['forward']:.1%} of the forward), attributes {row['inputs']:.3f} s",
             flush=True,
         )
     if len(rows) > 1:
@@ -198,8 +263,6 @@ def main() -> None:
         exponent = np.polyfit(sizes, times, 1)[0]
         slope = rows[-1]["forward"] / rows[-1]["tokens"] * 1e6
         print(f"forward grows as tokens^{exponent:.2f}, {slope:.2f} µs a token at the largest")
-    parts = step_parts(config, min(30_000, int(rows[-1]["gaussians"])), chosen.precision)
-    print("a step of 30,000: " + ", ".join(f"{name} {seconds:.3f} s" for name, seconds in parts.items()))
 
 
 if __name__ == "__main__":
