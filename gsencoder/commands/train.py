@@ -73,7 +73,9 @@ class TrainConfig(CommonConfig):
         default="",
         metadata={"help": "file of the teacher's adapter heads, behind which cells are compared; empty = none"},
     )
-    store: Literal["float16", "float32"] = field(default="float16", metadata={"help": "type of the written weights"})
+    store: Literal["float16", "float32"] = field(
+        default="float16", metadata={"help": "type of the written weights and words"}
+    )
     device: Device = field(default="auto", metadata={"help": "where the encoder computes"})
     splat: str = field(default="", metadata={"help": f"Gaussians of scenes with views; empty = seeds. {READABLE}"})
     orbits: int = field(default=24, metadata={"help": "cameras put around a splat that has no views"})
@@ -184,7 +186,7 @@ def write_results(
     made_by = {"settings": settings(config), "steps": done.step, "seconds": done.seconds, "validation": scores}
     save_weights(folder / WEIGHTS_FILE, encoder, outputs, made_by, dtype=config.store)
     if words is not None:
-        save_text_table(folder / WORDS_FILE, words)
+        save_text_table(folder / WORDS_FILE, words, dtype=config.store)
     shutil.copy(trainer.folder / LOG_FILE, folder / LOG_FILE)
     for name in (EVENTS_FOLDER, "validation"):
         if (trainer.folder / name).is_dir():

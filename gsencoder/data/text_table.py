@@ -7,6 +7,7 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
@@ -131,13 +132,17 @@ def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) 
     table = np.ascontiguousarray(embeddings, dtype=np.float32)
     if table.ndim != 2 or 0 in table.shape:
         raise InputError(f"text table of {encoder}: expected embeddings [names, channels], got shape {table.shape}")
-    norms = np.linalg.norm(table, axis=1, keepdims=True)
-    # Rows far from unit length stay as they are, for TextTable to complain about.
-    rounded = np.abs(norms - 1) <= UNIT_TOLERANCE
-    table = np.where(rounded, table / np.where(rounded, norms, 1), table)
+    table = _unrounded(table)
     space = FeatureSpace(name=encoder, channels=table.shape[1], text_encoder=encoder)
     mean = table.mean(axis=0, dtype=np.float64).astype(np.float32)
     return TextTable(names=tuple(names), embeddings=table, space=space, mean=mean)
+
+
+def _unrounded(table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C D"]:
+    """Unit vectors from rounded ones; rows far from unit length stay as they are, for TextTable to complain about."""
+    norms = np.linalg.norm(table, axis=1, keepdims=True)
+    rounded = np.abs(norms - 1) <= UNIT_TOLERANCE
+    return np.asarray(np.where(rounded, table / np.where(rounded, norms, 1), table))
 
 
 def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
@@ -161,8 +166,13 @@ def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
     return _read_safetensors(file)
 
 
-def save_text_table(path: str | Path, table: TextTable) -> None:
+def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float32", "float16"] = "float32") -> None:
     """Writes the table as safetensors (embeddings and mean), with the names and the space as JSON in its header.
+
+    Args:
+        path: the file.
+        table: to store.
+        dtype: of the embeddings; float16 halves the file.
 
     Raises:
         InputError: the file cannot be written; what was there before stays.
@@ -171,7 +181,7 @@ def save_text_table(path: str | Path, table: TextTable) -> None:
 
     space = {item.name: getattr(table.space, item.name) for item in fields(table.space)}
     header = json.dumps({"names": table.names, "space": space}, ensure_ascii=False)
-    data = save({"embeddings": table.embeddings, "mean": table.mean}, {"format": FORMAT, "table": header})
+    data = save({"embeddings": table.embeddings.astype(dtype), "mean": table.mean}, {"format": FORMAT, "table": header})
     with atomic_file(path) as stream:
         stream.write(data)
 
@@ -194,8 +204,13 @@ def _read_safetensors(file: Path) -> TextTable:
             raise
         raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
     shapes = arrays["embeddings"].ndim == 2 and arrays["mean"].ndim == 1
-    if not good or not shapes or any(array.dtype != np.float32 for array in arrays.values()):
-        raise InputError(f"{file}: expected float32 embeddings [C, D] and mean [D], names and a space of text")
+    types = arrays["embeddings"].dtype in (np.float32, np.float16) and arrays["mean"].dtype == np.float32
+    if not good or not shapes or not types:
+        raise InputError(
+            f"{file}: expected embeddings [C, D] of float32 or float16, a float32 mean [D], names and a space of text"
+        )
+    if arrays["embeddings"].dtype == np.float16:
+        arrays["embeddings"] = _unrounded(arrays["embeddings"].astype(np.float32))
     try:
         return TextTable(names=tuple(names), space=space, **arrays)
     except InputError as error:

@@ -109,6 +109,18 @@ def test_a_saved_table_reads_back_as_it_was(table: TextTable, tmp_path: Path, su
     np.testing.assert_allclose(read.mean, table.mean, atol=2e-7)
 
 
+def test_a_table_saved_in_half_precision_is_half_as_large_and_has_unit_rows(tmp_path: Path) -> None:
+    vectors = np.random.default_rng(0).normal(size=(50, 64)).astype(np.float32)
+    table = make_text_table([f"n{i}" for i in range(50)], vectors / np.linalg.norm(vectors, axis=1)[:, None], "toy")
+    save_text_table(tmp_path / "full.safetensors", table)
+    save_text_table(tmp_path / "half.safetensors", table, dtype="float16")
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * (tmp_path / "full.safetensors").stat().st_size
+    read = load_text_table(tmp_path / "half.safetensors")
+    assert read.names == table.names
+    np.testing.assert_allclose(np.linalg.norm(read.embeddings, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(read.embeddings, table.embeddings, atol=5e-4)
+
+
 def test_a_half_precision_file_gives_unit_rows_and_the_encoder_of_its_name(table: TextTable, tmp_path: Path) -> None:
     path = save_npz(tmp_path / "toy_names.npz", names=np.array(NAMES), embeddings=table.embeddings.astype(np.float16))
     read = load_text_table(path)
