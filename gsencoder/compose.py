@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from gsencoder.config import typed
 from gsencoder.errors import InputError
-from gsencoder.options import Option, join_list, near, options_by_key, options_of, wrong_value
+from gsencoder.options import Option, is_list_of_words, join_list, near, options_by_key, options_of, wrong_value
 
 T = TypeVar("T")
 
@@ -187,7 +187,9 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
                 raise InputError(f"{key}: expected one of {', '.join(names)}, got {value!r}{near(value, names)}")
         elif option is not None and option.kind != "value":
             if not (sweep and SWEPT_TEXT.fullmatch(value)):
-                written = seal(value)
+                # Whoever knows Hydra writes brackets around a list; text may begin with one, words of a set do not.
+                bracketed = is_list_of_words(option.annotation) and re.fullmatch(r"\[(.*)\]", value)
+                written = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
         elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
             written = f"[{value}]"
         try:

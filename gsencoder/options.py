@@ -62,6 +62,10 @@ def _is_text(annotation: Any) -> bool:
     return annotation in (str, Path)
 
 
+def _is_word(annotation: Any) -> bool:
+    return get_origin(annotation) is Literal and all(isinstance(value, str) for value in get_args(annotation))
+
+
 def kind_of(annotation: Any) -> Kind:
     """Whether an option's characters are the user's own ("text", "list") or Hydra's to parse ("value")."""
     members = union_members(annotation)
@@ -70,10 +74,14 @@ def kind_of(annotation: Any) -> Kind:
     if len(members) == 1 and get_origin(members[0]) is tuple:
         items = get_args(members[0])
         if len(items) == 2 and items[1] is Ellipsis:
-            item = items[0]
-            words = get_origin(item) is Literal and all(isinstance(value, str) for value in get_args(item))
-            return "list" if _is_text(item) or words else "value"
+            return "list" if _is_text(items[0]) or _is_word(items[0]) else "value"
     return "value"
+
+
+def is_list_of_words(annotation: Any) -> bool:
+    """Whether an option is a list of words from a closed set, which hold no brackets, commas or blanks."""
+    items = get_args(annotation)
+    return get_origin(annotation) is tuple and len(items) == 2 and items[1] is Ellipsis and _is_word(items[0])
 
 
 def describe(annotation: Any) -> str:

@@ -38,6 +38,7 @@ class FusionConfig:
     tau: float | None = field(default=None, metadata={"help": "occlusion tolerance"})
     window: tuple[float, float] = field(default=(0.0, 1.0), metadata={"help": "depth range"})
     ranks: tuple[int, ...] = field(default=(8, 16), metadata={"help": "ranks"})
+    against: tuple[Literal["depth", "render"], ...] = field(default=("depth",), metadata={"help": "tests"})
 
     def __post_init__(self) -> None:
         if self.voxel <= 0:
@@ -61,7 +62,9 @@ YAML = {
         "defaults:\n  - common\n  - fusion: default\n  - teacher: labels\n  - _self_\n"
         "paths: []\nquery: []\nquestion: ''\ndevice: null\nseed: 0\n"
     ),
-    "fusion/default.yaml": "voxel: 0.02\nlift: blend\ntau: null\nwindow: [0.0, 1.0]\nranks: [8, 16]\n",
+    "fusion/default.yaml": (
+        "voxel: 0.02\nlift: blend\ntau: null\nwindow: [0.0, 1.0]\nranks: [8, 16]\nagainst: [depth]\n"
+    ),
     "teacher/labels.yaml": "name: labels\ntable: null\n",
     "teacher/onnx.yaml": "name: onnx\nweights: ''\ntop_k: 5\n",
     "teacher/dinov2.yaml": "defaults:\n  - onnx\n  - _self_\nweights: dinov2.onnx\n",
@@ -202,9 +205,19 @@ def test_numbers_lists_and_choices_are_parsed(conf: Path) -> None:
     assert toy(conf, "tau=inf").fusion.tau == math.inf
 
 
+@pytest.mark.parametrize("value", ["depth,render", "[depth,render]", "[ depth , render ]"])
+def test_a_list_of_words_may_have_brackets(conf: Path, value: str) -> None:
+    assert toy(conf, f"fusion.against={value}").fusion.against == ("depth", "render")
+
+
+def test_brackets_around_a_list_of_text_are_text(conf: Path) -> None:
+    assert toy(conf, "query=[red],mug").query == ("[red]", "mug")
+
+
 @pytest.mark.parametrize(
     ("word", "said"),
     [
+        ("fusion.against=[depth", "fusion.against: expected a list, each one of depth, render, got '[depth'"),
         ("voxel=2cm", "fusion.voxel: expected a number, got '2cm' (grid in metres)"),
         ("voxel=2 cm", "fusion.voxel: expected a number, got '2 cm'"),
         ("voxel=(2", "fusion.voxel: expected a number, got '(2'"),
