@@ -7,12 +7,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.train.losses import Head, LossConfig, Sum, contrast_loss, field_loss, render_loss
-from gsencoder.train.samples import Batch, Rows
+from gsencoder.train.rows import Rows
+from gsencoder.train.samples import Batch
 
 
 class Distillation:
-    """The loss L = λ_3D · L_3D + λ_render · L_render + λ_contrast · L_contrast, in parts that are summed before they are
-    divided.
+    """The loss L = λ_3D · L_3D + λ_render · L_render, with λ_contrast · L_contrast where asked for, in parts that are
+    summed before they are divided.
 
     A step's loss is Σ total / Σ weight of each term over all its micro-batches on all processes. The weights are known
     before anything is computed, so every micro-batch can divide by the step's own and simply be added.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int16, Int32, Int64
+from jaxtyping import Float, Int16, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
@@ -21,30 +21,13 @@ from gsencoder.data.batch import SamplingConfig, choose_part, crop_size, thin_ou
 from gsencoder.errors import InputError
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, Plan, join_plans
-from gsencoder.render import Blend, BlendConfig
-from gsencoder.render.lattice import Lattice
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepared import PreparedScene, ViewRows
+from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.rarity import Rarity, nearest_codes
+from gsencoder.train.rows import Rows, join_rows, no_rows, restrict, rows_of
 
 OPEN_SCENES = 256
 """Scenes that a process keeps open, the latest used."""
-
-
-class Rows(NamedTuple):
-    """Rows of B that are compared with a teacher's cells, over the Gaussians of a sample or a batch."""
-
-    crow: Int64[Tensor, " P_plus_1"]
-    col: Int32[Tensor, " nnz"]
-    weight: Float[Tensor, " nnz"]
-    targets: Float[Tensor, "P C"]
-    row_weights: Float[Tensor, " P"]
-
-    def blend(self, gaussians: int) -> Blend:
-        """B itself. Its rows belong to no picture, so its lattice is a line of them."""
-        lattice = Lattice(height=len(self.crow) - 1, width=1, side=1, x0=0.5, y0=0.5, dx=1.0, dy=1.0)
-        depths = self.weight.new_zeros(gaussians)
-        return Blend(self.crow, self.col, self.weight, depths, lattice, BlendConfig())
 
 
 class Sample(NamedTuple):
@@ -222,9 +205,9 @@ def make_sample(
         gaussians = augment(gaussians, rng, change, voxel=voxel, up=scene.up)
     attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
     shape = recipe.losses
-    rows = [_no_rows(scene.channels)]
+    rows = [no_rows(scene.channels)]
     for view in views if shape.render_weight else ():
-        rows.append(_rows_of(restrict(scene.view(view), len(scene), selected, kept, shape), recipe))
+        rows.append(rows_of(restrict(scene.view(view), len(scene), selected, kept, shape), recipe.rarity, shape.rarity))
     return Sample(
         name=f"{scene.name} ({', '.join(scene.view_names[view] for view in views)})",
         attributes=attributes,
@@ -234,83 +217,6 @@ def make_sample(
         codes=torch.from_numpy(codes[kept].astype(np.int64)),
         weights=torch.from_numpy(weights[kept]),
         rows=join_rows(rows, [0] * len(rows)),
-    )
-
-
-def restrict(
-    view: ViewRows,
-    gaussians: int,
-    selected: Int64[np.ndarray, " s"],
-    kept: Int64[np.ndarray, " n"],
-    config: LossConfig,
-) -> ViewRows:
-    """The rows of B that a sample can be held against, over its Gaussians.
-
-    A row stays if the teacher saw something there, the whole scene fills it to `min_alpha`, and the selection has
-    `min_kept` of its weight. Of Gaussians that were left out at random afterwards the row is simply without.
-
-    Args:
-        view: over all Gaussians of the scene.
-        gaussians: how many these are.
-        selected: the Gaussians that the views were chosen for.
-        kept: those of them that the sample has; they become columns 0, 1, ….
-        config: see there.
-    """
-    column = np.full(gaussians, -1, np.int32)
-    column[selected] = -2
-    column[kept] = np.arange(len(kept), dtype=np.int32)
-    place = column[view.col]
-    starts = view.crow[:-1]
-    alpha = _row_sums(view.weight, starts, view.crow)
-    inside = _row_sums(np.where(place != -1, view.weight, 0), starts, view.crow)
-    there = _row_sums(np.where(place >= 0, view.weight, 0), starts, view.crow)
-    good = view.valid & (alpha >= config.min_alpha) & (inside >= config.min_kept * alpha)
-    # What is left after thinning out must still be more than a trace, or its average means nothing.
-    good &= there >= 0.5 * alpha
-    entries = np.repeat(good, np.diff(view.crow)) & (place >= 0)
-    counts = np.add.reduceat(np.append(entries, False), view.crow[:-1])[good] if len(entries) else np.zeros(0, int)
-    return ViewRows(
-        crow=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-        col=place[entries],
-        weight=view.weight[entries],
-        targets=view.targets[good],
-        valid=np.ones(int(good.sum()), bool),
-    )
-
-
-def _row_sums(values: np.ndarray, starts: np.ndarray, crow: np.ndarray) -> np.ndarray:
-    """Sums of compressed rows; empty rows are 0."""
-    total = np.add.reduceat(np.append(values, np.float32(0)), starts)
-    return np.where(np.diff(crow) > 0, total, 0)
-
-
-def _rows_of(view: ViewRows, recipe: SampleRecipe) -> Rows:
-    """Rows of one view as tensors, with their weights in the loss."""
-    return Rows(
-        crow=torch.from_numpy(view.crow),
-        col=torch.from_numpy(view.col),
-        weight=torch.from_numpy(view.weight),
-        targets=torch.from_numpy(view.targets),
-        row_weights=torch.from_numpy(recipe.rarity.weights(view.targets, recipe.losses.rarity)),
-    )
-
-
-def _no_rows(channels: int) -> Rows:
-    nothing = torch.zeros(0)
-    crow, col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int32)
-    return Rows(crow=crow, col=col, weight=nothing, targets=nothing.view(0, channels), row_weights=nothing)
-
-
-def join_rows(parts: Sequence[Rows], shifts: Sequence[int]) -> Rows:
-    """Rows below one another as one matrix; `shifts` are added to the columns of each."""
-    entries = np.cumsum([0, *(len(part.col) for part in parts)]).tolist()
-    crows = [part.crow[:-1] + entry for part, entry in zip(parts, entries, strict=False)]
-    return Rows(
-        crow=torch.cat([*crows, torch.tensor(entries[-1:])]),
-        col=torch.cat([part.col + shift for part, shift in zip(parts, shifts, strict=True)]),
-        weight=torch.cat([part.weight for part in parts]),
-        targets=torch.cat([part.targets for part in parts]),
-        row_weights=torch.cat([part.row_weights for part in parts]),
     )
 
 

@@ -141,7 +141,7 @@ def test_the_contrast_is_a_cross_entropy_over_squared_distances_to_the_kinds() -
     codebook, predicted, codes = typical(5), torch.randn(7, 8), torch.tensor([0, 1, 2, 3, 4, 4, 0])
     weights = torch.tensor([1.0, 2.0, 0.5, 1.0, 3.0, 1.0, 1.0])
     found = contrast_loss(predicted, codes, weights, codebook, CONFIG)
-    logits = -torch.cdist(predicted.double(), codebook.double()) ** 2 / (2 * 8 * CONFIG.temperature)
+    logits = -(torch.cdist(predicted.double(), codebook.double()) ** 2) / (2 * 8 * CONFIG.temperature)
     expected = (torch.nn.functional.cross_entropy(logits, codes, reduction="none") * weights).sum()
     torch.testing.assert_close(found.total.double(), expected, atol=1e-4, rtol=1e-5)
     assert found.weight == weights.sum()

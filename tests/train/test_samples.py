@@ -17,7 +17,8 @@ from gsencoder.render import BlendConfig, blend
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared import ViewRows
-from gsencoder.train.samples import SampleDataset, StepSampler, join_samples, restrict
+from gsencoder.train.rows import restrict
+from gsencoder.train.samples import SampleDataset, StepSampler, join_samples
 
 
 @pytest.fixture(scope="module")
