@@ -32,6 +32,8 @@ SMALL = EncoderConfig(
         drop_path=0.2,
     ),
 )
+LOSSES = LossConfig(contrast_weight=0.3)
+"""All terms at once."""
 PREPARE = PrepareConfig(fusion=FuseConfig(basis=False), render_cell=4, render_min_weight=0.0)
 
 
@@ -116,7 +118,7 @@ def samples(dataset: PreparedDataset, names: Sequence[str], **changes: Any) -> S
         "encoder": SMALL,
         "sampling": SamplingConfig(views=2, gaussians=200),
         "augmentation": AugmentConfig(turn=10.0),
-        "losses": LossConfig(),
+        "losses": LOSSES,
         "rarity": dataset.load_rarity(),
         "seed": 3,
     }

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from training_scenes import SHORT, prepared, samples, small_encoder
+from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
 from gsencoder.errors import InputError
 from gsencoder.train.checkpoint import CHECKPOINT_FILE
 from gsencoder.train.log import LOG_FILE, read_log
-from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.trainer import Trainer, TrainerConfig, Validated
 
@@ -31,7 +30,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
 def trainer(dataset: Prepared, folder: Path, config: TrainerConfig = SHORT, **changes: object) -> Trainer:
     folder.mkdir(exist_ok=True)
     return Trainer(
-        small_encoder(), samples(*dataset), LossConfig(), config, folder=folder, settings={"run": 1}, **changes
+        small_encoder(), samples(*dataset), LOSSES, config, folder=folder, settings={"run": 1}, **changes
     )
 
 
@@ -90,7 +89,7 @@ def test_rows_of_steps_that_are_done_again_are_taken_out_of_the_log(dataset: Pre
 def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, tmp_path: Path) -> None:
     trainer(dataset, tmp_path).run()
     with pytest.raises(InputError, match=r"was made with run=1, and this run has 2"):
-        Trainer(small_encoder(), samples(*dataset), LossConfig(), SHORT, folder=tmp_path, settings={"run": 2})
+        Trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
 
 
 def test_micro_batches_add_up_to_the_batch(dataset: Prepared, tmp_path: Path) -> None:
@@ -104,7 +103,7 @@ def test_micro_batches_add_up_to_the_batch(dataset: Prepared, tmp_path: Path) ->
         one = Trainer(
             encoder,
             samples(*dataset),
-            LossConfig(),
+            LOSSES,
             replace(config, batch=batch, accumulate=accumulate),
             folder=_made(tmp_path / name),
             settings={},
@@ -133,7 +132,7 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
     data = samples(*dataset)
     for number in range(len(data.scenes)):
         data[number]  # Kinds of targets are looked up once, and here before they are spoiled.
-    one = Trainer(small_encoder(), data, LossConfig(), SHORT, folder=tmp_path, settings={})
+    one = Trainer(small_encoder(), data, LOSSES, SHORT, folder=tmp_path, settings={})
     before = {name: value.clone() for name, value in one.encoder.state_dict().items()}
     for scene in data.scenes:
         spoiled = scene._arrays["targets"].copy()
@@ -183,9 +182,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from training_scenes import SHORT, samples, small_encoder
+from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.train.distributed import joined
-from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.trainer import Trainer
 
@@ -194,7 +192,7 @@ if __name__ == "__main__":
     names = {names!r}
     with joined("cpu") as (place, device):
         config = replace(SHORT, steps={steps}, accumulate={accumulate})
-        Trainer(small_encoder(), samples(dataset, names), LossConfig(), config, folder=Path({folder!r}),
+        Trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
                 settings={{}}, place=place, device=device).run()
 """
 
