@@ -2,7 +2,7 @@
 
 glibc gives every block above 32 MB back to the system when it is freed, and threads other than the first get heaps that
 cannot grow beyond 64 MB. Each layer's activations are then new pages, which the system must clear: that costs more than
-the arithmetic. Kept on one heap, the same step runs two to five times as fast.
+the arithmetic (`bench/cpu.py`).
 """
 
 import ctypes
