@@ -55,7 +55,7 @@ def train(arguments: argparse.Namespace, group: str, name: str, overrides: list[
         "seconds": round(results["seconds"]),
         "peak_mib": round(found["peak_memory_mb"]),
         "names": round(results["validation"]["names"], 3),
-        "cosine": round(results["validation"]["cosine"], 3),
+        "cosine": round(results["validation"]["cosine_named"], 3),
     }
 
 
@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
     chosen = arguments.only.split(",") if arguments.only else list(GROUPS)
-    print("| group | setting | steps | seconds | peak MiB | names | centred cosine |")
+    print("| group | setting | steps | seconds | peak MiB | names | cosine of named |")
     print("|---|---|---|---|---|---|---|", flush=True)
     for group in chosen:
         for name, overrides in GROUPS[group].items():

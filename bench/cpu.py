@@ -23,6 +23,7 @@ from gsencoder.compose import compose
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.neighbors import NeighborConv, neighbor_table
+from gsencoder.models.plan import join_plans
 from gsencoder.models.serialize import cells_of, morton_codes
 from gsencoder.train.losses import LossConfig, match_loss
 
@@ -35,7 +36,7 @@ def steps(gaussians: int, rounds: int, *, round_up: bool) -> float:
     for turn in range(rounds):
         splat = whole.select(np.arange(gaussians + 37 * turn))
         attributes, opacities, cloud = encoder_inputs(splat, config.model, config.model.voxel)
-        plan = encoder.join([cloud], round_up=round_up)
+        plan = join_plans([cloud], config.model.transformer.patch, round_up=round_up)
         start = time.perf_counter()
         with torch.autocast("cpu", torch.bfloat16):
             out = encoder(attributes, opacities, plan)
@@ -104,9 +105,7 @@ def main() -> None:
     print(f"attention: forward and backward in bfloat16 take {ratio:.2f} times as long as in float32")
     for size in (chosen.gaussians, 20 * chosen.gaussians):
         ratio = in_turn(convolution(size, shuffled=True), convolution(size, shuffled=False), chosen.rounds)
-        print(
-            f"order: the convolution over {size:,} shuffled tokens {ratio:.2f} times as long as in Morton order"
-        )
+        print(f"order: the convolution over {size:,} shuffled tokens {ratio:.2f} times as long as in Morton order")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,10 @@ samples of `experiment=house_cpu`.
 """
 
 import argparse
+import json
 import resource
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -55,7 +58,7 @@ def surface(count: int, voxel: float = 0.02) -> Gaussians:
             low, high = sorted((height[i, j], height[i, j] + step[i, j]))
             levels = np.arange(low + 1, high)
             points.append(np.stack((np.full(len(levels), i), np.full(len(levels), j), levels), axis=-1))
-    means = np.concatenate(points)[:count] if len(np.concatenate(points)) >= count else np.concatenate(points)
+    means = np.concatenate(points)[:count]
     means = ((means + rng.uniform(0.2, 0.8, means.shape)) * voxel).astype(np.float32)
     n = len(means)
     quats = rng.normal(size=(n, 4))
@@ -77,6 +80,11 @@ def best(run: Callable[[], Any], times: int = 5) -> float:
         run()
         found.append(time.perf_counter() - start)
     return min(found)
+
+
+def peak_gib() -> float:
+    """Most memory that this process has had, GiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
 
 
 class Recorded(TorchDispatchMode):
@@ -109,12 +117,15 @@ def measure(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
         return encoder_inputs(splat, config.model, voxel)
 
     attributes, opacities, cloud = inputs()
-    joined = encoder.join([cloud], round_up=dtype is not None)
+    joined = encoder.join([cloud])
 
     def forward() -> None:
         with torch.inference_mode(), torch.autocast("cpu", dtype, enabled=dtype is not None):
             encoder(attributes, opacities, joined)
 
+    seconds: dict[str, float] = {"gaussians": len(splat), "tokens": len(joined.counts), "before_gib": peak_gib()}
+    seconds["forward"] = best(forward)
+    seconds["peak_gib"] = peak_gib()
     recorded = Recorded()
     with torch.no_grad(), torch.autocast("cpu", dtype, enabled=dtype is not None), recorded:
         encoder(attributes, opacities, joined)
@@ -124,12 +135,13 @@ def measure(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
             for function, args, kwargs in recorded.products:
                 function(*args, **kwargs)
 
-    seconds = {"gaussians": len(splat), "tokens": len(joined.counts)}
-    seconds["products"], seconds["forward"] = best(products), best(forward)
+    # In turn with what they are held against.
+    seconds["products"] = best(products)
+    seconds["forward"] = min(seconds["forward"], best(forward))
     means, shape = torch.from_numpy(splat.means), config.model.transformer
 
     def planned() -> None:
-        encoder.join([plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders)], round_up=dtype is not None)
+        encoder.join([plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders)])
 
     seconds["plan"] = best(planned)
     seconds["inputs"] = best(inputs) - seconds["plan"]
@@ -152,8 +164,7 @@ def timed(module: Any, name: str, spent: dict[str, float], label: str) -> None:
 
 def step_parts(config: TrainConfig, prepared: Path, steps: int) -> dict[str, float]:
     """Mean seconds of the parts of a training step on prepared scenes, one sample a step."""
-    folder = PreparedDataset.__new__(PreparedDataset)
-    folder.folder = prepared
+    folder = PreparedDataset.open(prepared)
     outputs, _ = folder.load_space()
     recipe = SampleRecipe(
         encoder=config.model,
@@ -186,11 +197,10 @@ def step_parts(config: TrainConfig, prepared: Path, steps: int) -> dict[str, flo
         gaussians += len(batch.attributes)
         marks = [time.perf_counter()]
         with torch.autocast("cpu", dtype, enabled=dtype is not None):
-            encoder_only = encoder(batch.attributes, batch.opacities, batch.plan)
+            predicted = encoder(batch.attributes, batch.opacities, batch.plan)
         marks.append(time.perf_counter())
-        distillation.encoder = lambda *_, found=encoder_only: found
-        terms = distillation(batch)
-        loss = sum(weight * terms[name].total / terms[name].weight for name, weight in distillation.lambdas.items())
+        terms, divisors = distillation.terms(predicted, batch), distillation.divisors(batch)
+        loss = sum(weight * terms[name] / divisors[name] for name, weight in distillation.lambdas.items())
         marks.append(time.perf_counter())
         assert isinstance(loss, torch.Tensor)
         loss.backward()
@@ -198,7 +208,7 @@ def step_parts(config: TrainConfig, prepared: Path, steps: int) -> dict[str, flo
         optimizer.step()
         optimizer.zero_grad()
         marks.append(time.perf_counter())
-        parts = {"plan": marks[0] - made, "sample": made - start}
+        parts = {"join": marks[0] - made, "sample": made - start}
         parts |= dict(zip(("forward", "loss", "backward", "optimiser"), np.diff(marks), strict=True))
         for name, value in parts.items():
             spent[name] = spent.get(name, 0.0) + float(value)
@@ -212,6 +222,7 @@ def main() -> None:
     parser.add_argument("--model", default="tiny")
     parser.add_argument("--sizes", default="10000,30000,100000,300000")
     parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
+    parser.add_argument("--one", type=int, default=0, help="one size, its figures as JSON")
     parser.add_argument("--patch", type=int, default=0)
     parser.add_argument("--chunked", type=int, default=0)
     parser.add_argument("--step", default="", help="prepared scenes: what the parts of a training step take")
@@ -236,8 +247,7 @@ def main() -> None:
             EncodeConfig(chunk=chosen.chunk, precision=chosen.precision),
         )
         took = time.perf_counter() - start
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
-        print(f"{len(splat):,} Gaussians in chunks of {chosen.chunk:,}: {took:.1f} s, {peak:.2f} GiB at most")
+        print(f"{len(splat):,} Gaussians in chunks of {chosen.chunk:,}: {took:.1f} s, {peak_gib():.2f} GiB at most")
         return
     if chosen.step:
         config = compose("train", TrainConfig, ["scene", "experiment=house_cpu"])
@@ -248,21 +258,31 @@ def main() -> None:
         for name, seconds in parts.items():
             print(f"  {name}: {seconds * 1e3:.1f} ms, {seconds / total:.0%}")
         return
+    if chosen.one:
+        print(json.dumps(measure(config, chosen.one, chosen.precision)))
+        return
     rows = []
     for size in map(int, chosen.sizes.split(",")):
-        row = measure(config, size, chosen.precision)
+        # A process for each, whose peak of memory is its own.
+        done = subprocess.run([sys.executable, *sys.argv, f"--one={size}"], check=True, capture_output=True, text=True)
+        row = json.loads(done.stdout)
         rows.append(row)
         print(
             f"{row['gaussians']:>9,} Gaussians {row['tokens']:>9,} tokens: products {row['products']:.3f} s, forward "
             f"{row['forward']:.3f} s ({row['forward'] / row['products']:.2f}×), plan {row['plan']:.3f} s "
-            f"({row['plan'] / row['forward']:.1%} of the forward), attributes {row['inputs']:.3f} s",
+            f"({row['plan'] / row['forward']:.1%} of the forward), attributes {row['inputs']:.3f} s, memory "
+            f"{row['before_gib']:.2f} GiB before and {row['peak_gib']:.2f} GiB at most",
             flush=True,
         )
     if len(rows) > 1:
-        sizes, times = (np.log([row[name] for row in rows]) for name in ("tokens", "forward"))
-        exponent = np.polyfit(sizes, times, 1)[0]
-        slope = rows[-1]["forward"] / rows[-1]["tokens"] * 1e6
-        print(f"forward grows as tokens^{exponent:.2f}, {slope:.2f} µs a token at the largest")
+        tokens = np.array([row["tokens"] for row in rows])
+        forward = np.array([row["forward"] for row in rows])
+        memory = np.array([row["peak_gib"] - row["before_gib"] for row in rows])
+        exponent = np.polyfit(np.log(tokens), np.log(forward), 1)[0]
+        print(
+            f"forward grows as tokens^{exponent:.2f}, {np.polyfit(tokens, forward, 1)[0] * 1e6:.2f} µs a token; memory "
+            f"by {np.polyfit(tokens, memory, 1)[0] * 1024**2:.1f} KiB a token"
+        )
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "gsencoder"
 
 LEVELS = (
     ("errors",),
-    ("types",),
+    ("types", "tracking"),
     ("geometry",),
     ("render", "data"),
     ("fusion", "models", "reconstruct"),

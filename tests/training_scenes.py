@@ -12,6 +12,7 @@ from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.tracking import untracked
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
 from gsencoder.train.samples import SampleDataset, SampleRecipe
@@ -107,8 +108,8 @@ def prepared(folder: Path, *, count: int = 3, teacher: Teacher | None = None) ->
     chosen: Teacher = teacher
     dataset.find_space([Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
     for number in range(count):
-        dataset.prepare(scene(number), teacher, PREPARE)
-    dataset.find_rarity(names, lambda items, label: items)
+        dataset.prepare(scene(number), teacher, PREPARE, source=Path(f"wall_{number}"))
+    dataset.find_rarity(names, untracked)
     return dataset, names
 
 

@@ -1,6 +1,6 @@
 """`gsencoder evaluate SCENE… protocol=…`: a metric on labelled scenes, of fused features or of an encoder's."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rich.table import Table
@@ -18,7 +18,7 @@ from gsencoder.evaluate.localization import (
     scores,
     scores_by_name,
 )
-from gsencoder.evaluate.naming_protocol import NamingProtocol, evaluate_naming, naming_scores
+from gsencoder.evaluate.naming import NamingProtocol, evaluate_naming, naming_scores
 from gsencoder.evaluate.sources import Source, encoded, fused
 from gsencoder.evaluate.tables import csv_text
 from gsencoder.fusion.fuse import FuseConfig
@@ -128,11 +128,13 @@ def _naming(
     scores = naming_scores(scenes, protocol)
     for scene in scenes:
         summary.add_seconds(scene.seconds)
-    each = [
-        {"scene": scene.scene, "gaussians": sum(scene.total.values()), **naming_scores([scene])} for scene in scenes
-    ]
+    each = []
+    for scene in scenes:
+        counted = {name: count for name, count in scene.total.items() if name in scores["names"]}
+        own = naming_scores([replace(scene, total=counted)]) if counted else {}
+        each.append({"scene": scene.scene, "gaussians": sum(scene.total.values()), **own})
     summary.results.update(protocol="naming", **scores, names_table="names.csv", scenes=each)
-    rows = [{"name": name, **row} for name, row in scores["by_name"].items()]
+    rows = [{"name": name, **row} for name, row in scores["names"].items()]
     write_bytes(folder / "names.csv", csv_text(rows).encode())
 
 
@@ -166,8 +168,9 @@ def scores_line(results: dict) -> str:
     """The main figures in one line."""
     if results["protocol"] == "naming":
         return (
-            f"{results['names']} names in {len(results['scenes'])} scenes: accuracy {results['accuracy']:.3f} averaged "
-            f"over names, {results['accuracy_gaussians']:.3f} over Gaussians, centred cosine {results['cosine']:.3f}"
+            f"{len(results['names'])} names in {len(results['scenes'])} scenes: accuracy {results['accuracy']:.3f} "
+            f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centred cosine "
+            f"{results['cosine']:.3f}"
         )
     return (
         f"{results['objects']} objects in {len(results['scenes'])} scenes: Acc@0.25 {results['acc_25']:.3f}, "
@@ -179,7 +182,7 @@ def scores_line(results: dict) -> str:
 def names_table(results: dict) -> Table:
     """The names that were found worst."""
     naming = results["protocol"] == "naming"
-    names = results["by_name" if naming else "names"]
+    names = results["names"]
     table = Table(title="hardest names" if len(names) > SHOWN_NAMES else "names", title_justify="left")
     columns = ("gaussians", "accuracy") if naming else ("objects", "Acc@0.25", "Acc@0.5", "mean IoU", "best box")
     for title in ("name", *columns):

@@ -23,7 +23,7 @@ from gsencoder.data.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
 from gsencoder.errors import InputError
-from gsencoder.evaluate.naming import naming
+from gsencoder.evaluate.validation import validate_encoder
 from gsencoder.fusion.complete import check_orbits, with_gaussians, with_views
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.fusion.teachers import Teacher
@@ -140,7 +140,7 @@ def make_trainer(
     device: torch.device,
 ) -> tuple[Trainer, OutputSpace]:
     """The trainer of prepared scenes, and the space that its encoder learns."""
-    outputs, codebook = dataset.load_space()
+    outputs, _ = dataset.load_space()
     rarity = dataset.load_rarity()
     recipe = SampleRecipe(
         encoder=config.model,
@@ -151,7 +151,6 @@ def make_trainer(
         seed=config.train.seed,
         step_samples=config.train.samples_per_step(place.size),
     )
-    kinds = codebook if codebook is not None else rarity.codebook
     validation = dataset.scenes([path.name for path in held_out])
     torch.manual_seed(config.train.seed)
     trainer = Trainer(
@@ -165,7 +164,7 @@ def make_trainer(
         place=place,
         device=device,
         tensorboard=config.tensorboard,
-        validate=partial(_validate, validation, outputs, kinds, config),
+        validate=partial(_validate, validation, outputs, rarity.codebook, config),
     )
     return trainer, outputs
 
@@ -181,7 +180,7 @@ def write_results(
     """Weights, words, log and pictures; what was reached goes into the summary."""
     done, encoder = trainer.state, trainer.encoder
     # A run that had been cut off after its last step has not validated it.
-    judged = trainer.validated or trainer.validate(encoder, done.step)
+    judged = trainer.validated or trainer.validate(encoder)
     scores = dict(judged.scores)
     made_by = {"settings": settings(config), "steps": done.step, "seconds": done.seconds, "validation": scores}
     save_weights(folder / WEIGHTS_FILE, encoder, outputs, made_by, dtype=config.store)
@@ -246,14 +245,17 @@ def prepare(
     with together():
         if place.first:
             dataset = PreparedDataset(folder, made_with)
+            dataset.remove_leftovers()
             dataset.find_space(training, opened.look, config.prepare)
     dataset = PreparedDataset(folder, made_with)
-    missing = [path for path in [*training, *held_out] if not dataset.path_of(path.name).is_file()]
+    missing = [path for path in [*training, *held_out] if not dataset.holds(path)]
     with together():
         pass  # Nobody begins before everybody has seen what is missing.
     with together():
         for path in track(missing[place.rank :: place.size], "preparing scenes"):
-            dataset.prepare(*opened.complete(path), config.prepare)
+            scene, teacher = opened.complete(path)
+            with _named(path):
+                dataset.prepare(scene, teacher, config.prepare, source=path)
     with together():
         if place.first:
             dataset.find_rarity([path.name for path in training], track)
@@ -319,21 +321,20 @@ def _validate(
     codebook: np.ndarray,
     config: TrainConfig,
     encoder: GaussianEncoder,
-    step: int,  # noqa: ARG001
 ) -> Validated:
     if not scenes:
         return Validated({})
     encoding = EncodeConfig(precision=config.train.precision, device=config.device)
-    found = naming(scenes, encoder, outputs, codebook, encoding, shown=SHOWN_SCENES)
+    found = validate_encoder(scenes, encoder, outputs, codebook, encoding, shown=SHOWN_SCENES)
     pictures = {} if found.sheet is None else {"features": found.sheet}
-    return Validated({"names": found.score, "cosine": found.cosine}, pictures)
+    return Validated({"names": found.score, "cosine_named": found.cosine_named}, pictures)
 
 
 def _identity(config: TrainConfig, place: Place, dataset: PreparedDataset) -> dict[str, Any]:
     """What a run must have in common with one that it continues."""
     chosen = {name: settings(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
-    for name in ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "batch", "accumulate"):
+    for name in ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate"):
         del chosen["train"][name]
     told = {"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": config.heads}
-    # How the samples of a step are spread over processes and micro-batches may change.
+    # How the micro-batches of a step are spread over processes may change.
     return {**chosen, **told, "samples_per_step": config.train.samples_per_step(place.size)}

@@ -19,6 +19,17 @@ DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", 
 """safetensors' names of the number types that are written here."""
 
 
+def first_difference(found: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = "") -> str:
+    """The first setting in which two runs differ, in words."""
+    for key in sorted({*found, *wanted}):
+        old, new = found.get(key), wanted.get(key)
+        if isinstance(old, dict) and isinstance(new, dict) and old != new:
+            return first_difference(old, new, f"{prefix}{key}.")
+        if old != new:
+            return f"{prefix}{key}={old}, and this run asks {prefix}{key}={new}"
+    return "other settings"
+
+
 class Archive:
     """An open file; arrays and header values are checked as they are taken out.
 

@@ -8,27 +8,25 @@ the nearest object of that name.
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.evaluate.boxes import Hit, accuracy, asked_objects, score_boxes
-from gsencoder.evaluate.sources import Source
-from gsencoder.fusion.complete import with_gaussians
+from gsencoder.evaluate.sources import Source, opened, with_features
 from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.tracking import Track, untracked
 from gsencoder.types import GaussianFeatures, Scene
 
 LEVELS = (0.25, 0.5)
 """The IoU that a box needs to count as found."""
-
-Track = Callable[[Iterable[Path], str], Iterable[Path]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +76,7 @@ def evaluate_localization(
     splat: str = "",
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
-    track: Track = lambda items, label: items,  # noqa: ARG005
+    track: Track = untracked,
 ) -> list[SceneOutcome]:
     """Runs the protocol scene by scene; one scene is in memory at a time.
 
@@ -103,10 +101,7 @@ def evaluate_localization(
         InputError: no object to ask for in any scene, or whatever is wrong with a scene.
     """
     outcomes = []
-    for path in track([Path(path) for path in paths], "scenes"):
-        clock = time.perf_counter()
-        scene = load_scene(path, splat=splat or None, options=data)
-        loaded = time.perf_counter() - clock
+    for scene, loaded in opened(paths, data, splat, track):
         outcome = evaluate_scene(scene, source, words, protocol=protocol, seeds=seeds, localization=localization)
         outcomes.append(replace(outcome, seconds={"load": loaded, **outcome.seconds}))
     _warn_of_gaps(outcomes)
@@ -126,10 +121,7 @@ def evaluate_scene(
     if not asked_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels):
         count = len(scene.gaussians) if scene.gaussians is not None else 0
         return SceneOutcome(scene=scene.name, hits=(), gaussians=count, seen=0, rank=0, boxless=0, seconds={})
-    start = time.perf_counter()
-    scene = with_gaussians(scene, seeds)
-    seconds = {"seeds": time.perf_counter() - start}
-    features, spent = source(scene)
+    scene, features, seconds = with_features(scene, source, seeds)
     start = time.perf_counter()
     hits, boxless = ask(scene, features, words, protocol, localization)
     return SceneOutcome(
@@ -139,7 +131,7 @@ def evaluate_scene(
         seen=int(features.seen.sum()),
         rank=features.features.shape[1],
         boxless=boxless,
-        seconds={**seconds, **spent, "localize": time.perf_counter() - start},
+        seconds={**seconds, "localize": time.perf_counter() - start},
     )
 
 

@@ -1,131 +1,150 @@
-"""How well an encoder does on prepared scenes while it is trained: is the kind of its feature that of the fused one?
+"""The naming protocol on labelled scenes: is the nearest word of a Gaussian's feature the one that it was fused from?
 
-Kinds are what occurs in the training scenes: the vectors of a labels teacher, clusters of another's features. For
-every scene the choices are the kinds of its targets, and scores are averaged over kinds, so that a floor counts no more
-than a spoon. A name that no training scene has is counted as the nearest that one has; `naming_protocol` knows better.
+For every scene the choices are the names of its objects and "other", the normalised mean of the whole table. The truth
+is the nearest of them to the feature that the labels teacher's maps are fused into. Only Gaussians that were seen
+count, and every name counts the same, however many Gaussians it has.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
-import torch
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Int64
 
-from gsencoder.infer.encode import EncodeConfig, encode
-from gsencoder.infer.pictures import contact_sheet, fit_pca_colors, pca_picture
-from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.output_space import OutputSpace
-from gsencoder.render import blend
-from gsencoder.render.rgb import render_image
-from gsencoder.train.prepared import PreparedScene
-from gsencoder.train.rarity import nearest_codes
+from gsencoder.data.scenes import SceneConfig
+from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.text_table import TextTable
+from gsencoder.errors import InputError
+from gsencoder.evaluate.cosine import field_error
+from gsencoder.evaluate.sources import Source, opened, with_features
+from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.fusion.teachers.build import build_teacher
+from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
+from gsencoder.tracking import Track, untracked
+from gsencoder.types import GaussianFeatures
 
-Track = Callable[[Iterable[Any], str], Iterable[Any]]
+CHUNK = 16_384
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Naming:
-    """Gaussians by the kind of their target, over some scenes.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamingProtocol:
+    """Which names count."""
+
+    name: Literal["naming"] = "naming"
+    min_gaussians: int = field(default=1, metadata={"help": "names with fewer Gaussians in all scenes are left out"})
+
+    def __post_init__(self) -> None:
+        if self.min_gaussians < 1:
+            raise InputError(f"min_gaussians: expected 1 or more, got {self.min_gaussians}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneNames:
+    """One scene: for each name the Gaussians that have it, and those among them that were told right.
 
     Attributes:
-        right: for each row of the codebook, Gaussians that were told right.
-        total: for each row, Gaussians that have this target.
-        cosine: mean cosine of predicted and fused features, about the space's mean, over named Gaussians: those whose
-            target is at least half a typical distance from it.
-        sheet: for the first scenes one view in colour, its fused and its predicted features; None where not asked for.
+        scene: its name.
+        total: Gaussians by name, as fused.
+        right: of these, those whose feature is nearest to the same name.
+        cosine: mean cosine of the features with the fused ones, each about its mean.
+        seconds: by step.
     """
 
-    right: Float64[np.ndarray, " C"]
-    total: Float64[np.ndarray, " C"]
+    scene: str
+    total: dict[str, int]
+    right: dict[str, int]
     cosine: float
-    sheet: UInt8[np.ndarray, "H W 3"] | None = None
-
-    def accuracies(self) -> Float64[np.ndarray, " C"]:
-        """Share told right of each kind; NaN where there is none."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(self.right / self.total)
-
-    @property
-    def score(self) -> float:
-        """The mean over kinds that occur."""
-        return float(np.nanmean(self.accuracies()))
+    seconds: dict[str, float]
 
 
-def nearest_names(
-    outputs: Float32[np.ndarray, "n channels"], codebook: Float32[np.ndarray, "C channels"], choices: np.ndarray
-) -> Int64[np.ndarray, " n"]:
-    """The row of the codebook, among `choices`, that is nearest to each output; for unit vectors the one of largest
-    cosine, whatever mean was taken off."""
-    return np.asarray(choices[nearest_codes(codebook[choices], outputs)])
-
-
-def naming(
-    scenes: Sequence[PreparedScene],
-    encoder: GaussianEncoder,
-    outputs: OutputSpace,
-    codebook: Float32[np.ndarray, "C channels"],
-    config: EncodeConfig = EncodeConfig(),
+def evaluate_naming(
+    paths: Sequence[str | Path],
+    source: Source,
+    words: TextTable,
     *,
-    shown: int = 0,
-    track: Track = lambda items, label: items,  # noqa: ARG005
-) -> Naming:
-    """Encodes prepared scenes and counts.
+    data: SceneConfig = SceneConfig(),
+    splat: str = "",
+    seeds: SeedConfig = SeedConfig(),
+    fusion: FuseConfig = FuseConfig(),
+    track: Track = untracked,
+) -> list[SceneNames]:
+    """Runs the protocol scene by scene; one scene is in memory at a time.
 
     Args:
-        scenes: with fused targets.
-        encoder: to judge.
-        outputs: what its numbers mean.
-        codebook: the kinds of target, in standard units.
-        config: how scenes are encoded.
-        shown: scenes of which a view is drawn.
+        paths: labelled scenes with instance maps.
+        source: what gives a scene the features that are judged.
+        words: of the labels teacher.
+        data: how scenes are read.
+        splat: Gaussians of each scene, relative to its folder; empty = seeds.
+        seeds: how Gaussians are made for scenes without.
+        fusion: how the truth is fused.
         track: wraps the loop over scenes to show progress.
+
+    Raises:
+        InputError: whatever is wrong with a scene, or features of a space that the words do not lead into.
     """
-    pictures: list[np.ndarray] = []
-    titles: list[str] = []
-    right, total = np.zeros(len(codebook)), np.zeros(len(codebook))
-    cosines, count = 0.0, 0
-    for scene in track(scenes, "validation"):
-        seen = np.flatnonzero(scene.weights)
-        everything = scene.gaussians(np.arange(len(scene)))
-        found = encode(everything, encoder, outputs, config, metres_per_unit=scene.metres_per_unit or 1.0)
-        predicted = outputs.standardize(found.features[seen])
-        targets = scene.targets(seen)
-        if len(pictures) < 3 * shown:
-            pictures += view_pictures(scene, seen, targets, predicted)
-            titles += [f"{scene.name}: {what}" for what in ("colours", "fused", "predicted")]
-        truth = nearest_codes(codebook, targets)
-        choices = np.unique(truth)
-        guess = nearest_names(predicted, codebook, choices)
-        right += np.bincount(truth, weights=guess == truth, minlength=len(codebook))
-        total += np.bincount(truth, minlength=len(codebook))
-        lengths = np.sqrt(np.square(targets).sum(axis=1))
-        named = lengths >= 0.5 * outputs.channels**0.5
-        dots = (targets[named] * predicted[named]).sum(axis=1)
-        norms = lengths[named] * np.sqrt(np.square(predicted[named]).sum(axis=1) + 1e-12)
-        cosines += float((dots / norms).sum())
-        count += int(named.sum())
-    sheet = contact_sheet(pictures, titles, columns=3, width=400) if pictures else None
-    return Naming(right=right, total=total, cosine=cosines / max(count, 1), sheet=sheet)
-
-
-def view_pictures(
-    scene: PreparedScene,
-    rows: Int64[np.ndarray, " n"],
-    targets: Float32[np.ndarray, "n channels"],
-    predicted: Float32[np.ndarray, "n channels"],
-) -> list[UInt8[np.ndarray, "H W 3"]]:
-    """The middle view of a scene: its colours, its targets, and what was predicted, in the same false colours."""
-    gaussians = scene.gaussians(rows)
-    view = len(scene.cameras) // 2
-    b = blend(gaussians, scene.cameras, view)
-    colors = fit_pca_colors(targets)
-    # Rendering is linear: three columns are rendered, not all channels, and colours are read off them as they are.
-    plain = replace(colors, mean=np.zeros(3), axes=np.eye(3))
-    found = [render_image(gaussians, scene.cameras, view, blended=b)]
-    for features in (targets, predicted):
-        columns = ((features - colors.mean) @ colors.axes).astype(np.float32)
-        rendered = b.render(torch.from_numpy(columns)).numpy()
-        found.append(pca_picture(rendered.reshape(*b.shape, 3), plain, b.alpha.reshape(b.shape).numpy()))
+    found = []
+    for bare, loaded in opened(paths, data, splat, track):
+        scene, features, spent = with_features(bare, source, seeds)
+        teacher = build_teacher(LabelsConfig(), scene, words)
+        assert isinstance(teacher, LabelsTeacher)
+        truth = fuse(scene, teacher, fusion).features
+        if features.space.text_encoder != words.space.text_encoder:
+            raise InputError(
+                f"naming: the features are of ({features.space.describe()}), the words of ({words.space.describe()})"
+            )
+        rows = np.flatnonzero(truth.seen)
+        wanted = nearest_words(truth, rows, teacher.vectors)
+        told = nearest_words(features, rows, teacher.vectors)
+        total = np.bincount(wanted, minlength=len(teacher.names))
+        right = np.bincount(wanted[told == wanted], minlength=len(teacher.names))
+        there = np.flatnonzero(total)
+        cosine = 1 - field_error(features, truth).centred if features.space == truth.space else float("nan")
+        found.append(
+            SceneNames(
+                scene=scene.name,
+                total={teacher.names[code]: int(total[code]) for code in there},
+                right={teacher.names[code]: int(right[code]) for code in there},
+                cosine=cosine,
+                seconds={"load": loaded, **spent},
+            )
+        )
     return found
+
+
+def nearest_words(
+    features: GaussianFeatures, rows: Int64[np.ndarray, " n"], vectors: Float32[np.ndarray, "C D"]
+) -> Int64[np.ndarray, " n"]:
+    """For each row the vector with which its feature has the largest cosine."""
+    directions = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    parts = [
+        (features.decode(rows[start : start + CHUNK]) @ directions.T).argmax(axis=1)
+        for start in range(0, len(rows), CHUNK)
+    ]
+    return np.concatenate(parts) if parts else np.zeros(0, np.int64)
+
+
+def naming_scores(scenes: Sequence[SceneNames], protocol: NamingProtocol = NamingProtocol()) -> dict[str, Any]:
+    """The figures of the protocol: accuracy averaged over names ("other" is one), over objects' names alone, over
+    Gaussians, and of each name, worst first."""
+    total: dict[str, int] = {}
+    right: dict[str, int] = {}
+    for scene in scenes:
+        for name, count in scene.total.items():
+            total[name] = total.get(name, 0) + count
+            right[name] = right.get(name, 0) + scene.right[name]
+    each = {name: right[name] / count for name, count in total.items() if count >= protocol.min_gaussians}
+    if not each:
+        raise InputError(f"naming: no name has {protocol.min_gaussians} Gaussians")
+    named = [score for name, score in each.items() if name != "other"]
+    gaussians = sum(total[name] for name in each)
+    order = sorted(each, key=lambda name: (each[name], name))
+    return {
+        "accuracy": float(np.mean(list(each.values()))),
+        "accuracy_named": float(np.mean(named)) if named else float("nan"),
+        "accuracy_gaussians": sum(right[name] for name in each) / gaussians,
+        "cosine": float(np.mean([scene.cosine for scene in scenes])),
+        "names": {name: {"gaussians": total[name], "accuracy": each[name]} for name in order},
+    }

@@ -1,15 +1,20 @@
 """Where the features that are judged come from: a teacher's fused maps, or an encoder."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.spacing import unit_of
 from gsencoder.data.text_table import TextTable
+from gsencoder.fusion.complete import with_gaussians
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode import EncodeConfig, encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.tracking import Track
 from gsencoder.types import GaussianFeatures, Scene
 
 Source = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
@@ -37,3 +42,30 @@ def encoded(encoder: GaussianEncoder, outputs: OutputSpace, config: EncodeConfig
         return features, {"encode": time.perf_counter() - start}
 
     return source
+
+
+def opened(paths: Sequence[str | Path], data: SceneConfig, splat: str, track: Track) -> Iterator[tuple[Scene, float]]:
+    """Scenes one by one, each with the seconds that reading it took; one is in memory at a time.
+
+    Args:
+        paths: of the scenes.
+        data: how they are read.
+        splat: Gaussians of each, relative to its folder; empty = none but the scene's own.
+        track: wraps the loop to show progress.
+
+    Raises:
+        InputError: whatever is wrong with a scene.
+    """
+    for path in track([Path(path) for path in paths], "scenes"):
+        start = time.perf_counter()
+        scene = load_scene(path, splat=splat or None, options=data)
+        yield scene, time.perf_counter() - start
+
+
+def with_features(scene: Scene, source: Source, seeds: SeedConfig) -> tuple[Scene, GaussianFeatures, dict[str, float]]:
+    """A scene with Gaussians, seeds where it had none, their features, and the seconds of each step."""
+    start = time.perf_counter()
+    scene = with_gaussians(scene, seeds)
+    seconds = {"seeds": time.perf_counter() - start}
+    features, spent = source(scene)
+    return scene, features, seconds | spent

@@ -6,7 +6,7 @@ what is timed is what the knobs change: blending, visibility, basis and lift. Ro
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,11 @@ from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.tracking import Track, untracked
 from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Scene, Views
 
 REFERENCE = "reference"
 """The label of what all others are held against; it is neither on the front nor picked."""
-
-Track = Callable[[Iterable[Any], str], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,7 +160,7 @@ def trade_off(
     data: SceneConfig = SceneConfig(),
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
-    track: Track = lambda items, label: items,  # noqa: ARG005
+    track: Track = untracked,
 ) -> list[Trade]:
     """Measures every setting of a sweep on every scene: the reference, the defaults, then the rest.
 

@@ -7,7 +7,6 @@ of views or with the teacher's width.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -23,6 +22,7 @@ from gsencoder.fusion.partial import PartialFusion
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import BlendConfig
+from gsencoder.tracking import Track, untracked
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Scene, Views
 
 
@@ -72,13 +72,6 @@ class Fusion:
     truncation: float
 
 
-Track = Callable[[Iterable[int], str], Iterable[int]]
-
-
-def _silent(items: Iterable[int], label: str) -> Iterable[int]:  # noqa: ARG001
-    return items
-
-
 def fuse(
     scene: Scene,
     teacher: Teacher,
@@ -86,7 +79,7 @@ def fuse(
     *,
     basis: FeatureBasis | None = None,
     work: Path | None = None,
-    track: Track = _silent,
+    track: Track = untracked,
 ) -> Fusion:
     """Lifts a teacher's maps onto the scene's Gaussians.
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.data.archive import Archive, open_archive, write_archive
+from gsencoder.data.archive import Archive, first_difference, open_archive, write_archive
 from gsencoder.data.atomic import atomic_file
 from gsencoder.errors import InputError
 from gsencoder.types import FeatureMap, FeatureSpace
@@ -39,7 +39,7 @@ class PartialFusion:
         if self._made:
             found = _read_settings(folder / SETTINGS_FILE)
             if found != self._settings:
-                difference = _difference(found, self._settings)
+                difference = first_difference(found, self._settings)
                 raise InputError(f"{folder}: holds a fusion begun with {difference}; delete it to start anew")
 
     def _make(self) -> None:
@@ -124,14 +124,3 @@ def _read_settings(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise InputError(f"{path}: expected an object; delete {path.parent} to start anew")
     return found
-
-
-def _difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:
-    for key in sorted({*found, *wanted}):
-        old, new = found.get(key), wanted.get(key)
-        if old == new:
-            continue
-        if isinstance(old, dict) and isinstance(new, dict):
-            return _difference(old, new, f"{prefix}{key}.")
-        return f"{prefix}{key}={old}, and this run asks {prefix}{key}={new}"
-    return "other settings"

@@ -1,9 +1,7 @@
 """Features of a splat in one pass: no photographs, no teacher (SplatDistill sec. 3.4), for scenes of any size."""
 
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +11,8 @@ from gsencoder.errors import InputError
 from gsencoder.models.device import Device, Precision, autocast_dtype, choose_device
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.serialize import LARGEST_EXTENT
+from gsencoder.tracking import Track, untracked
 from gsencoder.types import GaussianFeatures, Gaussians
 
 
@@ -50,9 +50,6 @@ class Chunk:
     rows: Int64[np.ndarray, " m"]
 
 
-Track = Callable[[Iterable[Any], str], Iterable[Any]]
-
-
 def encode(
     gaussians: Gaussians,
     encoder: GaussianEncoder,
@@ -60,7 +57,7 @@ def encode(
     config: EncodeConfig = EncodeConfig(),
     *,
     metres_per_unit: float = 1.0,
-    track: Track = lambda items, label: items,  # noqa: ARG005
+    track: Track = untracked,
 ) -> GaussianFeatures:
     """Features of every Gaussian, all with weight 1.
 
@@ -83,11 +80,17 @@ def encode(
     voxel = encoder.config.voxel / metres_per_unit
     result = np.zeros((len(gaussians), outputs.channels), np.float32)
     bad = 0
+    corner, extent = gaussians.means.min(axis=0), np.ptp(gaussians.means.astype(np.float64), axis=0)
+    # Where the whole has too many cells for one set of codes, each chunk has its own.
+    if extent.max() >= (LARGEST_EXTENT - 2) * voxel:
+        corner = None
     chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
     with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype is not None):
         for chunk in track(chunks, "encoding"):
-            attributes, opacities, plan = encoder_inputs(gaussians.select(chunk.rows), encoder.config, voxel, device)
-            found = encoder(attributes, opacities, encoder.join([plan], round_up=True))
+            attributes, opacities, plan = encoder_inputs(
+                gaussians.select(chunk.rows), encoder.config, voxel, device, corner=corner
+            )
+            found = encoder(attributes, opacities, encoder.join([plan]))
             bad += int((~torch.isfinite(found[: len(chunk.own)]).all(dim=1)).sum())
             result[chunk.own] = outputs.restore(found[: len(chunk.own)].cpu().numpy())
     if bad:

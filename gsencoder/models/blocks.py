@@ -22,7 +22,7 @@ class PatchAttention(nn.Module):
         x: Float[Tensor, "T C"],
         gather: Int64[Tensor, " places"],
         scatter: Int64[Tensor, " T"],
-        padding: Bool[Tensor, "patches 1 1 width"] | None,
+        attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
         width: int,
     ) -> Float[Tensor, "T C"]:
         """Tokens are put into patches, attend within them, and are put back; see `plan.Level`."""
@@ -33,7 +33,7 @@ class PatchAttention(nn.Module):
         qkv = (placed.float() if slow else placed).view(-1, width, 3, self.heads, channels // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
         with torch.autocast(placed.device.type, enabled=False):
-            attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=padding)
+            attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
         flat = attended.transpose(1, 2).reshape(-1, channels)
         out: Tensor = self.project(flat.index_select(0, scatter))
         return out
@@ -75,11 +75,11 @@ class Block(nn.Module):
         neighbors: Int32[Tensor, "T 27"],
         gather: Int64[Tensor, " places"],
         scatter: Int64[Tensor, " T"],
-        padding: Bool[Tensor, "patches 1 1 width"] | None,
+        attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
         width: int,
     ) -> Float[Tensor, "T C"]:
         x = x + self.norm_position(self.mix(self.position(x, neighbors)))
-        x = x + self.drop_path(self.attention(self.norm_attention(x), gather, scatter, padding, width))
+        x = x + self.drop_path(self.attention(self.norm_attention(x), gather, scatter, attn_mask, width))
         hidden = functional.gelu(self.expand(self.norm_mlp(x)))
         out: Tensor = x + self.drop_path(self.contract(hidden))
         return out

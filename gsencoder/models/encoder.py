@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -55,14 +55,14 @@ class GaussianEncoder(nn.Module):
         self.head_norm = nn.LayerNorm(out)
         self.head = nn.Linear(out, channels)
 
-    def join(self, clouds: list[CloudPlan], *, round_up: bool = False) -> Plan:
+    def join(self, clouds: list[CloudPlan]) -> Plan:
         """The plan of a batch; see `plan.join_plans`."""
-        return join_plans(clouds, self.config.transformer.patch, round_up=round_up)
+        return join_plans(clouds, self.config.transformer.patch)
 
     def forward(
         self, attributes: Float[Tensor, "N A"], opacities: Float[Tensor, " N"], plan: Plan
     ) -> Float[Tensor, "N channels"]:
-        """Features in standard units (see `OutputSpace`), float32 whatever the network computed in.
+        """Features in standard units (see `OutputSpace`), at least float32 whatever the network computed in.
 
         Args:
             attributes: of `embed`, with the configuration's inputs.
@@ -74,7 +74,8 @@ class GaussianEncoder(nn.Module):
         tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
         x = functional.gelu(self.stem_norm(self.stem(tokens, plan.levels[0].neighbors)))
         x = self.transformer(x, plan)
-        features = self.head(self.head_norm(x)).float()
+        features = self.head(self.head_norm(x))
+        features = features.to(torch.promote_types(features.dtype, torch.float32))
         return features.index_select(0, plan.token_of)
 
 
@@ -88,7 +89,12 @@ def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: 
 
 
 def encoder_inputs(
-    gaussians: Gaussians, config: EncoderConfig, voxel: float, device: str | torch.device = "cpu"
+    gaussians: Gaussians,
+    config: EncoderConfig,
+    voxel: float,
+    device: str | torch.device = "cpu",
+    *,
+    corner: Float32[np.ndarray, "3"] | None = None,
 ) -> tuple[Float[Tensor, "N A"], Float[Tensor, " N"], CloudPlan]:
     """What an encoder takes of one cloud: attributes, opacities, and its plan.
 
@@ -97,6 +103,7 @@ def encoder_inputs(
         config: of the encoder.
         voxel: edge of the finest grid in the cloud's own units (`config.voxel` is in metres).
         device: where the tensors are to be.
+        corner: lowest corner of the scene that the cloud is a part of, world units; None = it is all of it.
 
     Raises:
         InputError: the cloud spreads over too many cells.
@@ -116,4 +123,5 @@ def encoder_inputs(
         attributes=config.inputs,
     )
     shape = config.transformer
-    return attributes, opacities, plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders)
+    start = None if corner is None else tensor(corner)
+    return attributes, opacities, plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders, corner=start)

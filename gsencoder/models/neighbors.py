@@ -109,7 +109,7 @@ class _Convolve(torch.autograd.Function):
             grad_x = _multiply(grad, neighbors, weight.flip(0).transpose(1, 2).flatten(0, 1))
         if ctx.needs_input_grad[2]:
             padded = _with_zero_row(x)
-            total = weight.new_zeros(weight.shape, dtype=torch.float32).flatten(0, 1)
+            total = weight.new_zeros(weight.shape, dtype=torch.promote_types(weight.dtype, torch.float32)).flatten(0, 1)
             for rows in _blocks(len(x), x.device):
                 total += _neighborhoods(padded, neighbors[rows]).T @ grad[rows]
             grad_weight = total.view(weight.shape).to(weight.dtype)

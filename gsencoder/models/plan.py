@@ -25,7 +25,7 @@ class Level(NamedTuple):
         neighbors: the 27 cells around each token; T where there is none.
         gathers: for each order the token at every place of every patch; padding repeats a token of its patch.
         scatters: for each order the place of every token.
-        padding: False at places that attention must not look at, [patches, 1, 1, width]; None where no patch is padded.
+        attn_mask: False at places that are not to be looked at, [patches, 1, 1, width]; None where no patch is padded.
         width: places in a patch.
         parents: each token's token one level below (coarser); empty at the last level.
         children: each coarser token's tokens here, eight of them, the first repeated where there are fewer.
@@ -34,7 +34,7 @@ class Level(NamedTuple):
     neighbors: Int32[Tensor, "T 27"]
     gathers: Int64[Tensor, "O places"]
     scatters: Int64[Tensor, "O T"]
-    padding: Bool[Tensor, "patches 1 1 width"] | None
+    attn_mask: Bool[Tensor, "patches 1 1 width"] | None
     width: int
     parents: Int64[Tensor, " parents"]
     children: Int64[Tensor, "M 8"]
@@ -66,7 +66,7 @@ class Plan(NamedTuple):
                 neighbors=move(level.neighbors),
                 gathers=move(level.gathers),
                 scatters=move(level.scatters),
-                padding=move(level.padding) if level.padding is not None else None,
+                attn_mask=move(level.attn_mask) if level.attn_mask is not None else None,
                 parents=move(level.parents),
                 children=move(level.children),
             )
@@ -95,7 +95,12 @@ class CloudPlan(NamedTuple):
 
 
 def plan_cloud(
-    means: Float[Tensor, "N 3"], voxel: float, *, levels: int, orders: Sequence[Order] = ORDERS
+    means: Float[Tensor, "N 3"],
+    voxel: float,
+    *,
+    levels: int,
+    orders: Sequence[Order] = ORDERS,
+    corner: Float[Tensor, "3"] | None = None,
 ) -> CloudPlan:
     """The plan of one cloud.
 
@@ -104,11 +109,12 @@ def plan_cloud(
         voxel: edge of the finest grid, world units; each level below doubles it.
         levels: how many there are.
         orders: the curves that attention follows, in turn.
+        corner: lowest corner of the scene that the cloud is a part of, world units; None = it is all of it.
 
     Raises:
         InputError: positions that are not finite, or spread over too many cells.
     """
-    cells = cells_of(means, voxel)
+    cells = cells_of(means, voxel, corner)
     codes, members = torch.sort(morton_codes(cells), stable=True)
     _, token_of_member, counts = torch.unique_consecutive(codes, return_inverse=True, return_counts=True)
     token_of = torch.empty_like(members)
@@ -140,7 +146,7 @@ def _no_pool(morton: Int64[Tensor, " T"]) -> tuple[Tensor, Tensor, Tensor]:
     return nothing, nothing.view(0, 8), nothing
 
 
-def join_plans(clouds: Sequence[CloudPlan], patch: int, *, round_up: bool = False) -> Plan:
+def join_plans(clouds: Sequence[CloudPlan], patch: int, *, round_up: bool = True) -> Plan:
     """Puts clouds side by side, without padding between them, and cuts each into patches of nearly equal size.
 
     Args:
@@ -202,7 +208,7 @@ def _join_levels(parts: Sequence[CloudLevel], patch: int, size: Callable[[int], 
         neighbors=_grown(torch.cat(neighbors), total, total),
         gathers=orders.index_select(1, places),
         scatters=_grown(scatters, total, dim=1),
-        padding=None if bool(used.all()) else used[:, None, None, :],
+        attn_mask=None if bool(used.all()) else used[:, None, None, :],
         width=used.shape[1],
         parents=_grown(_shifted([part.parents for part in parts], coarser), total if sum(coarser) else 0),
         children=_grown(_shifted([part.children for part in parts], sizes), size(sum(coarser))),

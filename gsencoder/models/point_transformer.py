@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 from gsencoder.errors import InputError
 from gsencoder.models.blocks import Block, Pool, Unpool
 from gsencoder.models.plan import ORDERS, Level, Plan
-from gsencoder.models.serialize import Order
+from gsencoder.models.serialize import ALIGN, Order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +37,13 @@ class TransformerConfig:
 
     def __post_init__(self) -> None:
         levels = len(self.encoder_depths)
-        if levels < 1 or any(len(part) != levels for part in (self.encoder_channels,)):
+        # Beyond this, cells of a part of a scene would be pooled in other pairs than in the whole.
+        most = ALIGN.bit_length()
+        if not 1 <= levels <= most:
+            raise InputError(f"encoder_depths: expected one entry a level and 1 to {most} levels, got {levels} entries")
+        if self.head_channels < 1 or self.patch < 1:
+            raise InputError(f"head_channels and patch: expected 1 or more, got {self.head_channels} and {self.patch}")
+        if len(self.encoder_channels) != levels:
             raise InputError(
                 f"encoder_channels: expected one entry a level as in encoder_depths ({levels}), "
                 f"got {len(self.encoder_channels)}"
@@ -55,8 +61,6 @@ class TransformerConfig:
                 raise InputError(
                     f"channels: expected multiples of head_channels ({self.head_channels}), got {channels}"
                 )
-        if self.head_channels < 1 or self.patch < 1:
-            raise InputError(f"head_channels and patch: expected 1 or more, got {self.head_channels} and {self.patch}")
         if not self.orders:
             raise InputError("orders: expected at least one of z, z-trans, hilbert, hilbert-trans")
         if not 0 <= self.drop_path < 1:
@@ -122,7 +126,7 @@ class PointTransformer(nn.Module):
         assert isinstance(blocks, nn.ModuleList)
         for number, block in enumerate(blocks, start=before):
             order = turn[number % len(turn)]
-            places = (level.neighbors, level.gathers[order], level.scatters[order], level.padding, level.width)
+            places = (level.neighbors, level.gathers[order], level.scatters[order], level.attn_mask, level.width)
             if self.config.checkpoint and self.training:
                 x = checkpoint(block, x, *places, use_reentrant=False)
             else:

@@ -28,11 +28,16 @@ ALIGN = 64
 through six levels."""
 
 
-def cells_of(points: Tensor, voxel: float) -> Int64[Tensor, "N 3"]:
+def cells_of(points: Tensor, voxel: float, corner: Tensor | None = None) -> Int64[Tensor, "N 3"]:
     """Grid cells of points [N, 3] in world units, counted on each axis from just below the lowest occupied one.
 
-    The grid is anchored at the world's zero and counted from a multiple of ALIGN cells, so that a part of a scene falls
-    into the same cells as the whole.
+    The grid is anchored at the world's zero and counted from a multiple of ALIGN cells, so that a part of a scene is
+    cut and pooled as the whole is. With the corner of the whole it is also ordered alike.
+
+    Args:
+        points: world units.
+        voxel: edge of a cell, world units.
+        corner: from where cells are counted, [3], world units; None = the lowest of the points.
 
     Raises:
         InputError: points that are not finite, or that spread over 2²⁰ cells or more on an axis.
@@ -41,6 +46,8 @@ def cells_of(points: Tensor, voxel: float) -> Int64[Tensor, "N 3"]:
         return torch.zeros(0, 3, dtype=torch.int64, device=points.device)
     scaled = torch.floor(points.double() / voxel)
     low, high = scaled.aminmax(dim=0)
+    if corner is not None:
+        low = torch.minimum(low, torch.floor(corner.to(scaled) / voxel))
     if not torch.isfinite(high - low).all():
         bad = int((~torch.isfinite(scaled).all(dim=1)).sum())
         raise InputError(f"grid: {bad} of {len(points)} positions are not finite")
@@ -91,7 +98,8 @@ def _hilbert_from_morton(morton: Int64[Tensor, " N"], bits: int) -> Int64[Tensor
 
     Hamilton 2006, "Compact Hilbert indices": the curve within a cell is one of 24 orientations, and a table gives,
     for an orientation and the octants of the next two levels, their places on the curve and the orientation inside.
-    `bits` says how far to look and changes nothing else, so that a part of a scene is ordered as in the whole.
+    `bits` says how far to look and changes nothing else: cells that are counted from one corner are always ordered
+    alike.
     """
     table = _hilbert_table().to(morton.device)
     code, state = torch.zeros_like(morton), torch.zeros_like(morton)

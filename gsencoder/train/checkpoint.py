@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.data.archive import first_difference, open_archive, write_archive
 from gsencoder.errors import InputError
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
@@ -24,11 +24,13 @@ class TrainingState:
         step: steps that are done.
         seconds: that they took.
         unlogged: losses of the last steps, which the next line of the log stands for too.
+        closed: whether what is due after the last step, its line of the log and validation, has been done.
     """
 
     step: int = 0
     seconds: float = 0.0
     unlogged: tuple[dict[str, float], ...] = ()
+    closed: bool = True
 
 
 def save_checkpoint(
@@ -69,9 +71,8 @@ def load_checkpoint(
     with open_archive(path) as file:
         found = file.value("settings", dict)
         if found != settings:
-            key, old, new = _difference(found, settings)
             raise InputError(
-                f"{path}: was made with {key}={old!r}, and this run has {new!r}; "
+                f"{path}: was made with {first_difference(found, settings)}; "
                 "give the same settings, another out=, or resume=false to begin anew"
             )
         parameters = {
@@ -91,17 +92,9 @@ def load_checkpoint(
             step=file.value("step", int),
             seconds=float(file.value("seconds", float, int)),
             unlogged=tuple(file.value("unlogged", list)),
+            closed=file.value("closed", bool),
         )
     model.load_state_dict(parameters)
     for parameter, values in moments.items():
         optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in values.items()}
     return state
-
-
-def _difference(old: Any, new: Any, path: str = "") -> tuple[str, Any, Any]:
-    """The first place in which two settings differ, and what stands there."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in sorted({*old, *new}):
-            if old.get(key) != new.get(key):
-                return _difference(old.get(key), new.get(key), f"{path}.{key}" if path else key)
-    return path, old, new

@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gsencoder.train.losses import Head, LossConfig, Sum, contrast_loss, field_loss, render_loss
-from gsencoder.train.rows import Rows
+from gsencoder.train.losses import Head, LossConfig, contrast_loss, field_loss, render_loss
 from gsencoder.train.samples import Batch
 
 
@@ -42,28 +41,29 @@ class Distillation:
         terms = {"field": config.field_weight, "render": config.render_weight, "contrast": config.contrast_weight}
         return {name: weight for name, weight in terms.items() if weight}
 
-    def weights(self, batch: Batch) -> dict[str, float]:
-        """The sum of weights of each term in a batch: what its total will be divided by."""
-        gaussians = float(batch.weights.double().sum())
+    def divisors(self, batch: Batch) -> dict[str, float]:
+        """The sum of a batch's weights in each term."""
+        gaussians = float(batch.loss_weights.double().sum())
         return {
             "field": gaussians,
-            "contrast": gaussians,
             "render": float(batch.rows.row_weights.double().sum()),
+            "contrast": gaussians,
         }
 
-    def __call__(self, batch: Batch) -> dict[str, Sum]:
-        """Totals and weights of the terms that count; a batch without rows has a render loss of nothing."""
-        predicted = self.encoder(batch.attributes, batch.opacities, batch.plan)
-        terms = {}
-        with torch.autocast(predicted.device.type, enabled=False):
-            if self.config.field_weight:
-                terms["field"] = field_loss(predicted, batch.targets, batch.weights, self.config)
-            if self.config.render_weight:
-                terms["render"] = self._render(predicted, batch.rows)
-            if self.config.contrast_weight:
-                terms["contrast"] = contrast_loss(predicted, batch.codes, batch.weights, self.codebook, self.config)
-        return terms
+    def __call__(self, batch: Batch) -> dict[str, Tensor]:
+        """Totals of the terms that count, of what the encoder predicts."""
+        return self.terms(self.encoder(batch.attributes, batch.opacities, batch.plan), batch)
 
-    def _render(self, predicted: Tensor, rows: Rows) -> Sum:
-        b = rows.blend(len(predicted))
-        return render_loss(predicted, b, rows.targets, rows.row_weights, self.config, self.heads)
+    def terms(self, predicted: Float[Tensor, "N C"], batch: Batch) -> dict[str, Tensor]:
+        """Totals of the terms that count; a batch without rows has a render loss of nothing."""
+        config, terms = self.config, {}
+        with torch.autocast(predicted.device.type, enabled=False):
+            if config.field_weight:
+                terms["field"] = field_loss(predicted, batch.targets, batch.loss_weights, config)
+            if config.render_weight:
+                rows = batch.rows
+                b = rows.blend(len(predicted))
+                terms["render"] = render_loss(predicted, b, rows.targets, rows.row_weights, config, self.heads)
+            if config.contrast_weight:
+                terms["contrast"] = contrast_loss(predicted, batch.codes, batch.loss_weights, self.codebook, config)
+        return terms

@@ -17,6 +17,8 @@ from torch import Tensor, distributed
 from gsencoder.errors import InputError
 from gsencoder.models.device import Device, choose_device
 
+STOPPED_ELSEWHERE = "training: another process stopped; its own message says why"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
@@ -64,6 +66,15 @@ def place_from(environment: Mapping[str, str]) -> tuple[Place, str]:
     return Place(rank=rank, size=size, local_rank=local), meeting
 
 
+def gpu_of(place: Place, meeting: str) -> int:
+    """The number of this process's GPU among those that it sees.
+
+    Where SLURM gives each task a GPU of its own, a task sees that one alone.
+    """
+    bound = meeting.startswith("tcp://") and torch.cuda.device_count() == 1
+    return 0 if bound else place.local_rank
+
+
 def first_host(nodes: str) -> str:
     """The first machine of a SLURM list such as `a[03-07,9],b1`.
 
@@ -89,7 +100,7 @@ def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[
     """Meets the other processes for the block; yields the place and the device of this one.
 
     Args:
-        device: "auto" (a GPU for each process of a machine where there are enough, else the CPU), "cpu" or "cuda".
+        device: "auto" (a GPU for each process of a machine where torch sees any, else the CPU), "cpu" or "cuda".
         timeout_hours: how long to wait for the others: preparation may keep one busy. A process that dies is noticed by
             the launcher, not by this.
 
@@ -97,7 +108,7 @@ def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[
         InputError: no such device, or the others cannot be met.
     """
     place, meeting = place_from(os.environ)
-    chosen = choose_device(device, place.local_rank)
+    chosen = choose_device(device, gpu_of(place, meeting))
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
     if place.size == 1:
@@ -133,12 +144,13 @@ def together() -> Iterator[None]:
     and if one of them fails in it, all do: none is left waiting.
 
     Raises:
-        InputError: this process's own, or that another failed.
+        Exception: this process's own.
+        InputError: another process failed.
     """
-    failure: InputError | None = None
+    failure: Exception | None = None
     try:
         yield
-    except InputError as error:
+    except Exception as error:
         failure = error
     failed = torch.tensor([float(failure is not None)])
     if distributed.is_available() and distributed.is_initialized() and distributed.get_backend() == "nccl":
@@ -147,4 +159,4 @@ def together() -> Iterator[None]:
     if failure is not None:
         raise failure
     if count:
-        raise InputError("training: another process stopped; its own message says why")
+        raise InputError(STOPPED_ELSEWHERE)

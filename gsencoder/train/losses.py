@@ -9,7 +9,6 @@ features, and that is what stands here.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -85,14 +84,6 @@ class Head(nn.Module):
         return out
 
 
-class Sum(NamedTuple):
-    """A weighted sum of losses and the sum of their weights; what is reported is one over the other, over all
-    processes and micro-batches of a step."""
-
-    total: Tensor
-    weight: Tensor
-
-
 def match_loss(
     predicted: Float[Tensor, "n C"], target: Float[Tensor, "n C"], config: LossConfig
 ) -> Float[Tensor, " n"]:
@@ -111,12 +102,12 @@ def match_loss(
 
 def field_loss(
     predicted: Float[Tensor, "N C"], target: Float[Tensor, "N C"], weights: Float[Tensor, " N"], config: LossConfig
-) -> Sum:
-    """L_3D: over Gaussians; those of weight 0 were never seen and have no target."""
+) -> Float[Tensor, ""]:
+    """L_3D (Eq. 3) before its division: Σ_i w_i · match_i over Gaussians; those of weight 0 were never seen and have no
+    target."""
     rows = torch.nonzero(weights).squeeze(1)
     losses = match_loss(predicted.index_select(0, rows), target.index_select(0, rows), config)
-    chosen = weights.index_select(0, rows)
-    return Sum((losses * chosen).sum(), chosen.sum())
+    return (losses * weights.index_select(0, rows)).sum()
 
 
 def contrast_loss(
@@ -125,8 +116,8 @@ def contrast_loss(
     weights: Float[Tensor, " N"],
     codebook: Float[Tensor, "K C"],
     config: LossConfig,
-) -> Sum:
-    """Cross-entropy of a target's kind among all kinds, softmax_k(−|predicted − c_k|² / (2·C·temperature)).
+) -> Float[Tensor, ""]:
+    """Σ_i w_i · cross-entropy of a target's kind among all kinds, softmax_k(−|predicted − c_k|² / (2·C·temperature)).
 
     Where two kinds look alike, what fits both best under L_3D is their mean, which may be nearest to a third. This term
     makes the likelier one win, by as much as the features are told apart by later: their nearest vector.
@@ -142,8 +133,7 @@ def contrast_loss(
     half = 0.5 * (codebook * codebook).sum(dim=1)
     logits = (predicted.index_select(0, rows) @ codebook.T - half) / (codebook.shape[1] * config.temperature)
     losses = functional.cross_entropy(logits, codes.index_select(0, rows), reduction="none")
-    chosen = weights.index_select(0, rows)
-    return Sum((losses * chosen).sum(), chosen.sum())
+    return (losses * weights.index_select(0, rows)).sum()
 
 
 def render_loss(
@@ -153,8 +143,10 @@ def render_loss(
     weights: Float[Tensor, " P"],
     config: LossConfig,
     heads: Sequence[tuple[Head, nn.Module]] = (),
-) -> Sum:
-    """L_render: over cells of the teacher's grid, after dividing by what of each cell the selection covers.
+) -> Float[Tensor, ""]:
+    """L_render (Eq. 4) before its division: Σ_p w_p · match((B f)_p / alpha_p, t_p) over cells of the teacher's grid.
+
+    The division by alpha is by what of each cell the selection covers.
 
     Args:
         predicted: on the Gaussians of the sample.
@@ -173,4 +165,4 @@ def render_loss(
         losses = torch.stack(
             [match_loss(head(decode(rendered)), head(decode(target)), config) for head, decode in heads]
         ).sum(dim=0)
-    return Sum((losses * weights).sum(), weights.sum())
+    return (losses * weights).sum()

@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.data.archive import first_difference, open_archive, write_archive
 from gsencoder.data.atomic import atomic_file
 from gsencoder.errors import InputError
 from gsencoder.fusion.basis import encode
@@ -21,16 +23,17 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
 from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
 from gsencoder.render import blend
+from gsencoder.tracking import Track
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.prepared import PreparedScene, ViewRows, write_prepared
 from gsencoder.train.rarity import Rarity, cluster_targets, count_targets
 from gsencoder.types import FeatureMap, Scene, Views
 
 SPACE_FILE, SETTINGS_FILE, RARITY_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
+MAPS_PREFIX, MAPS_SECONDS = ".maps.", 24 * 3600.0
+"""Folders of maps of scenes that are being prepared; older ones were left by runs that were killed."""
 SAMPLED_TARGETS = 200_000
 """Targets of all scenes together that clusters are sought in."""
-
-Track = Callable[[Iterable[Any], str], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,13 +112,27 @@ class PreparedDataset:
         except (OSError, ValueError) as error:
             raise InputError(f"{folder}: cannot be used for prepared scenes: {error}") from error
         if found is not None and found != wanted:
-            different = [key for key in {*found, *wanted} if found.get(key) != wanted.get(key)]
-            raise InputError(
-                f"{folder}: was prepared with other settings ({', '.join(sorted(different))}); give another folder"
-            )
+            difference = first_difference(found, wanted)
+            raise InputError(f"{folder}: was prepared with {difference}; give another folder as prepared=")
         if found is None:
             with atomic_file(path) as stream:
                 stream.write(json.dumps(wanted, indent=1).encode())
+
+    @classmethod
+    def open(cls, folder: Path) -> "PreparedDataset":
+        """What has been prepared in a folder, with whatever settings.
+
+        Raises:
+            InputError: nothing has.
+        """
+        path = folder / SETTINGS_FILE
+        if not path.is_file():
+            raise InputError(f"{folder}: expected prepared scenes, found no {SETTINGS_FILE}")
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{folder}: cannot be used for prepared scenes: {error}") from error
+        return cls(folder, found)
 
     def find_space(
         self, scenes: Sequence[Path], open_scene: Callable[[Path], tuple[Scene, Teacher]], config: PrepareConfig
@@ -148,8 +165,32 @@ class PreparedDataset:
         """The file of a scene; it is there once the scene has been prepared."""
         return self.folder / "scenes" / f"{name}.safetensors"
 
-    def prepare(self, scene: Scene, teacher: Teacher, config: PrepareConfig) -> None:
+    def holds(self, source: Path) -> bool:
+        """Whether the scene of this folder has been prepared.
+
+        Raises:
+            InputError: another scene of the same name has been.
+        """
+        path = self.path_of(source.name)
+        if not path.is_file():
+            return False
+        with open_archive(path) as file:
+            made_from = file.value("source", str)
+        if made_from != str(source.resolve()):
+            raise InputError(
+                f"{path}: was prepared from {made_from}, and this run means {source.resolve()}; scenes are told apart "
+                "by name: rename one, or give another folder as prepared="
+            )
+        return True
+
+    def prepare(self, scene: Scene, teacher: Teacher, config: PrepareConfig, *, source: Path = Path()) -> None:
         """Fuses one scene and keeps its targets and matrices; the file appears whole or not at all.
+
+        Args:
+            scene: with Gaussians and views.
+            teacher: of the dataset's space.
+            config: see there.
+            source: where the scene was read from.
 
         Raises:
             InputError: whatever `fuse` refuses, or the disk is full.
@@ -157,8 +198,14 @@ class PreparedDataset:
         outputs, _ = self.load_space()
         path = self.path_of(scene.name)
         path.parent.mkdir(exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=self.folder, prefix=".maps.") as maps:
-            prepare_scene(path, scene, KeptMaps(teacher, Path(maps)), outputs, config)
+        with tempfile.TemporaryDirectory(dir=self.folder, prefix=MAPS_PREFIX) as maps:
+            prepare_scene(path, scene, KeptMaps(teacher, Path(maps)), outputs, config, source=source)
+
+    def remove_leftovers(self) -> None:
+        """Removes maps that killed runs left behind."""
+        for path in self.folder.glob(f"{MAPS_PREFIX}*"):
+            if time.time() - path.stat().st_mtime > MAPS_SECONDS:
+                shutil.rmtree(path, ignore_errors=True)
 
     def find_rarity(self, names: Sequence[str], track: Track) -> None:
         """Counts how often each kind of target occurs in the training scenes, unless that has been done."""
@@ -196,7 +243,15 @@ class PreparedDataset:
         return [PreparedScene(self.path_of(name)) for name in names]
 
 
-def prepare_scene(path: Path, scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig) -> None:
+def prepare_scene(
+    path: Path,
+    scene: Scene,
+    teacher: Teacher,
+    outputs: OutputSpace,
+    config: PrepareConfig,
+    *,
+    source: Path = Path(),
+) -> None:
     """Writes a scene's Gaussians, fused targets, and for every view the rows of its render loss.
 
     Args:
@@ -205,6 +260,7 @@ def prepare_scene(path: Path, scene: Scene, teacher: Teacher, outputs: OutputSpa
         teacher: of the space of `outputs`.
         outputs: the dataset's.
         config: see there.
+        source: where the scene was read from.
 
     Raises:
         InputError: whatever `fuse` refuses.
@@ -222,7 +278,7 @@ def prepare_scene(path: Path, scene: Scene, teacher: Teacher, outputs: OutputSpa
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
         arrays = (b.crow.numpy(), b.col.numpy(), b.weight.numpy())
         rows.append(ViewRows(crow=arrays[0], col=arrays[1], weight=arrays[2], targets=targets, valid=valid))
-    write_prepared(path, scene, fused, outputs, rows)
+    write_prepared(path, scene, fused, outputs, rows, source=source)
 
 
 def _pooled(

@@ -144,7 +144,13 @@ class PreparedScene:
 
 
 def write_prepared(
-    path: Path, scene: Scene, features: GaussianFeatures, outputs: OutputSpace, views: list[ViewRows]
+    path: Path,
+    scene: Scene,
+    features: GaussianFeatures,
+    outputs: OutputSpace,
+    views: list[ViewRows],
+    *,
+    source: Path,
 ) -> None:
     """Writes a scene with its fused targets and the rows of all its views.
 
@@ -154,6 +160,7 @@ def write_prepared(
         features: fused, in the basis of `outputs`.
         outputs: the dataset's.
         views: one for each camera.
+        source: where the scene was read from.
 
     Raises:
         InputError: features of another space, or the disk is full.
@@ -186,6 +193,7 @@ def write_prepared(
         **camera_arrays(scene.views.cameras),
     }
     header = {
+        "source": str(source.resolve()),
         "views": list(scene.views.names),
         "metres_per_unit": scene.metres_per_unit,
         "up": None if scene.up is None else scene.up.tolist(),

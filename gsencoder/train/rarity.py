@@ -27,8 +27,10 @@ class Rarity:
     counts: Float64[np.ndarray, " C"]
 
     def each(self, power: float) -> Float32[np.ndarray, " C"]:
-        """n^−power for each vector of the codebook, scaled so that the mean over the dataset's targets is 1."""
-        weights = np.maximum(self.counts, 1.0) ** -power
+        """n^−power for each vector of the codebook, scaled so that the mean over the dataset's targets is 1. What is
+        nearest to a vector that no target has is a mixture of others, and counts as the commonest kind does."""
+        counts = np.where(self.counts > 0, self.counts, max(float(self.counts.max()), 1.0))
+        weights = counts**-power
         weights *= self.counts.sum() / max(float((weights * self.counts).sum()), 1e-30)
         return weights.astype(np.float32)
 

@@ -15,9 +15,18 @@ from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepared import ViewRows
 from gsencoder.train.rarity import Rarity
 
+MIN_LEFT = 0.5
+"""Share of a row's weight that must be left when Gaussians were thinned out at random."""
+
 
 class Rows(NamedTuple):
-    """Rows of B that are compared with a teacher's cells, over the Gaussians of a sample or a batch."""
+    """Rows of B that are compared with a teacher's cells, over the Gaussians of a sample or a batch.
+
+    Attributes:
+        crow, col, weight: compressed rows, as in `render.Blend`.
+        targets: the teacher's vectors in the cells, standard units.
+        row_weights: of each row in the loss.
+    """
 
     crow: Int64[Tensor, " P_plus_1"]
     col: Int32[Tensor, " nnz"]
@@ -42,7 +51,8 @@ def restrict(
     """The rows of B that a sample can be held against, over its Gaussians.
 
     A row stays if the teacher saw something there, the whole scene fills it to `min_alpha`, and the selection has
-    `min_kept` of its weight. Of Gaussians that were left out at random afterwards the row is simply without.
+    `min_kept` of its weight. Of Gaussians that were left out at random afterwards the row is simply without, as long as
+    MIN_LEFT of its weight is there.
 
     Args:
         view: over all Gaussians of the scene.
@@ -55,13 +65,12 @@ def restrict(
     column[selected] = -2
     column[kept] = np.arange(len(kept), dtype=np.int32)
     place = column[view.col]
-    starts = view.crow[:-1]
-    alpha = _row_sums(view.weight, starts, view.crow)
-    inside = _row_sums(np.where(place != -1, view.weight, 0), starts, view.crow)
-    there = _row_sums(np.where(place >= 0, view.weight, 0), starts, view.crow)
+    alpha = _row_sums(view.weight, view.crow)
+    inside = _row_sums(np.where(place != -1, view.weight, 0), view.crow)
+    there = _row_sums(np.where(place >= 0, view.weight, 0), view.crow)
     good = view.valid & (alpha >= config.min_alpha) & (inside >= config.min_kept * alpha)
     # What is left after thinning out must still be more than a trace, or its average means nothing.
-    good &= there >= 0.5 * alpha
+    good &= there >= MIN_LEFT * alpha
     entries = np.repeat(good, np.diff(view.crow)) & (place >= 0)
     counts = np.add.reduceat(np.append(entries, False), view.crow[:-1])[good] if len(entries) else np.zeros(0, int)
     return ViewRows(
@@ -73,9 +82,9 @@ def restrict(
     )
 
 
-def _row_sums(values: np.ndarray, starts: np.ndarray, crow: np.ndarray) -> np.ndarray:
+def _row_sums(values: np.ndarray, crow: np.ndarray) -> np.ndarray:
     """Sums of compressed rows; empty rows are 0."""
-    total = np.add.reduceat(np.append(values, np.float32(0)), starts)
+    total = np.add.reduceat(np.append(values, np.float32(0)), crow[:-1])
     return np.where(np.diff(crow) > 0, total, 0)
 
 

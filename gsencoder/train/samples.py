@@ -1,8 +1,8 @@
 """Training samples: a part of a prepared scene, changed at random, with its plan, its targets and its rows of B.
 
-Everything random about sample k of a run comes from (seed, k). Nothing depends on which process makes it, on how many
-there are, or on what was made before, so that a run may be cut off and resumed, or spread over more machines, and go
-through the same samples.
+Everything random about sample k of a run comes from (seed, k), and its size from the step that it belongs to. Nothing
+depends on which process makes it or on what was made before, so that a run may be cut off and resumed, or spread over
+more machines, and go through the same samples.
 """
 
 from collections import OrderedDict
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int16, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
@@ -31,7 +31,7 @@ OPEN_SCENES = 256
 
 
 class Sample(NamedTuple):
-    """One part of one scene, as a worker hands it over."""
+    """One part of one scene, as a worker hands it over; see `Batch`."""
 
     name: str
     attributes: Float[Tensor, "N A"]
@@ -39,7 +39,7 @@ class Sample(NamedTuple):
     plan: CloudPlan
     targets: Float[Tensor, "N C"]
     codes: Int64[Tensor, " N"]
-    weights: Float[Tensor, " N"]
+    loss_weights: Float[Tensor, " N"]
     rows: Rows
 
 
@@ -51,7 +51,7 @@ class Batch(NamedTuple):
         attributes, opacities, plan: what the encoder takes.
         targets: standard units.
         codes: of each target the nearest row of the codebook; −1 where there is no target.
-        weights: of each Gaussian in the loss; 0 where it has no target.
+        loss_weights: of each Gaussian; 0 where it has no target.
         rows: of the render loss.
     """
 
@@ -61,7 +61,7 @@ class Batch(NamedTuple):
     plan: Plan
     targets: Float[Tensor, "N C"]
     codes: Int64[Tensor, " N"]
-    weights: Float[Tensor, " N"]
+    loss_weights: Float[Tensor, " N"]
     rows: Rows
 
 
@@ -123,7 +123,7 @@ class SampleDataset(Dataset[Sample]):
         scene = self.scenes[which]
         return make_sample(scene, self._codes_of(which), self.recipe, size, rng)
 
-    def _codes_of(self, which: int) -> Int16[np.ndarray, " N"]:
+    def _codes_of(self, which: int) -> Int32[np.ndarray, " N"]:
         """Kinds of a scene's targets. Only so many scenes are kept open: each holds a file descriptor."""
         if which not in self._codes:
             self._codes[which] = target_codes(self.scenes[which], self.recipe.rarity)
@@ -163,9 +163,9 @@ class StepSampler(Sampler[list[int]]):
                 yield list(range(start, start + self.batch))
 
 
-def target_codes(scene: PreparedScene, rarity: Rarity) -> Int16[np.ndarray, " N"]:
+def target_codes(scene: PreparedScene, rarity: Rarity) -> Int32[np.ndarray, " N"]:
     """For each Gaussian the row of the codebook that its target is nearest to; −1 where it has none."""
-    codes = np.full(len(scene), -1, np.int16)
+    codes = np.full(len(scene), -1, np.int32)
     seen = np.flatnonzero(scene.weights)
     codes[seen] = nearest_codes(rarity.codebook, scene.targets(seen))
     return codes
@@ -173,7 +173,7 @@ def target_codes(scene: PreparedScene, rarity: Rarity) -> Int16[np.ndarray, " N"
 
 def make_sample(
     scene: PreparedScene,
-    codes: Int16[np.ndarray, " N"],
+    codes: Int32[np.ndarray, " N"],
     recipe: SampleRecipe,
     size: int,
     rng: np.random.Generator,
@@ -215,7 +215,7 @@ def make_sample(
         plan=plan,
         targets=torch.from_numpy(scene.targets(kept)),
         codes=torch.from_numpy(codes[kept].astype(np.int64)),
-        weights=torch.from_numpy(weights[kept]),
+        loss_weights=torch.from_numpy(weights[kept]),
         rows=join_rows(rows, [0] * len(rows)),
     )
 
@@ -238,9 +238,9 @@ def join_samples(parts: Sequence[Sample | InputError], patch: int) -> Batch | In
         names=tuple(sample.name for sample in samples),
         attributes=torch.cat([sample.attributes for sample in samples]),
         opacities=torch.cat([sample.opacities for sample in samples]),
-        plan=join_plans([sample.plan for sample in samples], patch, round_up=True),
+        plan=join_plans([sample.plan for sample in samples], patch),
         targets=torch.cat([sample.targets for sample in samples]),
         codes=torch.cat([sample.codes for sample in samples]),
-        weights=torch.cat([sample.weights for sample in samples]),
+        loss_weights=torch.cat([sample.loss_weights for sample in samples]),
         rows=join_rows([sample.rows for sample in samples], starts),
     )

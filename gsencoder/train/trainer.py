@@ -2,23 +2,26 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from gsencoder.errors import InputError
 from gsencoder.models.device import Precision, autocast_dtype
 from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.tracking import Track, untracked
 from gsencoder.train.checkpoint import CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
-from gsencoder.train.distributed import Place, sum_over_processes, together
+from gsencoder.train.distributed import STOPPED_ELSEWHERE, Place, sum_over_processes, together
 from gsencoder.train.log import Log
 from gsencoder.train.losses import Head, LossConfig
 from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
@@ -76,8 +79,7 @@ class Validated(NamedTuple):
     pictures: Mapping[str, np.ndarray] = {}
 
 
-Validation = Callable[[GaussianEncoder, int], Validated]
-Track = Callable[[range, str], Iterator[int]]
+Validation = Callable[[GaussianEncoder], Validated]
 
 
 class Trainer:
@@ -96,7 +98,7 @@ class Trainer:
         place: Place = Place(),
         device: torch.device = torch.device("cpu"),
         tensorboard: bool = False,
-        validate: Validation = lambda encoder, step: Validated({}),  # noqa: ARG005
+        validate: Validation = lambda encoder: Validated({}),  # noqa: ARG005
     ) -> None:
         """Takes up what an earlier run with the same settings left in `folder`.
 
@@ -111,7 +113,7 @@ class Trainer:
             place: of this process.
             device: of this process.
             tensorboard: whether to write events.
-            validate: judges the encoder after a step; asked of the first process alone.
+            validate: judges the encoder; asked of the first process alone.
 
         Raises:
             InputError: the folder holds another run.
@@ -123,11 +125,13 @@ class Trainer:
             _groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
         )
         self.state = TrainingState()
-        self._in_between = False
+        self._in_step = False
         self.validated: Validated | None = None
         if (folder / CHECKPOINT_FILE).is_file():
             self.state = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
-        self._log = Log(folder, done=self.state.step, events=tensorboard) if place.first else None
+        # A line that was written for a step whose closing was cut off is written again.
+        done = self.state.step - (not self.state.closed)
+        self._log = Log(folder, done=done, events=tensorboard) if place.first else None
         network: nn.Module = torch.compile(encoder, dynamic=True) if config.compile else encoder  # type: ignore[assignment]
         self._parallel: nn.parallel.DistributedDataParallel | None = None
         if place.size > 1:
@@ -138,20 +142,22 @@ class Trainer:
         self.distillation = Distillation(network, losses, codebook, heads=heads)
         self._autocast = autocast_dtype(config.precision, device)
 
-    def run(self, track: Track = lambda steps, label: iter(steps)) -> TrainingState:  # noqa: ARG005
-        """All steps that are left. An interrupt leaves a checkpoint behind.
+    def run(self, track: Track = untracked) -> TrainingState:
+        """All steps that are left. Whatever stops the run between two steps, an interrupt, a signal or an error of the
+        input, leaves a checkpoint of the last one.
 
         Raises:
-            InputError: a loss or gradient is not finite; the samples and the term are named, and the checkpoint is
-                that of the last step that was.
+            InputError: a sample cannot be made, or a loss or gradient is not finite; the samples and the term are
+                named, and the step is not taken.
         """
         try:
             self._run(track)
         except BaseException as stop:
-            # An interrupt or a signal, not an error. What is between two steps is not saved: the checkpoint before it
-            # continues to the same losses.
-            if not isinstance(stop, Exception) and not self._in_between:
-                self.save()
+            foreseen = isinstance(stop, InputError) or not isinstance(stop, Exception)
+            # What is within a step is not saved: the checkpoint before it continues to the same losses.
+            if foreseen and not self._in_step and self.state.step:
+                with suppress(InputError):
+                    self.save()
             raise
         finally:
             if self._log is not None:
@@ -161,25 +167,32 @@ class Trainer:
     def _run(self, track: Track) -> None:
         config, start = self.config, time.monotonic() - self.state.seconds
         first, saved = self.state.step, time.monotonic()
+        if not self.state.closed:
+            self._close()
         batches = iter(self._loader(first))
-        recent = list(self.state.unlogged)
         for step in track(range(first, config.steps), "training"):
-            recent.append(self._step(step, [_checked(next(batches)) for _ in range(config.accumulate)]))
-            done = step + 1
-            row: dict[str, float] = {}
-            if done % config.log_every == 0 or done == config.steps:
-                row = {name: float(np.mean([each[name] for each in recent])) for name in recent[-1]}
-                recent = []
-            self.state = TrainingState(step=done, seconds=time.monotonic() - start, unlogged=tuple(recent))
-            self._in_between = False
-            if done == config.steps or (config.validate_every and done % config.validate_every == 0):
-                with together():
-                    row |= self._validated(done)
-            if row and self._log is not None:
-                self._log.add(done, row | {"seconds": self.state.seconds})
-            if time.monotonic() - saved >= config.checkpoint_every or done == config.steps:
+            losses = self._step(step, [next(batches) for _ in range(config.accumulate)])
+            unlogged = (*self.state.unlogged, losses)
+            self.state = TrainingState(step=step + 1, seconds=time.monotonic() - start, unlogged=unlogged, closed=False)
+            self._in_step = False
+            self._close()
+            if time.monotonic() - saved >= config.checkpoint_every or self.state.step == config.steps:
                 self.save()
                 saved = time.monotonic()
+
+    def _close(self) -> None:
+        """What is due after a step: validation, and a line of the log for the last steps."""
+        config, done, recent = self.config, self.state.step, self.state.unlogged
+        last = done == config.steps
+        row: dict[str, float] = {}
+        if logged := last or done % config.log_every == 0:
+            row = {name: float(np.mean([each[name] for each in recent])) for name in recent[-1]}
+        if last or (config.validate_every and done % config.validate_every == 0):
+            with together():
+                row |= self._validated(done)
+        if row and self._log is not None:
+            self._log.add(done, row | {"seconds": self.state.seconds})
+        self.state = replace(self.state, unlogged=() if logged else recent, closed=True)
 
     def save(self) -> None:
         """Writes the checkpoint; only the first process does."""
@@ -207,57 +220,85 @@ class Trainer:
             prefetch_factor=4 if config.workers else None,
         )
 
-    def _step(self, step: int, batches: list[Batch]) -> dict[str, float]:
+    def _step(self, step: int, made: list[Batch | InputError]) -> dict[str, float]:
         """One optimiser step; returns the losses of all processes together."""
         rate = self.rate_at(step)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.encoder.train()
+        batches, divisors = self._divisors(made)
         lambdas = self.distillation.lambdas
-        own = [self.distillation.weights(batch) for batch in batches]
-        counts = [sum(weights[name] for weights in own) for name in lambdas]
-        counts = sum_over_processes(torch.tensor(counts, dtype=torch.float64, device=self.device)).tolist()
-        divisors = {name: max(count, 1e-12) for name, count in zip(lambdas, counts, strict=True)}
-        totals = torch.zeros(len(lambdas) + 1, dtype=torch.float64, device=self.device)
-        blame = ""
+        parts = []
         for micro, batch in enumerate(batches):
-            last = micro + 1 == len(batches)
-            # What is random in the network follows the step and the micro-batch, not what was drawn before.
-            number = (step * len(batches) + micro) * self.place.size + self.place.rank
-            state = np.random.SeedSequence([self.config.seed, number]).generate_state(1, np.uint64)
-            torch.manual_seed(int(state[0] >> np.uint64(1)))
+            self._seed((step * len(batches) + micro) * self.place.size + self.place.rank)
             if self._parallel is not None:
-                self._parallel.require_backward_grad_sync = last
+                self._parallel.require_backward_grad_sync = micro + 1 == len(batches)
             with torch.autocast(self.device.type, self._autocast, enabled=self._autocast is not None):
                 terms = self.distillation(_on(batch, self.device))
-            loss = torch.zeros((), device=self.device)
-            for place, name in enumerate(lambdas):
-                share = terms[name].total / divisors[name]
-                loss = loss + lambdas[name] * share
-                totals[place] += share.detach().double()
-                if not math.isfinite(share.item()):
-                    blame = blame or f"the {name} loss of {'; '.join(batch.names)}"
+            shares = torch.stack([terms[name] / divisors[name] for name in lambdas])
+            loss = (shares * shares.new_tensor(list(lambdas.values()))).sum()
             # Gradients of several processes are averaged; what is wanted is their sum.
             (loss * self.place.size).backward()
-        norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), self.config.clip or math.inf)
-        if not blame and not math.isfinite(norm.item()):
+            parts.append(shares.detach().double())
+        norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), self.config.clip or math.inf).item()
+        totals = self._finite_totals(step, batches, torch.stack(parts), norm)
+        self._in_step = True
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        losses = dict(zip(lambdas, totals, strict=True))
+        total = sum(lambdas[name] * loss for name, loss in losses.items())
+        return {"loss": total, **losses, "gradient": norm, "learning_rate": rate}
+
+    def _divisors(self, made: list[Batch | InputError]) -> tuple[list[Batch], dict[str, float]]:
+        """The batches of a step, and what the totals of its terms are divided by, over all processes.
+
+        Raises:
+            InputError: a sample could not be made: its own error here, and at all other processes that there was one.
+        """
+        batches = [batch for batch in made if isinstance(batch, Batch)]
+        lambdas = self.distillation.lambdas
+        own = [self.distillation.divisors(batch) for batch in batches]
+        sums = [sum(each[name] for each in own) for name in lambdas]
+        failed = len(made) - len(batches)
+        found = sum_over_processes(torch.tensor([*sums, failed], dtype=torch.float64, device=self.device)).tolist()
+        for one in made:
+            if isinstance(one, InputError):
+                raise one
+        if found[-1]:
+            raise InputError(STOPPED_ELSEWHERE)
+        return batches, {name: max(count, 1e-12) for name, count in zip(lambdas, found, strict=False)}
+
+    def _seed(self, number: int) -> None:
+        """What is random in the network follows the micro-batch's number in the run, not what was drawn before."""
+        state = np.random.SeedSequence([self.config.seed, number]).generate_state(1, np.uint64)
+        torch.manual_seed(int(state[0] >> np.uint64(1)))
+
+    def _finite_totals(
+        self, step: int, batches: list[Batch], parts: Float64[Tensor, "micro terms"], norm: float
+    ) -> list[float]:
+        """The step's losses over all processes.
+
+        Raises:
+            InputError: a loss of any process, or the gradient, is not finite.
+        """
+        blame = ""
+        for batch, row in zip(batches, parts.tolist(), strict=True):
+            for name, value in zip(self.distillation.lambdas, row, strict=True):
+                if not math.isfinite(value):
+                    blame = blame or f"the {name} loss of {'; '.join(batch.names)}"
+        if not blame and not math.isfinite(norm):
             # Gradients have been summed by now: with several processes any of their samples may be the cause.
             names = "; ".join(name for batch in batches for name in batch.names)
             blame = f"the gradient of {names}{' or of samples of other processes' if self.place.size > 1 else ''}"
-        totals[-1] = float(bool(blame))
-        sums = sum_over_processes(totals).tolist()
-        if sums[-1]:
+        flag = parts.new_tensor([float(bool(blame))])
+        *totals, blamed = sum_over_processes(torch.cat((parts.sum(dim=0), flag))).tolist()
+        if blamed:
             where = blame or "a loss or gradient of another process"
             raise InputError(
                 f"training: {where} is not finite at step {step}; nothing was changed by it. Lower learning_rate, or "
                 "look at these scenes (`gsencoder inspect`)"
             )
-        self._in_between = True
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        losses = dict(zip(lambdas, sums[:-1], strict=True))
-        total = sum(lambdas[name] * loss for name, loss in losses.items())
-        return {"loss": total, **losses, "gradient": float(norm), "learning_rate": rate}
+        return totals
 
     def rate_at(self, step: int) -> float:
         """The learning rate of a step: a linear rise, then half a cosine."""
@@ -272,7 +313,7 @@ class Trainer:
         scores: dict[str, float] = {}
         if self._log is not None:
             self.encoder.eval()
-            self.validated = found = self.validate(self.encoder, done)
+            self.validated = found = self.validate(self.encoder)
             scores = {f"validation/{name}": float(value) for name, value in found.scores.items()}
             for name, pixels in found.pictures.items():
                 self._log.picture(done, f"validation/{name}", pixels)
@@ -283,13 +324,6 @@ def _groups(encoder: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
     matrices = [value for value in encoder.parameters() if value.ndim > 1]
     rest = [value for value in encoder.parameters() if value.ndim <= 1]
     return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
-
-
-def _checked(batch: Batch | InputError) -> Batch:
-    """What a worker made; what it refused is raised here, in its own words."""
-    if isinstance(batch, InputError):
-        raise batch
-    return batch
 
 
 def _on(batch: Batch, device: torch.device) -> Batch:
@@ -306,7 +340,7 @@ def _on(batch: Batch, device: torch.device) -> Batch:
         plan=batch.plan.to(device),
         targets=move(batch.targets),
         codes=move(batch.codes),
-        weights=move(batch.weights),
+        loss_weights=move(batch.loss_weights),
         rows=type(batch.rows)(*map(move, batch.rows)),
     )
 

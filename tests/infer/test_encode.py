@@ -14,6 +14,7 @@ from gsencoder.errors import InputError
 from gsencoder.infer.encode import EncodeConfig, cut, encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.point_transformer import TransformerConfig
 from gsencoder.types import FeatureSpace
 
 OUTPUTS = OutputSpace(space=FeatureSpace(name="s", channels=5), mean=np.arange(5, dtype=np.float32), scale=2.0)
@@ -52,14 +53,34 @@ def test_the_halo_is_what_lies_around_a_box() -> None:
         assert (rows <= high + 1.5).all()
 
 
-def test_chunks_give_nearly_what_the_whole_gives() -> None:
+def test_chunks_whose_halo_covers_what_a_token_sees_give_what_the_whole_gives() -> None:
+    """A network of one level that attends to nothing but itself sees two cells far: stem and block, one each."""
+    shape = TransformerConfig(
+        encoder_depths=(1,), encoder_channels=(16,), decoder_depths=(), decoder_channels=(), head_channels=16, patch=1
+    )
+    config = replace(SMALL, transformer=shape)
+    torch.manual_seed(0)
+    network, one = GaussianEncoder(config, 5), random_gaussians(1500)
+    whole = encode(one, network, OUTPUTS, WHOLE).features
+    for halo, exact in ((3 * config.voxel, True), (0.0, False)):
+        chunks = cut(one.means, 700, halo)
+        assert len(chunks) > 1
+        assert all(len(chunk.rows) < 700 for chunk in chunks)  # None had its halo cut.
+        parts = encode(one, network, OUTPUTS, replace(WHOLE, chunk=700, halo=halo)).features
+        assert np.allclose(parts, whole, atol=1e-4) == exact
+
+
+def test_chunks_give_nearly_what_the_whole_gives_and_the_halo_is_why() -> None:
     one = random_gaussians(1500)
-    whole = encode(one, encoder(), OUTPUTS, WHOLE)
-    parts = encode(one, encoder(), OUTPUTS, replace(WHOLE, chunk=700, halo=1.0))
-    a, b = whole.features - OUTPUTS.mean, parts.features - OUTPUTS.mean
-    cosines = (a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
-    assert cosines.mean() > 0.97
-    assert len(cut(one.means, 700, 1.0)) > 1
+    whole = encode(one, encoder(), OUTPUTS, WHOLE).features - OUTPUTS.mean
+    cosines = []
+    for halo in (0.0, 1.0):
+        assert len(cut(one.means, 700, halo)) > 1
+        parts = encode(one, encoder(), OUTPUTS, replace(WHOLE, chunk=700, halo=halo)).features - OUTPUTS.mean
+        norms = np.linalg.norm(whole, axis=1) * np.linalg.norm(parts, axis=1)
+        cosines.append(float(((whole * parts).sum(axis=1) / norms).mean()))
+    assert cosines[1] > 0.97
+    assert cosines[1] > cosines[0]
 
 
 def test_features_come_with_their_space_and_a_weight_for_every_gaussian() -> None:

@@ -72,7 +72,7 @@ def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(
     ours_grads = torch.autograd.grad(ours, [x, layer.weight, layer.bias], upstream)
     plain_grads = torch.autograd.grad(plain, [x, layer.weight, layer.bias], upstream)
     for mine, theirs in zip(ours_grads, plain_grads, strict=True):
-        torch.testing.assert_close(mine, theirs, rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
 
 
 def test_moving_all_cells_changes_nothing() -> None:

@@ -16,8 +16,8 @@ def cloud(count: int, seed: int = 0, extent: float = 2.0) -> torch.Tensor:
 
 
 def make_plan(means: torch.Tensor, voxel: float, *, levels: int, patch: int) -> Plan:
-    """The plan of one cloud on its own."""
-    return join_plans([plan_cloud(means, voxel, levels=levels)], patch)
+    """The plan of one cloud on its own, of as many tokens as there are."""
+    return join_plans([plan_cloud(means, voxel, levels=levels)], patch, round_up=False)
 
 
 def check(plan: Plan, gaussians: int) -> None:
@@ -44,7 +44,7 @@ def test_every_plan_holds_together(count: int, levels: int, patch: int, round_up
         for gather, scatter in zip(level.gathers, level.scatters, strict=True):
             # Each token stands in exactly one place that attention looks at, and finds itself there.
             assert torch.equal(gather[scatter[:real]], torch.arange(real))
-            used = torch.ones_like(gather, dtype=torch.bool) if level.padding is None else level.padding.flatten()
+            used = torch.ones_like(gather, dtype=torch.bool) if level.attn_mask is None else level.attn_mask.flatten()
             patches = -(-real // patch)
             assert int(used.view(-1, level.width)[:patches].sum()) == real
         if number + 1 < levels:
@@ -68,8 +68,8 @@ def test_tokens_are_the_occupied_cells() -> None:
 def test_patches_of_a_cloud_differ_by_one_token_at_most() -> None:
     plan = make_plan(cloud(1000), VOXEL, levels=1, patch=64)
     level = plan.levels[0]
-    assert level.padding is not None
-    sizes = level.padding.view(-1, level.width).sum(dim=1)
+    assert level.attn_mask is not None
+    sizes = level.attn_mask.view(-1, level.width).sum(dim=1)
     assert sizes.max() - sizes.min() <= 1
     assert level.width <= 64
 
@@ -88,7 +88,7 @@ def test_patches_are_compact_in_space() -> None:
 
 def test_clouds_side_by_side_have_the_plans_that_they_have_alone() -> None:
     a, b = cloud(300, 1), cloud(120, 2)
-    together = join_plans([plan_cloud(part, VOXEL, levels=3) for part in (a, b)], 32)
+    together = join_plans([plan_cloud(part, VOXEL, levels=3) for part in (a, b)], 32, round_up=False)
     alone = [make_plan(part, VOXEL, levels=3, patch=32) for part in (a, b)]
     check(together, 420)
     assert torch.equal(together.counts, torch.cat([one.counts for one in alone]))

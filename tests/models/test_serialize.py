@@ -83,6 +83,17 @@ def test_hilbert_codes_do_not_depend_on_how_many_bits_are_looked_at(bits: int) -
     assert torch.equal(encode_cells(cube(2), "hilbert", bits), encode_cells(cube(2), "hilbert", 2))
 
 
+def test_a_part_counted_from_the_corner_of_the_whole_has_the_codes_of_the_whole() -> None:
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 20 - 7
+    part = points[points[:, 0] > 5]
+    corner = points.amin(dim=0)
+    whole, alone = cells_of(points, 0.02), cells_of(part, 0.02, corner)
+    assert torch.equal(alone, whole[points[:, 0] > 5])
+    assert not torch.equal(cells_of(part, 0.02), alone)
+    # A corner that lies within the part, by rounding, is no reason for cells below zero.
+    assert (cells_of(part, 0.02, part.amax(dim=0)) >= 0).all()
+
+
 def test_cells_are_anchored_so_that_a_part_falls_into_the_cells_of_the_whole() -> None:
     points = torch.from_numpy(np.random.default_rng(0).uniform(-5, 5, (1000, 3)).astype(np.float32))
     whole, part = cells_of(points, 0.02), cells_of(points[:100], 0.02)

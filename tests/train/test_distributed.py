@@ -1,9 +1,15 @@
 """Who a process is, as its environment tells."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
+import torch
 
 from gsencoder.errors import InputError
-from gsencoder.train.distributed import Place, first_host, joined, place_from, together
+from gsencoder.train.distributed import Place, first_host, gpu_of, joined, place_from, together
 
 SLURM = {
     "SLURM_STEP_ID": "0",
@@ -32,6 +38,17 @@ def test_slurm_tells_rank_and_size_and_where_to_meet() -> None:
     place, meeting = place_from(SLURM)
     assert (place.rank, place.size, place.local_rank) == (5, 8, 1)
     assert meeting == "tcp://gpu03:23456"
+
+
+@pytest.mark.parametrize(
+    ("environment", "visible", "gpu"),
+    [(SLURM, 1, 0), (SLURM, 8, 1), ({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"}, 1, 1)],
+)
+def test_a_task_of_slurm_that_sees_one_gpu_takes_it(
+    environment: dict[str, str], visible: int, gpu: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: visible)
+    assert gpu_of(*place_from(environment)) == gpu
 
 
 def test_an_address_that_is_given_is_taken() -> None:
@@ -64,7 +81,7 @@ def test_an_environment_that_contradicts_itself_is_refused(environment: dict[str
         place_from(environment)
 
 
-def test_a_device_that_is_not_there_is_refused() -> None:
+def test_a_device_that_is_not_there_is_refused(no_gpu: None) -> None:
     with pytest.raises(InputError, match="no GPU"), joined("cuda"):
         pass
 
@@ -72,6 +89,35 @@ def test_a_device_that_is_not_there_is_refused() -> None:
 def test_an_unknown_device_is_refused(no_jaxtyping: None) -> None:
     with pytest.raises(InputError, match="expected auto, cpu or cuda"), joined("tpu"):  # type: ignore[arg-type]
         pass
+
+
+TOGETHER = """
+from gsencoder.errors import InputError
+from gsencoder.train.distributed import joined, together
+
+if __name__ == "__main__":
+    with joined("cpu") as (place, device):
+        try:
+            with together():
+                if not place.first:
+                    raise {error}
+        except Exception as error:
+            print(f"{{place.rank}}: {{type(error).__name__}}: {{error}}", flush=True)
+"""
+
+
+@pytest.mark.parametrize("error", ["InputError('its own')", "MemoryError('its own')"])
+def test_if_one_of_two_processes_fails_in_a_block_both_do(tmp_path: Path, error: str) -> None:
+    path = tmp_path / "run.py"
+    path.write_text(TOGETHER.format(error=error))
+    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([*launcher, str(path)], timeout=120, env=environment, capture_output=True, text=True)
+    lines = sorted(line for line in done.stdout.splitlines() if line[:2] in ("0:", "1:"))
+    assert lines == [
+        "0: InputError: training: another process stopped; its own message says why",
+        f"1: {error.partition('(')[0]}: its own",
+    ]
 
 
 def test_one_process_leaves_a_block_as_it_entered_it() -> None:

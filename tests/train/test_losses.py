@@ -56,19 +56,18 @@ def test_gaussians_that_were_never_seen_neither_cost_nor_learn() -> None:
     weights = torch.tensor([1.0, 0.0, 2.0, 0.0, 1.0])
     found = field_loss(predicted, target, weights, CONFIG)
     expected = (match_loss(predicted, target, CONFIG) * weights).sum()
-    torch.testing.assert_close(found.total, expected)
-    assert found.weight == 4
-    (gradient,) = torch.autograd.grad(found.total, [predicted])
+    torch.testing.assert_close(found, expected)
+    (gradient,) = torch.autograd.grad(found, [predicted])
     assert (gradient[[1, 3]] == 0).all()
     spoiled = target.clone()
     spoiled[1] = float("nan")
-    assert torch.isfinite(field_loss(predicted, spoiled, weights, CONFIG).total)
+    assert torch.isfinite(field_loss(predicted, spoiled, weights, CONFIG))
 
 
 def test_no_seen_gaussian_is_a_sum_of_nothing() -> None:
     found = field_loss(torch.randn(3, 8), typical(3), torch.zeros(3), CONFIG)
-    assert found.total == 0
-    assert found.weight == 0
+    assert found == 0
+    assert found == 0
 
 
 def test_the_render_loss_compares_what_is_left_after_dividing_by_alpha() -> None:
@@ -83,8 +82,8 @@ def test_the_render_loss_compares_what_is_left_after_dividing_by_alpha() -> None
     rendered = (dense @ predicted) / b.alpha.clamp(min=1e-12)[:, None]
     expected = (match_loss(rendered, target, CONFIG) * weights).sum()
     found = render_loss(predicted, b, target, weights, CONFIG)
-    torch.testing.assert_close(found.total, expected, rtol=1e-4, atol=1e-4)
-    ours = torch.autograd.grad(found.total, [predicted])[0]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    ours = torch.autograd.grad(found, [predicted])[0]
     plain = torch.autograd.grad(expected, [predicted])[0]
     torch.testing.assert_close(ours, plain, rtol=1e-3, atol=1e-5)
 
@@ -94,7 +93,7 @@ def test_a_field_of_one_vector_renders_to_that_vector_wherever_anything_is() -> 
     vector = typical(1)
     target = vector.expand(b.rows, -1)
     found = render_loss(vector.expand(60, -1).contiguous(), b, target, (b.alpha > 1e-3).float(), CONFIG)
-    assert found.total < 1e-3
+    assert found < 1e-3
 
 
 def test_heads_are_compared_in_their_own_spaces_and_do_not_learn() -> None:
@@ -106,9 +105,9 @@ def test_heads_are_compared_in_their_own_spaces_and_do_not_learn() -> None:
     weights = (b.alpha > 0.3).float()
     found = render_loss(predicted, b, typical(b.rows), weights, CONFIG, [(head, decode), (head, decode)])
     once = render_loss(predicted, b, typical(b.rows), weights, CONFIG, [(head, decode)])
-    torch.testing.assert_close(found.total, 2 * once.total)
+    torch.testing.assert_close(found, 2 * once)
     assert body.weight.requires_grad is False
-    assert torch.autograd.grad(found.total, [predicted])[0].abs().sum() > 0
+    assert torch.autograd.grad(found, [predicted])[0].abs().sum() > 0
 
 
 @pytest.mark.parametrize("change", [{"cosine": -1.0}, {"min_alpha": 0.0}, {"min_kept": 1.5}, {"rarity": float("inf")}])
@@ -143,8 +142,7 @@ def test_the_contrast_is_a_cross_entropy_over_squared_distances_to_the_kinds() -
     found = contrast_loss(predicted, codes, weights, codebook, CONFIG)
     logits = -(torch.cdist(predicted.double(), codebook.double()) ** 2) / (2 * 8 * CONFIG.temperature)
     expected = (torch.nn.functional.cross_entropy(logits, codes, reduction="none") * weights).sum()
-    torch.testing.assert_close(found.total.double(), expected, atol=1e-4, rtol=1e-5)
-    assert found.weight == weights.sum()
+    torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=1e-5)
 
 
 def test_where_kinds_look_alike_the_contrast_ends_nearer_to_the_likelier_one_by_the_logarithm_of_the_odds() -> None:
@@ -155,8 +153,8 @@ def test_where_kinds_look_alike_the_contrast_ends_nearer_to_the_likelier_one_by_
     def closure() -> torch.Tensor:
         optimizer.zero_grad()
         found = contrast_loss(guess.expand(10, 8), codes, torch.ones(10, dtype=torch.float64), codebook, CONFIG)
-        found.total.backward()
-        return found.total
+        found.backward()
+        return found
 
     optimizer.step(closure)
     squares = (guess.detach() - codebook).square().sum(dim=1)
@@ -169,15 +167,15 @@ def test_where_kinds_look_alike_the_contrast_ends_nearer_to_the_likelier_one_by_
 def test_the_contrast_is_finite_for_predictions_of_any_length(size: float) -> None:
     predicted = (torch.randn(5, 8) * size).requires_grad_()
     found = contrast_loss(predicted, torch.arange(5), torch.ones(5), typical(5), CONFIG)
-    (gradient,) = torch.autograd.grad(found.total, [predicted])
-    assert torch.isfinite(found.total)
+    (gradient,) = torch.autograd.grad(found, [predicted])
+    assert torch.isfinite(found)
     assert torch.isfinite(gradient).all()
 
 
 def test_unseen_gaussians_have_no_kind_and_no_part_in_the_contrast() -> None:
     predicted = torch.randn(4, 8, requires_grad=True)
     weights, codes = torch.tensor([1.0, 0.0, 1.0, 0.0]), torch.tensor([1, -1, 0, -1])
-    contrast_loss(predicted, codes, weights, typical(3), CONFIG).total.backward()
+    contrast_loss(predicted, codes, weights, typical(3), CONFIG).backward()
     assert predicted.grad is not None
     assert (predicted.grad[codes < 0] == 0).all()
     assert (predicted.grad[codes >= 0] != 0).any(dim=1).all()

@@ -82,7 +82,7 @@ def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[Prepar
     assert len(found.attributes) == len(source)
     everything = np.arange(len(source))
     np.testing.assert_array_equal(found.targets.numpy(), source.targets(everything))
-    assert ((found.weights > 0).numpy() == (source.weights > 0)).all()
+    assert ((found.loss_weights > 0).numpy() == (source.weights > 0)).all()
 
 
 def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tuple[PreparedDataset, list[str]]) -> None:
