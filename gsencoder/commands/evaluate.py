@@ -1,5 +1,6 @@
 """`gsencoder evaluate SCENE… protocol=…`: a metric on labelled scenes, of fused features or of an encoder's."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from gsencoder.evaluate.localization import (
     scores_by_name,
 )
 from gsencoder.evaluate.naming import NamingProtocol, evaluate_naming, naming_scores
-from gsencoder.evaluate.sources import Source, encoded, fused
+from gsencoder.evaluate.sources import Source, encoded, fused, opened
 from gsencoder.evaluate.tables import csv_text
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
@@ -31,6 +32,7 @@ from gsencoder.models.weights import load_weights
 from gsencoder.outputs import output_folder, write_bytes
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
+from gsencoder.types import Scene
 
 SHOWN_NAMES = 15
 
@@ -80,6 +82,10 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
     screen.print(f"{out}: {scores_line(summary.results)}")
 
 
+def _scenes(config: EvaluateConfig) -> Iterator[tuple[Scene, float]]:
+    return opened(find_scenes(config.paths), config.data, config.splat, Progress(quiet=config.quiet))
+
+
 def _localization(
     config: EvaluateConfig,
     protocol: LocalizationProtocol,
@@ -89,15 +95,7 @@ def _localization(
     summary: Summary,
 ) -> None:
     outcomes = evaluate_localization(
-        find_scenes(config.paths),
-        source,
-        words,
-        protocol=protocol,
-        data=config.data,
-        splat=config.splat,
-        seeds=config.seeds,
-        localization=config.localize,
-        track=Progress(quiet=config.quiet),
+        _scenes(config), source, words, protocol=protocol, seeds=config.seeds, localization=config.localize
     )
     record(outcomes, summary)
     hits = [hit for outcome in outcomes for hit in outcome.hits]
@@ -115,16 +113,7 @@ def _naming(
     folder: Path,
     summary: Summary,
 ) -> None:
-    scenes = evaluate_naming(
-        find_scenes(config.paths),
-        source,
-        words,
-        data=config.data,
-        splat=config.splat,
-        seeds=config.seeds,
-        fusion=config.fusion,
-        track=Progress(quiet=config.quiet),
-    )
+    scenes = evaluate_naming(_scenes(config), source, words, seeds=config.seeds, fusion=config.fusion)
     scores = naming_scores(scenes, protocol)
     for scene in scenes:
         summary.add_seconds(scene.seconds)

@@ -8,21 +8,18 @@ the nearest object of that name.
 import math
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.evaluate.boxes import Hit, accuracy, asked_objects, score_boxes
-from gsencoder.evaluate.sources import Source, opened, with_features
+from gsencoder.evaluate.sources import Source, with_features
 from gsencoder.infer.localize import LocalizeConfig, localize
-from gsencoder.tracking import Track, untracked
 from gsencoder.types import GaussianFeatures, Scene
 
 LEVELS = (0.25, 0.5)
@@ -67,29 +64,23 @@ class SceneOutcome:
 
 
 def evaluate_localization(
-    paths: Sequence[str | Path],
+    scenes: Iterable[tuple[Scene, float]],
     source: Source,
     words: TextTable,
     *,
     protocol: LocalizationProtocol = LocalizationProtocol(),
-    data: SceneConfig = SceneConfig(),
-    splat: str = "",
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
-    track: Track = untracked,
 ) -> list[SceneOutcome]:
     """Runs the protocol scene by scene; one scene is in memory at a time.
 
     Args:
-        paths: scenes with labelled objects (`find_scenes` expands folders of them).
+        scenes: with labelled objects, as `opened` gives them.
         source: what gives a scene its features.
         words: lead into their space.
         protocol: which objects are asked for.
-        data: how scenes are read.
-        splat: Gaussians of each scene, relative to its folder; empty = seeds.
         seeds: how Gaussians are made for scenes without.
         localization: how words become boxes.
-        track: wraps the loop over scenes to show progress.
 
     Returns:
         One outcome a scene, in order.
@@ -101,7 +92,7 @@ def evaluate_localization(
         InputError: no object to ask for in any scene, or whatever is wrong with a scene.
     """
     outcomes = []
-    for scene, loaded in opened(paths, data, splat, track):
+    for scene, loaded in scenes:
         outcome = evaluate_scene(scene, source, words, protocol=protocol, seeds=seeds, localization=localization)
         outcomes.append(replace(outcome, seconds={"load": loaded, **outcome.seconds}))
     _warn_of_gaps(outcomes)

@@ -5,25 +5,22 @@ is the nearest of them to the feature that the labels teacher's maps are fused i
 count, and every name counts the same, however many Gaussians it has.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError
 from gsencoder.evaluate.cosine import field_error
-from gsencoder.evaluate.sources import Source, opened, with_features
+from gsencoder.evaluate.sources import Source, with_features
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
-from gsencoder.tracking import Track, untracked
-from gsencoder.types import GaussianFeatures
+from gsencoder.types import GaussianFeatures, Scene
 
 CHUNK = 16_384
 
@@ -60,33 +57,27 @@ class SceneNames:
 
 
 def evaluate_naming(
-    paths: Sequence[str | Path],
+    scenes: Iterable[tuple[Scene, float]],
     source: Source,
     words: TextTable,
     *,
-    data: SceneConfig = SceneConfig(),
-    splat: str = "",
     seeds: SeedConfig = SeedConfig(),
     fusion: FuseConfig = FuseConfig(),
-    track: Track = untracked,
 ) -> list[SceneNames]:
     """Runs the protocol scene by scene; one scene is in memory at a time.
 
     Args:
-        paths: labelled scenes with instance maps.
+        scenes: labelled, with instance maps, as `opened` gives them.
         source: what gives a scene the features that are judged.
         words: of the labels teacher.
-        data: how scenes are read.
-        splat: Gaussians of each scene, relative to its folder; empty = seeds.
         seeds: how Gaussians are made for scenes without.
         fusion: how the truth is fused.
-        track: wraps the loop over scenes to show progress.
 
     Raises:
         InputError: whatever is wrong with a scene, or features of a space that the words do not lead into.
     """
     found = []
-    for bare, loaded in opened(paths, data, splat, track):
+    for bare, loaded in scenes:
         scene, features, spent = with_features(bare, source, seeds)
         teacher = build_teacher(LabelsConfig(), scene, words)
         assert isinstance(teacher, LabelsTeacher)

@@ -14,7 +14,7 @@ from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode import EncodeConfig, encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.tracking import Track
+from gsencoder.tracking import Track, untracked
 from gsencoder.types import GaussianFeatures, Scene
 
 Source = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
@@ -44,7 +44,9 @@ def encoded(encoder: GaussianEncoder, outputs: OutputSpace, config: EncodeConfig
     return source
 
 
-def opened(paths: Sequence[str | Path], data: SceneConfig, splat: str, track: Track) -> Iterator[tuple[Scene, float]]:
+def opened(
+    paths: Sequence[str | Path], data: SceneConfig = SceneConfig(), splat: str = "", track: Track = untracked
+) -> Iterator[tuple[Scene, float]]:
     """Scenes one by one, each with the seconds that reading it took; one is in memory at a time.
 
     Args:
