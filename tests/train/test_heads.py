@@ -83,9 +83,7 @@ def test_heads_for_features_of_another_width_are_refused(tmp_path: Path) -> None
 )
 def test_a_file_that_lists_no_heads_is_refused(tmp_path: Path, entry: dict) -> None:
     write_archive(tmp_path / "h", {"x": np.zeros(1, np.float32)}, {"heads": [entry]})
-    with pytest.raises(
-        InputError, match=r"expected heads with name, layers|a\.0: expected linear, layernorm"
-    ):
+    with pytest.raises(InputError, match=r"expected heads with name, layers|a\.0: expected linear, layernorm"):
         load_heads(tmp_path / "h", outputs())
 
 
