@@ -185,12 +185,14 @@ def step_parts(config: TrainConfig, prepared: Path, steps: int) -> dict[str, flo
     distillation = Distillation(encoder, config.loss, torch.from_numpy(recipe.rarity.codebook))
     dtype = autocast_dtype(config.train.precision, torch.device("cpu"))
     gaussians = 0
-    for step in range(-10, steps):
+    # The first visit to a scene opens its file and looks up the kinds of its targets.
+    first = -len(dataset.scenes)
+    for step in range(first, steps):
         if step == 0:
             spent.clear()
             gaussians = 0
         start = time.perf_counter()
-        sample = dataset.make(step + 10)
+        sample = dataset.make(step - first)
         made = time.perf_counter()
         batch = samples.join_samples([sample], config.model.transformer.patch)
         assert isinstance(batch, samples.Batch)

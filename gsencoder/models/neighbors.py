@@ -56,10 +56,10 @@ def neighbor_table(cells: Int64[Tensor, "N 3"]) -> Int32[Tensor, "N 27"]:
             found[CELLS - 1 - cell].scatter_(0, there[column].long(), own)
         place += hit
         wanted += 1
-    rows = torch.cat((order.int(), nobody[None])).index_select(0, found[:, :n].flatten())
+    rows = torch.cat((order.int(), nobody[None])).index_select(0, found.flatten()).view(CELLS, n + 1)
     place_of = torch.empty_like(order)
     place_of[order] = torch.arange(n, device=order.device)
-    return rows.view(CELLS, n).T.contiguous().index_select(0, place_of)
+    return rows[:, :n].T.contiguous().index_select(0, place_of)
 
 
 class NeighborConv(nn.Module):

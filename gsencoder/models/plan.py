@@ -193,19 +193,20 @@ def _grown(rows: Tensor, size: int, value: int = 0, dim: int = 0) -> Tensor:
 def _join_levels(parts: Sequence[CloudLevel], patch: int, size: Callable[[int], int]) -> Level:
     sizes = [len(part.neighbors) for part in parts]
     total, coarser = size(sum(sizes)), [len(part.children) for part in parts]
-    neighbors = [
-        torch.where(part.neighbors < own, part.neighbors + sum(sizes[:i]), total).int()
-        if len(parts) > 1 or total != own
-        else part.neighbors
-        for i, (part, own) in enumerate(zip(parts, sizes, strict=True))
-    ]
+    neighbors = parts[0].neighbors
+    if len(parts) > 1 or total != len(neighbors):
+        neighbors, begin = neighbors.new_full((total, neighbors.shape[1]), total), 0
+        for part, own in zip(parts, sizes, strict=True):
+            rows = neighbors[begin : begin + own]
+            torch.add(part.neighbors, begin, out=rows).masked_fill_(part.neighbors == own, total)
+            begin += own
     orders = _shifted([part.orders for part in parts], sizes, dim=1)
     places, slots, used = _patches(sizes, patch, size, orders.device)
     scatters = torch.empty_like(orders).scatter_(1, orders, slots.expand_as(orders))
     # Tokens that stand for nothing have no neighbours, are in no patch and no real token's children, and whatever is
     # read for them is never used.
     return Level(
-        neighbors=_grown(torch.cat(neighbors), total, total),
+        neighbors=neighbors,
         gathers=orders.index_select(1, places),
         scatters=_grown(scatters, total, dim=1),
         attn_mask=None if bool(used.all()) else used[:, None, None, :],
