@@ -2,9 +2,10 @@
 
     python bench/cpu.py [--gaussians 15000] [--rounds 12]
 
-heap: training steps of ever new sizes in a process that keeps what it frees, and in one that does not. rounding: the
-same with plans whose sizes are rounded up, and not, in bfloat16. attention: forward and backward of attention in
-bfloat16 and in float32. order: the 3³ convolution with tokens in Morton order, and shuffled.
+heap: training steps of ever new sizes in a process that keeps what it frees, and in one that does not; and a forward
+pass of 200,000 Gaussians in float32. rounding: steps with plans whose sizes are rounded up, and not, in bfloat16.
+attention: forward and backward of attention in bfloat16 and in float32. order: the 3³ convolution with tokens in Morton
+order, and shuffled.
 """
 
 import argparse
@@ -46,6 +47,20 @@ def steps(gaussians: int, rounds: int, *, round_up: bool) -> float:
     return float(np.median(found[2:]))
 
 
+def forward(gaussians: int, rounds: int) -> float:
+    """Fastest of some forward passes in float32."""
+    config = compose("train", TrainConfig, ["scene"])
+    encoder = GaussianEncoder(config.model, CHANNELS).eval()
+    attributes, opacities, cloud = encoder_inputs(surface(gaussians), config.model, config.model.voxel)
+    plan, found = encoder.join([cloud]), []
+    with torch.inference_mode():
+        for _ in range(rounds):
+            start = time.perf_counter()
+            encoder(attributes, opacities, plan)
+            found.append(time.perf_counter() - start)
+    return min(found[1:])
+
+
 def in_turn(first: Callable[[], object], second: Callable[[], object], rounds: int) -> float:
     """How many times as long the first takes as the second: the median over turns."""
     ratios = []
@@ -83,15 +98,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gaussians", type=int, default=15_000)
     parser.add_argument("--rounds", type=int, default=12)
-    parser.add_argument("--only", default="", help="heap-on, heap-off, rounding-on, rounding-off: one step time")
+    parser.add_argument("--only", default="", help="heap, forward or rounding, -on or -off: its seconds")
     chosen = parser.parse_args()
     if chosen.only:
-        if chosen.only != "heap-off":
+        if chosen.only not in ("heap-off", "forward-off"):
             keep_heap()
+        if chosen.only.startswith("forward"):
+            print(forward(200_000, 5))
+            return
         print(steps(chosen.gaussians, chosen.rounds, round_up=chosen.only != "rounding-off"))
         return
     own = [sys.executable, __file__, f"--gaussians={chosen.gaussians}", f"--rounds={chosen.rounds}"]
-    for choice in ("heap", "rounding"):
+    told = {"heap": "a step without the heap", "forward": "a forward without it", "rounding": "a step without rounding"}
+    for choice, text in told.items():
         ratios = []
         for _ in range(3):
             off, on = (
@@ -99,7 +118,7 @@ def main() -> None:
                 for way in ("off", "on")
             )
             ratios.append(off / on)
-        print(f"{choice}: a step without takes {np.median(ratios):.2f} times as long", flush=True)
+        print(f"{choice}: {text} takes {np.median(ratios):.2f} times as long", flush=True)
     keep_heap()
     ratio = in_turn(attention(torch.bfloat16), attention(torch.float32), chosen.rounds)
     print(f"attention: forward and backward in bfloat16 take {ratio:.2f} times as long as in float32")
