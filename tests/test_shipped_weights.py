@@ -4,10 +4,14 @@ from pathlib import Path
 
 import pytest
 
+from gsencoder.data.scenes import load_scene
 from gsencoder.data.text_table import load_text_table
+from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.naming import evaluate_naming, naming_scores
 from gsencoder.evaluate.sources import encoded, opened
+from gsencoder.fusion.complete import with_gaussians
 from gsencoder.fusion.store import WORDS_FILE
+from gsencoder.infer.encode import EncodeConfig, encode
 from gsencoder.models.weights import SHIPPED, load_weights
 
 FOLDER = SHIPPED / "house_cpu"
@@ -23,8 +27,19 @@ def test_they_take_less_than_ten_megabytes_and_say_how_they_were_made() -> None:
 
 
 @pytest.mark.parametrize("number", [40, 45])
-def test_rooms_that_they_never_saw_are_named(shared: Path, number: int) -> None:
+def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, number: int) -> None:
     encoder, outputs, _ = load_weights("house_cpu")
     words = load_text_table(FOLDER / WORDS_FILE)
     path = shared / "scenes" / "house" / f"train_{number:03d}"
-    assert naming_scores(evaluate_naming(opened([path]), encoded(encoder, outputs), words))["accuracy"] >= 0.7
+    accuracies, features = [], []
+    for chunk in (0, 80_000):
+        config = EncodeConfig(chunk=chunk)
+        named = evaluate_naming(opened([path]), encoded(encoder, outputs, config), words)
+        accuracies.append(naming_scores(named)["accuracy"])
+        scene = with_gaussians(load_scene(path))
+        assert scene.gaussians is not None
+        features.append(encode(scene.gaussians, encoder, outputs, config))
+    assert accuracies[0] >= 0.7
+    assert accuracies[1] >= accuracies[0] - 0.01
+    whole, parts = features
+    assert 0 < field_error(parts, whole).centred <= 0.02

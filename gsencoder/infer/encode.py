@@ -11,6 +11,7 @@ from gsencoder.errors import InputError
 from gsencoder.models.device import Device, Precision, autocast_dtype, choose_device
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.plan import Curves, curves_of
 from gsencoder.models.serialize import LARGEST_EXTENT
 from gsencoder.tracking import Track, untracked
 from gsencoder.types import GaussianFeatures, Gaussians
@@ -80,15 +81,12 @@ def encode(
     voxel = encoder.config.voxel / metres_per_unit
     result = np.zeros((len(gaussians), outputs.channels), np.float32)
     bad = 0
-    corner, extent = gaussians.means.min(axis=0), np.ptp(gaussians.means.astype(np.float64), axis=0)
-    # Where the whole has too many cells for one set of codes, each chunk has its own.
-    if extent.max() >= (LARGEST_EXTENT - 2) * voxel:
-        corner = None
     chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
+    whole = _whole(gaussians, encoder, voxel, device) if len(chunks) > 1 else None
     with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype is not None):
         for chunk in track(chunks, "encoding"):
             attributes, opacities, plan = encoder_inputs(
-                gaussians.select(chunk.rows), encoder.config, voxel, device, corner=corner
+                gaussians.select(chunk.rows), encoder.config, voxel, device, whole=whole
             )
             found = encoder(attributes, opacities, encoder.join([plan]))
             bad += int((~torch.isfinite(found[: len(chunk.own)]).all(dim=1)).sum())
@@ -102,6 +100,15 @@ def encode(
         space=outputs.space,
         basis=outputs.basis,
     )
+
+
+def _whole(gaussians: Gaussians, encoder: GaussianEncoder, voxel: float, device: torch.device) -> Curves | None:
+    """The scene's curves; None where it has too many cells for one set of codes, and each chunk has its own."""
+    if np.ptp(gaussians.means.astype(np.float64), axis=0).max() >= (LARGEST_EXTENT - 2) * voxel:
+        return None
+    shape = encoder.config.transformer
+    means = torch.from_numpy(np.ascontiguousarray(gaussians.means)).to(device)
+    return curves_of(means, voxel, levels=shape.levels, orders=shape.orders)
 
 
 def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chunk]:

@@ -5,14 +5,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.errors import InputError
 from gsencoder.models.embed import CHANNELS, Attribute, channels_of, embed
 from gsencoder.models.neighbors import NeighborConv
-from gsencoder.models.plan import CloudPlan, Plan, join_plans, plan_cloud
+from gsencoder.models.plan import CloudPlan, Curves, Plan, join_plans, plan_cloud
 from gsencoder.models.point_transformer import PointTransformer, TransformerConfig
 from gsencoder.types import Gaussians
 
@@ -94,7 +94,7 @@ def encoder_inputs(
     voxel: float,
     device: str | torch.device = "cpu",
     *,
-    corner: Float32[np.ndarray, "3"] | None = None,
+    whole: Curves | None = None,
 ) -> tuple[Float[Tensor, "N A"], Float[Tensor, " N"], CloudPlan]:
     """What an encoder takes of one cloud: attributes, opacities, and its plan.
 
@@ -103,7 +103,7 @@ def encoder_inputs(
         config: of the encoder.
         voxel: edge of the finest grid in the cloud's own units (`config.voxel` is in metres).
         device: where the tensors are to be.
-        corner: lowest corner of the scene that the cloud is a part of, world units; None = it is all of it.
+        whole: of the scene that the cloud is a part of (`plan.curves_of`); None = it is all of it.
 
     Raises:
         InputError: the cloud spreads over too many cells.
@@ -123,5 +123,5 @@ def encoder_inputs(
         attributes=config.inputs,
     )
     shape = config.transformer
-    start = None if corner is None else tensor(corner)
-    return attributes, opacities, plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders, corner=start)
+    plan = plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders, whole=whole)
+    return attributes, opacities, plan

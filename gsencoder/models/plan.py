@@ -25,7 +25,7 @@ class Level(NamedTuple):
         neighbors: the 27 cells around each token; T where there is none.
         gathers: for each order the token at every place of every patch; padding repeats a token of its patch.
         scatters: for each order the place of every token.
-        attn_mask: False at places that are not to be looked at, [patches, 1, 1, width]; None where no patch is padded.
+        attn_mask: for each order False at places that are not to be looked at; None where no patch is padded.
         width: places in a patch.
         parents: each token's token one level below (coarser); empty at the last level.
         children: each coarser token's tokens here, eight of them, the first repeated where there are fewer.
@@ -34,7 +34,7 @@ class Level(NamedTuple):
     neighbors: Int32[Tensor, "T 27"]
     gathers: Int64[Tensor, "O places"]
     scatters: Int64[Tensor, "O T"]
-    attn_mask: Bool[Tensor, "patches 1 1 width"] | None
+    attn_mask: Bool[Tensor, "O patches 1 1 width"] | None
     width: int
     parents: Int64[Tensor, " parents"]
     children: Int64[Tensor, "M 8"]
@@ -77,12 +77,33 @@ class Plan(NamedTuple):
 
 
 class CloudLevel(NamedTuple):
-    """One level of one cloud, before patches are cut."""
+    """One level of one cloud, before patches are cut.
+
+    Attributes:
+        neighbors, parents, children: as in `Level`.
+        orders: for each order the tokens along the curve.
+        ranks: for each order the places of these tokens along the curve of the whole scene; None where this is all.
+        whole: tokens of the whole scene.
+    """
 
     neighbors: Int32[Tensor, "T 27"]
     orders: Int64[Tensor, "O T"]
     parents: Int64[Tensor, " parents"]
     children: Int64[Tensor, "M 8"]
+    ranks: Int64[Tensor, "O T"] | None = None
+    whole: int = 0
+
+
+class Curves(NamedTuple):
+    """A whole scene along its curves, for plans of parts of it.
+
+    Attributes:
+        corner: from where cells are counted, world units.
+        codes: for each level the sorted codes of all tokens, in each order.
+    """
+
+    corner: Float[Tensor, "3"]
+    codes: tuple[Int64[Tensor, "O _T"], ...]
 
 
 class CloudPlan(NamedTuple):
@@ -100,7 +121,7 @@ def plan_cloud(
     *,
     levels: int,
     orders: Sequence[Order] = ORDERS,
-    corner: Float[Tensor, "3"] | None = None,
+    whole: Curves | None = None,
 ) -> CloudPlan:
     """The plan of one cloud.
 
@@ -109,12 +130,13 @@ def plan_cloud(
         voxel: edge of the finest grid, world units; each level below doubles it.
         levels: how many there are.
         orders: the curves that attention follows, in turn.
-        corner: lowest corner of the scene that the cloud is a part of, world units; None = it is all of it.
+        whole: of the scene that the cloud is a part of, with the same voxel, levels and orders; None = it is all of it.
+            Patches are then cut where those of the whole are, so that tokens meet the same others.
 
     Raises:
         InputError: positions that are not finite, or spread over too many cells.
     """
-    cells = cells_of(means, voxel, corner)
+    cells = cells_of(means, voxel, whole.corner if whole is not None else None)
     codes, members = torch.sort(morton_codes(cells), stable=True)
     _, token_of_member, counts = torch.unique_consecutive(codes, return_inverse=True, return_counts=True)
     token_of = torch.empty_like(members)
@@ -126,10 +148,23 @@ def plan_cloud(
     found = []
     for level in range(levels):
         parents, children, first = _pool(morton) if level + 1 < levels else _no_pool(morton)
-        sorted_rows = torch.argsort(along, dim=1)
-        found.append(CloudLevel(neighbor_table(cells), sorted_rows, parents, children))
+        codes, sorted_rows = torch.sort(along, dim=1)
+        ranks = torch.searchsorted(whole.codes[level], codes) if whole is not None else None
+        of = whole.codes[level].shape[1] if whole is not None else 0
+        found.append(CloudLevel(neighbor_table(cells), sorted_rows, parents, children, ranks, of))
         cells, morton, along = cells[first] >> 1, morton[first] >> 3, along[:, first] >> 3
     return CloudPlan(token_of, members, counts, tuple(found))
+
+
+def curves_of(means: Float[Tensor, "N 3"], voxel: float, *, levels: int, orders: Sequence[Order] = ORDERS) -> Curves:
+    """A scene along its curves; see `plan_cloud`, whose settings these are."""
+    cells = cells_of(means, voxel)
+    morton = torch.unique(morton_codes(cells))
+    along = torch.stack([encode_morton(morton, order, bits_of(cells)) for order in orders])
+    codes = [torch.sort(along, dim=1).values]
+    for _ in range(levels - 1):
+        codes.append(torch.stack([torch.unique_consecutive(row >> 3) for row in codes[-1]]))
+    return Curves(means.amin(dim=0), tuple(codes))
 
 
 def _pool(morton: Int64[Tensor, " T"]) -> tuple[Int64[Tensor, " T"], Int64[Tensor, "M 8"], Int64[Tensor, " M"]]:
@@ -151,7 +186,8 @@ def join_plans(clouds: Sequence[CloudPlan], patch: int, *, round_up: bool = True
 
     Args:
         clouds: with equally many levels and orders.
-        patch: most tokens in a patch. A cloud of n tokens has ⌈n / patch⌉ patches of n // that or one more.
+        patch: most tokens in a patch. A cloud of n tokens has ⌈n / patch⌉ patches of n // that or one more; one that is
+            a part of a scene has what it holds of the scene's patches.
         round_up: let every level end in tokens that stand for nothing, so that few different sizes occur: libraries
             that compile a product for each size (oneDNN in bfloat16, torch.compile) then do so rarely.
     """
@@ -201,38 +237,53 @@ def _join_levels(parts: Sequence[CloudLevel], patch: int, size: Callable[[int], 
             torch.add(part.neighbors, begin, out=rows).masked_fill_(part.neighbors == own, total)
             begin += own
     orders = _shifted([part.orders for part in parts], sizes, dim=1)
-    places, slots, used = _patches(sizes, patch, size, orders.device)
+    places, slots, used = _patches(_lengths(parts, patch), size)
     scatters = torch.empty_like(orders).scatter_(1, orders, slots.expand_as(orders))
     # Tokens that stand for nothing have no neighbours, are in no patch and no real token's children, and whatever is
     # read for them is never used.
     return Level(
         neighbors=neighbors,
-        gathers=orders.index_select(1, places),
+        gathers=orders.gather(1, places.expand(len(orders), -1)),
         scatters=_grown(scatters, total, dim=1),
-        attn_mask=None if bool(used.all()) else used[:, None, None, :],
-        width=used.shape[1],
+        attn_mask=None if bool(used.all()) else used[:, :, None, None].expand(len(orders), -1, -1, -1, -1),
+        width=used.shape[2],
         parents=_grown(_shifted([part.parents for part in parts], coarser), total if sum(coarser) else 0),
         children=_grown(_shifted([part.children for part in parts], sizes), size(sum(coarser))),
     )
 
 
+def _lengths(parts: Sequence[CloudLevel], patch: int) -> list[Int64[Tensor, " patches"]]:
+    """How many tokens each patch has, for each order; for all orders at once where none of the clouds is a part."""
+    found = []
+    for order in range(len(parts[0].orders) if any(part.ranks is not None for part in parts) else 1):
+        lengths = []
+        for part in parts:
+            count = part.orders.shape[1]
+            if part.ranks is None:
+                patches = -(-count // patch)
+                bounds = torch.arange(patches + 1, device=part.orders.device) * count // max(patches, 1)
+                lengths.append(bounds.diff())
+            else:
+                # Patch k of the whole has the ranks from ⌊k·whole/patches⌋ on.
+                patches = -(-part.whole // patch)
+                number = ((part.ranks[order] + 1) * patches - 1) // part.whole
+                lengths.append(torch.unique_consecutive(number, return_counts=True)[1])
+        found.append(torch.cat(lengths))
+    return found
+
+
 def _patches(
-    sizes: Sequence[int], patch: int, size: Callable[[int], int], device: torch.device
-) -> tuple[Int64[Tensor, " places"], Int64[Tensor, " T"], Bool[Tensor, "patches width"]]:
+    lengths: Sequence[Int64[Tensor, " _patches"]], size: Callable[[int], int]
+) -> tuple[Int64[Tensor, "o places"], Int64[Tensor, "o T"], Bool[Tensor, "o patches width"]]:
     """The position in the order at each place, the place of each position, and which places are more than padding."""
-    starts, lengths, begin = [], [], 0
-    for count in sizes:
-        patches = -(-count // patch)
-        bounds = torch.arange(patches + 1, device=device) * count // max(patches, 1)
-        starts.append(begin + bounds[:-1])
-        lengths.append(bounds.diff())
-        begin += count
-    start, length = torch.cat(starts), torch.cat(lengths)
-    width = int(length.max()) if len(length) else 0
-    step = torch.arange(width, device=device)
-    used = step < length[:, None]
-    places = start[:, None] + torch.where(used, step, 0)
-    slots = torch.nonzero(used.flatten()).squeeze(1)
+    count = size(max(len(each) for each in lengths))
+    length = torch.stack([_grown(each, count) for each in lengths])
+    width = int(length.max()) if count else 0
+    step = torch.arange(width, device=length.device)
+    used = step < length[..., None]
+    slots = torch.nonzero(used.flatten(1))[:, 1].view(len(lengths), -1)
     # A patch of nothing attends to a token again and again, without a mask; nobody reads the result.
-    patches = size(len(used))
-    return _grown(places, patches).flatten(), slots, _grown(used, patches, 1)
+    nothing = length == 0
+    start = (length.cumsum(dim=1) - length).masked_fill(nothing, 0)
+    places = start[..., None] + torch.where(used, step, 0)
+    return places.flatten(1), slots, used | nothing[..., None]

@@ -126,7 +126,8 @@ class PointTransformer(nn.Module):
         assert isinstance(blocks, nn.ModuleList)
         for number, block in enumerate(blocks, start=before):
             order = turn[number % len(turn)]
-            places = (level.neighbors, level.gathers[order], level.scatters[order], level.attn_mask, level.width)
+            mask = level.attn_mask[order] if level.attn_mask is not None else None
+            places = (level.neighbors, level.gathers[order], level.scatters[order], mask, level.width)
             if self.config.checkpoint and self.training:
                 x = checkpoint(block, x, *places, use_reentrant=False)
             else:

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.models.plan import ORDERS, Plan, join_plans, plan_cloud
+from gsencoder.models.plan import ORDERS, Level, Plan, curves_of, join_plans, plan_cloud
 
 VOXEL = 0.1
 
@@ -41,12 +41,12 @@ def test_every_plan_holds_together(count: int, levels: int, patch: int, round_up
     check(plan, count)
     real = len(plan.counts)
     for number, level in enumerate(plan.levels):
-        for gather, scatter in zip(level.gathers, level.scatters, strict=True):
+        for order, (gather, scatter) in enumerate(zip(level.gathers, level.scatters, strict=True)):
             # Each token stands in exactly one place that attention looks at, and finds itself there.
             assert torch.equal(gather[scatter[:real]], torch.arange(real))
-            used = torch.ones_like(gather, dtype=torch.bool) if level.attn_mask is None else level.attn_mask.flatten()
+            used = torch.ones_like(gather, dtype=torch.bool) if level.attn_mask is None else level.attn_mask[order]
             patches = -(-real // patch)
-            assert int(used.view(-1, level.width)[:patches].sum()) == real
+            assert int(used.reshape(-1, level.width)[:patches].sum()) == real
         if number + 1 < levels:
             coarser = len(torch.unique(level.parents[:real]))
             assert torch.equal(torch.unique(level.parents[:real]), torch.arange(coarser))
@@ -69,7 +69,7 @@ def test_patches_of_a_cloud_differ_by_one_token_at_most() -> None:
     plan = make_plan(cloud(1000), VOXEL, levels=1, patch=64)
     level = plan.levels[0]
     assert level.attn_mask is not None
-    sizes = level.attn_mask.view(-1, level.width).sum(dim=1)
+    sizes = level.attn_mask.reshape(-1, level.width).sum(dim=1)
     assert sizes.max() - sizes.min() <= 1
     assert level.width <= 64
 
@@ -84,6 +84,46 @@ def test_patches_are_compact_in_space() -> None:
     for order in range(len(ORDERS)):
         placed = centers[level.gathers[order]].view(-1, level.width, 3)
         assert placed.std(dim=1).mean() < 0.5 * centers.std(dim=0).mean()
+
+
+def patch_of(level: Level, order: int, tokens: int) -> torch.Tensor:
+    """The patch of each token."""
+    return level.scatters[order, :tokens] // level.width
+
+
+@given(st.integers(30, 400), st.integers(1, 3), st.integers(2, 40), st.integers(0, 5))
+@settings(max_examples=40)
+def test_tokens_of_a_part_share_a_patch_exactly_where_they_do_in_the_whole(
+    count: int, levels: int, patch: int, seed: int
+) -> None:
+    points = cloud(count, seed)
+    part = torch.nonzero(points[:, 0] > 0.7).flatten()
+    if not len(part):
+        return
+    curves = curves_of(points, VOXEL, levels=levels)
+    whole = join_plans([plan_cloud(points, VOXEL, levels=levels)], patch)
+    plan = join_plans([plan_cloud(points[part], VOXEL, levels=levels, whole=curves)], patch)
+    theirs, ours = whole.token_of[part], plan.token_of
+    for there, here in zip(whole.levels, plan.levels, strict=True):
+        assert here.width <= patch
+        for order in range(4):
+            a = patch_of(there, order, int(theirs.max()) + 1)[theirs]
+            b = patch_of(here, order, int(ours.max()) + 1)[ours]
+            # The same pairs, whatever the patches are called.
+            pairs = torch.unique(torch.stack((a, b)), dim=1)
+            assert len(torch.unique(pairs[0])) == len(torch.unique(pairs[1])) == pairs.shape[1]
+        if len(there.parents):
+            theirs, ours = there.parents[theirs], here.parents[ours]
+
+
+def test_the_whole_as_a_part_of_itself_has_the_plan_that_it_has() -> None:
+    points = cloud(500)
+    curves = curves_of(points, VOXEL, levels=3)
+    plain = join_plans([plan_cloud(points, VOXEL, levels=3)], 48)
+    again = join_plans([plan_cloud(points, VOXEL, levels=3, whole=curves)], 48)
+    for one, other in zip(plain.levels, again.levels, strict=True):
+        assert torch.equal(one.gathers, other.gathers)
+        assert torch.equal(one.scatters, other.scatters)
 
 
 def test_clouds_side_by_side_have_the_plans_that_they_have_alone() -> None:
