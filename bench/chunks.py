@@ -1,0 +1,74 @@
+"""What encoding in chunks costs and changes: against the whole scene at once, and against the fused features.
+
+    python bench/chunks.py SCENE… [--weights house_cpu] [--chunks 125000,80000,40000] [--halos 0,0.64,1.28]
+
+Cosine: centred, with the features of the whole scene in float32. Names: `evaluate`'s protocol. Seconds are of `encode`
+alone, warm.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from per_scene import quality
+
+from gsencoder.data.model_files import find_file
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeds import seed
+from gsencoder.data.text_table import load_text_table
+from gsencoder.evaluate.boxes import accuracy
+from gsencoder.evaluate.cosine import field_error
+from gsencoder.evaluate.naming import naming_scores
+from gsencoder.fusion.fuse import fuse
+from gsencoder.fusion.teachers.labels import LabelsTeacher
+from gsencoder.infer.encode import EncodeConfig, cut, encode
+from gsencoder.models.heap import keep_heap
+from gsencoder.models.weights import load_weights
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+")
+    parser.add_argument("--weights", default="house_cpu")
+    parser.add_argument("--words", default="clip_vitb32_names.npz")
+    parser.add_argument("--chunks", default="125000,80000,40000")
+    parser.add_argument("--halos", default="0,0.64,1.28")
+    chosen = parser.parse_args()
+    keep_heap()
+    words = load_text_table(find_file(chosen.words, "words"))
+    encoder, outputs, _ = load_weights(chosen.weights)
+    halos = [float(halo) for halo in chosen.halos.split(",")]
+    settings = {
+        "whole, float32": EncodeConfig(chunk=0, precision="float32"),
+        "whole, bfloat16": EncodeConfig(chunk=0, precision="bfloat16"),
+    }
+    for chunk, halo in product(map(int, chosen.chunks.split(",")), halos):
+        settings[f"chunks of {chunk:,}, halo {halo:g} m"] = EncodeConfig(chunk=chunk, halo=halo, precision="float32")
+    rows: dict[str, list[tuple]] = {name: [] for name in settings}
+    for path in chosen.scenes:
+        scene = load_scene(Path(path))
+        scene = replace(scene, gaussians=seed(scene))
+        assert scene.gaussians is not None
+        teacher = LabelsTeacher(scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder)
+        truth = fuse(scene, teacher).features
+        whole = encode(scene.gaussians, encoder, outputs, settings["whole, float32"])
+        for name, config in settings.items():
+            start = time.perf_counter()
+            found = encode(scene.gaussians, encoder, outputs, config)
+            spent = time.perf_counter() - start
+            parts = len(cut(scene.gaussians.means, config.chunk, config.halo))
+            same = 1 - field_error(found, whole).centred
+            rows[name].append((*quality(scene, truth, found, teacher, words), same, spent, parts))
+    print("| setting | chunks | cosine with the whole | names | Acc@0.25 | seconds |\n|---|---|---|---|---|---|")
+    for name, each in rows.items():
+        names = naming_scores([row[0] for row in each])["accuracy"]
+        hits = accuracy([hit for row in each for hit in row[1]], 0.25)
+        same, spent, parts = (float(np.mean([row[place] for row in each])) for place in (2, 3, 4))
+        print(f"| {name} | {parts:.1f} | {same:.4f} | {names:.3f} | {hits:.3f} | {spent:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
