@@ -29,7 +29,13 @@ def find_weights(given: str) -> Path:
     if Path(given).is_dir():
         return Path(given) / WEIGHTS_FILE
     shipped = SHIPPED / given / WEIGHTS_FILE
-    return shipped if shipped.is_file() else find_file(given, "weights")
+    if shipped.is_file():
+        return shipped
+    try:
+        return find_file(given, "weights")
+    except InputError as error:
+        names = ", ".join(sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS_FILE}")))
+        raise InputError(f"{error}; gsencoder comes with {names}") from error
 
 
 def save_weights(
