@@ -8,22 +8,17 @@ alone, warm.
 
 import argparse
 import time
-from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
-from per_scene import quality
+from per_scene import labelled, quality
 
 from gsencoder.data.model_files import find_file
-from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import seed
 from gsencoder.data.text_table import load_text_table
 from gsencoder.evaluate.boxes import accuracy
 from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.naming import naming_scores
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.infer.encode import EncodeConfig, cut, encode
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.weights import load_weights
@@ -49,10 +44,8 @@ def main() -> None:
         settings[f"chunks of {chunk:,}, halo {halo:g} m"] = EncodeConfig(chunk=chunk, halo=halo, precision="float32")
     rows: dict[str, list[tuple]] = {name: [] for name in settings}
     for path in chosen.scenes:
-        scene = load_scene(Path(path))
-        scene = replace(scene, gaussians=seed(scene))
+        scene, teacher = labelled(path, words)
         assert scene.gaussians is not None
-        teacher = LabelsTeacher(scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder)
         truth = fuse(scene, teacher).features
         whole = encode(scene.gaussians, encoder, outputs, settings["whole, float32"])
         for name, config in settings.items():

@@ -164,7 +164,7 @@ def timed(module: Any, name: str, spent: dict[str, float], label: str) -> None:
 
 def step_parts(config: TrainConfig, prepared: Path, steps: int) -> dict[str, float]:
     """Mean seconds of the parts of a training step on prepared scenes, one sample a step."""
-    folder = PreparedDataset.open(prepared)
+    folder = PreparedDataset(prepared)
     outputs, _ = folder.load_space()
     recipe = SampleRecipe(
         encoder=config.model,

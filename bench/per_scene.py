@@ -23,9 +23,8 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeds import seed
 from gsencoder.data.text_table import TextTable, load_text_table
 from gsencoder.evaluate.boxes import Hit, accuracy
-from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.localization import LocalizationProtocol, ask
-from gsencoder.evaluate.naming import SceneNames, naming_scores, nearest_words
+from gsencoder.evaluate.naming import SceneNames, compare_names, naming_scores
 from gsencoder.evaluate.sources import encoded
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.fuse import fuse
@@ -97,18 +96,16 @@ def quality(
     scene: Scene, truth: GaussianFeatures, features: GaussianFeatures, teacher: LabelsTeacher, words: TextTable
 ) -> tuple[SceneNames, list[Hit]]:
     """Names told right, and boxes of the placed objects."""
-    rows = np.flatnonzero(truth.seen)
-    wanted, told = (nearest_words(one, rows, teacher.vectors) for one in (truth, features))
-    total = np.bincount(wanted, minlength=len(teacher.names))
-    right = np.bincount(wanted[told == wanted], minlength=len(teacher.names))
-    names = SceneNames(
-        scene=scene.name,
-        total={teacher.names[code]: int(total[code]) for code in np.flatnonzero(total)},
-        right={teacher.names[code]: int(right[code]) for code in np.flatnonzero(total)},
-        cosine=1 - field_error(features, truth).centred,
-        seconds={},
-    )
+    names = compare_names(scene.name, truth, features, teacher, {})
     return names, ask(scene, features, words, LocalizationProtocol(), LocalizeConfig())[0]
+
+
+def labelled(path: str, words: TextTable) -> tuple[Scene, LabelsTeacher]:
+    """A scene with seeds, and the teacher of its labels."""
+    scene = load_scene(Path(path))
+    scene = replace(scene, gaussians=seed(scene))
+    teacher = LabelsTeacher(scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder)
+    return scene, teacher
 
 
 def main() -> None:
@@ -124,9 +121,7 @@ def main() -> None:
     encoder, outputs, _ = load_weights(chosen.weights)
     table: dict[str, list[tuple[SceneNames, list[Hit], float]]] = {}
     for path in chosen.scenes:
-        scene = load_scene(Path(path))
-        scene = replace(scene, gaussians=seed(scene))
-        teacher = LabelsTeacher(scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder)
+        scene, teacher = labelled(path, words)
         start = time.perf_counter()
         truth = fuse(scene, teacher).features
         found = {"fused": (truth, time.perf_counter() - start)}

@@ -86,23 +86,38 @@ def evaluate_naming(
             raise InputError(
                 f"naming: the features are of ({features.space.describe()}), the words of ({words.space.describe()})"
             )
-        rows = np.flatnonzero(truth.seen)
-        wanted = nearest_words(truth, rows, teacher.vectors)
-        told = nearest_words(features, rows, teacher.vectors)
-        total = np.bincount(wanted, minlength=len(teacher.names))
-        right = np.bincount(wanted[told == wanted], minlength=len(teacher.names))
-        there = np.flatnonzero(total)
-        cosine = 1 - field_error(features, truth).centred if features.space == truth.space else float("nan")
-        found.append(
-            SceneNames(
-                scene=scene.name,
-                total={teacher.names[code]: int(total[code]) for code in there},
-                right={teacher.names[code]: int(right[code]) for code in there},
-                cosine=cosine,
-                seconds={"load": loaded, **spent},
-            )
-        )
+        found.append(compare_names(scene.name, truth, features, teacher, {"load": loaded, **spent}))
     return found
+
+
+def compare_names(
+    name: str,
+    truth: GaussianFeatures,
+    features: GaussianFeatures,
+    teacher: LabelsTeacher,
+    seconds: dict[str, float],
+) -> SceneNames:
+    """Counts the nearest words of a scene's features against those of the fused ones.
+
+    Args:
+        name: of the scene.
+        truth: fused from the teacher's maps; Gaussians that it has not seen do not count.
+        features: of the same Gaussians.
+        teacher: of the scene.
+        seconds: by step, to be kept with the result.
+    """
+    rows = np.flatnonzero(truth.seen)
+    wanted, told = (nearest_words(one, rows, teacher.vectors) for one in (truth, features))
+    total = np.bincount(wanted, minlength=len(teacher.names))
+    right = np.bincount(wanted[told == wanted], minlength=len(teacher.names))
+    there = np.flatnonzero(total)
+    return SceneNames(
+        scene=name,
+        total={teacher.names[code]: int(total[code]) for code in there},
+        right={teacher.names[code]: int(right[code]) for code in there},
+        cosine=1 - field_error(features, truth).centred if features.space == truth.space else float("nan"),
+        seconds=seconds,
+    )
 
 
 def nearest_words(

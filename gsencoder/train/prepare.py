@@ -95,44 +95,33 @@ class PreparedDataset:
     stopped, and several processes may share the work.
     """
 
-    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
         """Args:
-        folder: made if it does not exist.
-        settings: all that the preparation depends on; what the folder holds must have been made with the same.
+        folder: made if it does not exist and settings are given.
+        settings: all that the preparation depends on; what the folder holds must have been made with the same. None =
+            what is there, whatever it was made with.
 
         Raises:
-            InputError: it was made with others, or cannot be used.
+            InputError: it was made with others, cannot be used, or holds nothing where it must.
         """
         self.folder = folder
-        self.settings = wanted = json.loads(json.dumps(settings, default=str))
         path = folder / SETTINGS_FILE
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            found = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+            if settings is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+            found: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
         except (OSError, ValueError) as error:
             raise InputError(f"{folder}: cannot be used for prepared scenes: {error}") from error
+        if found is None and settings is None:
+            raise InputError(f"{folder}: expected prepared scenes, found no {SETTINGS_FILE}")
+        wanted: dict[str, Any] = found if settings is None else json.loads(json.dumps(settings, default=str))
+        self.settings = wanted
         if found is not None and found != wanted:
             difference = first_difference(found, wanted)
             raise InputError(f"{folder}: was prepared with {difference}; give another folder as prepared=")
         if found is None:
             with atomic_file(path) as stream:
                 stream.write(json.dumps(wanted, indent=1).encode())
-
-    @classmethod
-    def open(cls, folder: Path) -> "PreparedDataset":
-        """What has been prepared in a folder, with whatever settings.
-
-        Raises:
-            InputError: nothing has.
-        """
-        path = folder / SETTINGS_FILE
-        if not path.is_file():
-            raise InputError(f"{folder}: expected prepared scenes, found no {SETTINGS_FILE}")
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{folder}: cannot be used for prepared scenes: {error}") from error
-        return cls(folder, found)
 
     def find_space(
         self, scenes: Sequence[Path], open_scene: Callable[[Path], tuple[Scene, Teacher]], config: PrepareConfig

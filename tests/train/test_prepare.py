@@ -73,6 +73,14 @@ def test_another_scene_of_a_prepared_name_is_refused(tmp_path: Path) -> None:
         dataset.holds(tmp_path / "elsewhere" / names[0])
 
 
+def test_what_is_there_is_opened_without_settings_and_nothing_is_made(tmp_path: Path) -> None:
+    dataset, _ = prepared(tmp_path / "prepared", count=1)
+    assert PreparedDataset(tmp_path / "prepared").settings == dataset.settings
+    with pytest.raises(InputError, match=f"expected prepared scenes, found no {SETTINGS_FILE}"):
+        PreparedDataset(tmp_path / "nothing")
+    assert not (tmp_path / "nothing").exists()
+
+
 def test_a_folder_of_another_dataset_is_refused_and_the_setting_named(tmp_path: Path) -> None:
     prepared(tmp_path, count=1)
     with pytest.raises(InputError, match=r"prepared with made="):
