@@ -173,7 +173,7 @@ def _run(command: Command, config: Any, debug: bool) -> None:
 
     cls, run = command.load()
     check_required(cls, config)
-    refuse_to_replace_inputs(config.out, getattr(config, "paths", ()))
+    refuse_to_replace_inputs(config.out, settings(config))
     summary = Summary(command.name, settings(config))
     with _collected_warnings(summary.warnings, debug):
         run(config, summary)

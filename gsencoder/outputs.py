@@ -7,7 +7,7 @@ import re
 import secrets
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from hashlib import sha1
 from pathlib import Path
@@ -136,18 +136,72 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
         raise InputError(f"{path}: exists; give another out= or overwrite=true")
 
 
-def refuse_to_replace_inputs(out: Path | None, inputs: Sequence[str]) -> None:
+def refuse_to_replace_inputs(out: Path | None, given: Mapping[str, Any]) -> None:
     """Complains if a folder that is about to be replaced holds one of the inputs.
+
+    Args:
+        out: the folder.
+        given: the settings of the run; every text in them that names an existing file or folder is an input.
 
     Raises:
         InputError: it does.
     """
     if out is None or not os.path.isdir(out):
         return
-    folder = os.path.realpath(out)
-    for name in inputs:
-        if os.path.commonpath([folder, os.path.realpath(name)]) == folder:
-            raise InputError(f"{out}: holds the input {name}, so it cannot be replaced; give another out=")
+    for key, name in _texts({key: value for key, value in given.items() if key != "out"}):
+        if os.path.exists(name) and lies_in(name, out):
+            raise InputError(f"{out}: holds the input {key}={name}, so it cannot be replaced; give another out=")
+
+
+def lies_in(path: str | Path, folder: str | Path) -> bool:
+    """Whether a path is a folder, or lies in it, whatever names and links lead there."""
+    inner, outer = os.path.realpath(path), os.path.realpath(folder)
+    return os.path.commonpath([inner, outer]) == outer
+
+
+def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """All texts in nested settings that could be paths, with their keys."""
+    if isinstance(value, str) and 0 < len(value) < 4096 and "\0" not in value:
+        yield key, value
+    elif isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _texts(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _texts(item, key)
+
+
+WORK_MARK = "unfinished.txt"
+
+
+def open_work_folder(path: Path, *, anew: bool) -> None:
+    """Makes the folder in which a run that may be cut off keeps its state, or takes up the one that a run has left.
+
+    Args:
+        path: the folder. One that no run has made is never touched.
+        anew: forget what an earlier run left in it.
+
+    Raises:
+        InputError: it holds something else, or cannot be made.
+    """
+    try:
+        if path.is_dir() and any(path.iterdir()) and not (path / WORK_MARK).is_file():
+            raise InputError(
+                f"{path}: this run would keep its state here, and the folder holds something else (no {WORK_MARK}); "
+                "give another out="
+            )
+        if anew:
+            shutil.rmtree(path, ignore_errors=True)
+        path.mkdir(parents=True, exist_ok=True)
+        write_bytes(path / WORK_MARK, b"The state of a run that is not finished, which removes this folder.\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot keep the state of this run here: {error.strerror or error}") from error
+
+
+def close_work_folder(path: Path) -> None:
+    """Removes the folder of a run that is finished."""
+    if (path / WORK_MARK).is_file():
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _short(name: str) -> str:
@@ -252,7 +306,10 @@ def is_full_disk(error: BaseException) -> bool:
 
 def _refusal(error: Exception, partial: Path, path: str | Path) -> str | None:
     """What to tell the user if it was the system that refused to write, or None."""
-    if isinstance(error, OSError) and error.errno == errno.EFBIG:
+    if isinstance(error, InputError) and str(partial) not in str(error):
+        # What lies elsewhere, such as the state of a run that can go on, was not given up.
+        return str(error)
+    if (isinstance(error, OSError) and error.errno == errno.EFBIG) or os.strerror(errno.EFBIG) in str(error):
         return f"{path}: a file would grow larger than this system or shell allows (ulimit -f); nothing was kept"
     if is_full_disk(error):
         return f"{path}: no space left on the device; nothing was kept"

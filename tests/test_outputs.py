@@ -5,6 +5,7 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,9 @@ import pytest
 from gsencoder import outputs
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.outputs import (
+    WORK_MARK,
+    close_work_folder,
+    open_work_folder,
     output_folder,
     refuse_existing,
     refuse_to_replace_inputs,
@@ -187,7 +191,6 @@ def test_a_kill_leaves_no_output_folder_and_the_next_run_cleans_up(tmp_path: Pat
         OSError(errno.EDQUOT, "Disk quota exceeded"),
         OSError("4096 requested and 100 written"),
         RuntimeError("I/O error: No space left on device (os error 28)"),
-        InputError("out/a.ply: cannot write: No space left on device"),
     ],
 )
 def test_a_full_disk_is_one_line_that_names_the_folder(tmp_path: Path, error: Exception) -> None:
@@ -235,7 +238,7 @@ def test_a_place_that_cannot_be_written_is_a_named_error(tmp_path: Path) -> None
 
 
 def test_a_name_longer_than_the_system_allows_is_refused_before_the_work(tmp_path: Path) -> None:
-    refuse_to_replace_inputs(tmp_path / ("x" * 300), ["scene"])
+    refuse_to_replace_inputs(tmp_path / ("x" * 300), {"paths": ["scene"]})
     with (
         pytest.raises(InputError, match="cannot write here: File name too long"),
         output_folder(tmp_path / ("x" * 300)),
@@ -250,13 +253,50 @@ def test_names_as_long_as_the_system_allows_work(tmp_path: Path) -> None:
 
 def test_inputs_inside_the_folder_to_replace_are_protected(tmp_path: Path) -> None:
     fill(tmp_path / "out", "old")
-    inside = str(tmp_path / "out" / "deep")
-    for inputs in ([inside], [str(tmp_path / "out")], ["elsewhere", inside]):
+    inside, out = str(tmp_path / "out" / "deep"), str(tmp_path / "out")
+    for given in ({"paths": [inside]}, {"paths": [out]}, {"weights": out}, {"seeds": {"mesh": inside}, "voxel": 2}):
         with pytest.raises(InputError, match="holds the input"):
-            refuse_to_replace_inputs(tmp_path / "out", inputs)
-    refuse_to_replace_inputs(tmp_path / "out", [str(tmp_path), str(tmp_path / "out2")])
-    refuse_to_replace_inputs(tmp_path / "new", [str(tmp_path / "new")])
-    refuse_to_replace_inputs(None, [inside])
+            refuse_to_replace_inputs(tmp_path / "out", given)
+    refuse_to_replace_inputs(tmp_path / "out", {"out": out, "paths": [str(tmp_path)], "splat": str(tmp_path / "out2")})
+    refuse_to_replace_inputs(tmp_path / "out", {"weights": str(tmp_path / "out" / "nothing"), "query": "a\0b"})
+    refuse_to_replace_inputs(tmp_path / "new", {"paths": [str(tmp_path / "new")]})
+    refuse_to_replace_inputs(None, {"paths": [inside]})
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [("No space left on device", "no space left"), ("File too large (os error 27)", "ulimit -f")]
+)
+def test_a_disk_that_is_full_elsewhere_is_not_said_to_be_full_here(tmp_path: Path, words: str, told: str) -> None:
+    with (
+        pytest.raises(InputError, match=rf"out: .*{told}.*; nothing was kept$"),
+        output_folder(tmp_path / "out") as own,
+    ):
+        raise InputError(f"{own}/a.ply: cannot be written: {words}")
+    with pytest.raises(InputError, match=rf"^/elsewhere/b: cannot be written: {re.escape(words)}$"):
+        write_and_raise(tmp_path / "out", InputError(f"/elsewhere/b: cannot be written: {words}"))
+
+
+def test_the_folder_of_a_run_is_its_own(tmp_path: Path) -> None:
+    work = tmp_path / "run.training"
+    open_work_folder(work, anew=False)
+    (work / "state").touch()
+    open_work_folder(work, anew=False)
+    assert (work / "state").is_file()
+    open_work_folder(work, anew=True)
+    assert [entry.name for entry in work.iterdir()] == [WORK_MARK]
+    close_work_folder(work)
+    assert not work.exists()
+
+
+@pytest.mark.parametrize("anew", [True, False])
+def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path, *, anew: bool) -> None:
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(InputError, match="holds something else"):
+        open_work_folder(tmp_path, anew=anew)
+    close_work_folder(tmp_path)
+    assert (tmp_path / "notes.txt").is_file()
+    with pytest.raises(InputError, match="cannot keep the state of this run here"):
+        open_work_folder(tmp_path / "notes.txt", anew=anew)
 
 
 def test_single_files_are_replaced_only_if_allowed(tmp_path: Path) -> None:

@@ -4,11 +4,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsencoder.config import CommonConfig, settings
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import load_text_table, save_text_table
+from gsencoder.errors import about
 from gsencoder.fusion.complete import with_gaussians
 from gsencoder.fusion.store import WORDS_FILE, save_features
 from gsencoder.infer.encode import EncodeConfig, encode
@@ -44,6 +45,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     """Encodes one scene into out=, or each of several into a folder of its name below out=."""
     keep_heap()
     paths = find_scenes(config.paths)
+    check_names(paths)
     with summary.step("weights"):
         file = find_weights(config.weights)
         encoder, outputs, _ = load_weights(file)
@@ -61,7 +63,8 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
         if len(paths) > 1:
             out = out / scene.name
         with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
-            _encode_into(folder, scene, encoder, outputs, config, one)
+            with about(scene.name):
+                _encode_into(folder, scene, encoder, outputs, config, one)
             if words is not None:
                 save_text_table(folder / WORDS_FILE, words)
         screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.config import CommonConfig, settings
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
@@ -44,6 +44,7 @@ class FuseCommandConfig(CommonConfig):
 def run(config: FuseCommandConfig, summary: Summary) -> None:
     """Fuses one scene into out=, or each of several into a folder of its name below out=."""
     paths = find_scenes(config.paths)
+    check_names(paths)
     with summary.step("teacher"):
         words = text_table_of(config.teacher)
     screen = console(config.quiet)

@@ -1,9 +1,10 @@
 """`gsencoder train SCENE… out=FOLDER`: distil a teacher into an encoder that needs neither photographs nor teacher."""
 
 import hashlib
+import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import partial
@@ -22,7 +23,7 @@ from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, about
 from gsencoder.evaluate.validation import validate_encoder
 from gsencoder.fusion.complete import check_orbits, with_gaussians, with_views
 from gsencoder.fusion.store import WORDS_FILE
@@ -35,7 +36,7 @@ from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
-from gsencoder.outputs import output_folder
+from gsencoder.outputs import close_work_folder, lies_in, open_work_folder, output_folder, refuse_to_replace_inputs
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
 from gsencoder.train.distributed import Place, joined, together
@@ -97,7 +98,11 @@ def run(config: TrainConfig, summary: Summary) -> None:
     """Prepares scenes, trains, and writes weights, log and scores into out=."""
     keep_heap()
     out = config.out or Path("outputs") / "train"
-    work = out.with_name(f"{out.name}.training")
+    real = Path(os.path.realpath(out))
+    work, kept = real.with_name(f"{real.name}.training"), config.prepared or real.with_name(f"{real.name}.prepared")
+    for name, taken in (("out", real), ("the state of the run", work)):
+        if lies_in(kept, taken):
+            raise InputError(f"prepared={kept}: lies in the folder of {name}, {taken}; give another folder")
     training, held_out = split(find_scenes(config.paths), config.holdout)
     words = text_table_of(config.teacher)
     with joined(config.device) as (place, device), ExitStack() as results:
@@ -108,23 +113,22 @@ def run(config: TrainConfig, summary: Summary) -> None:
                 # Opened now, so that an out= that cannot be written is told before hours of work.
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
         with summary.step("prepare"):
-            dataset = prepare(training, held_out, words, config, out, place, track)
+            dataset = prepare(training, held_out, words, config, kept, place, track)
         if config.prepare_only:
             counts = f"{len(training)} scenes to train on, {len(held_out)} for validation"
             console(config.quiet or not place.first).print(f"{dataset.folder}: {counts}")
             return
         with together():
             if place.first:
-                if not config.resume:
-                    shutil.rmtree(work, ignore_errors=True)
-                work.mkdir(parents=True, exist_ok=True)
+                refuse_to_replace_inputs(work, settings(config))
+                open_work_folder(work, anew=not config.resume)
         trainer, outputs = make_trainer(dataset, training, held_out, config, work, place, device)
         with summary.step("train"):
             done = trainer.run(track)
         if folder is None:
             return
         write_results(folder, trainer, outputs, words, config, summary)
-    shutil.rmtree(work, ignore_errors=True)
+    close_work_folder(work)
     scores = summary.results["validation"]
     told = ", ".join(f"{name} {value:.3f}" for name, value in scores.items()) or "not validated"
     console(config.quiet).print(f"{out}: {done.step} steps in {done.seconds / 60:.1f} minutes; {told}")
@@ -225,11 +229,11 @@ def prepare(
     held_out: Sequence[Path],
     words: TextTable | None,
     config: TrainConfig,
-    out: Path,
+    folder: Path,
     place: Place,
     track: Progress,
 ) -> PreparedDataset:
-    """Prepares what is not prepared yet; processes share the scenes.
+    """Prepares what is not prepared yet in `folder`; processes share the scenes.
 
     Raises:
         InputError: of any process; the scene is named.
@@ -240,7 +244,6 @@ def prepare(
         **{name: settings(getattr(config, name)) for name in ("data", "seeds", "teacher", "prepare")},
         **{"splat": config.splat, "orbits": config.orbits, "voxel": config.model.voxel},
     }
-    folder = config.prepared or out.with_name(f"{out.name}.prepared")
     opened = OpenScenes(config, words)
     with together():
         if place.first:
@@ -254,7 +257,7 @@ def prepare(
     with together():
         for path in track(missing[place.rank :: place.size], "preparing scenes"):
             scene, teacher = opened.complete(path)
-            with _named(path):
+            with about(path):
                 dataset.prepare(scene, teacher, config.prepare, source=path)
     with together():
         if place.first:
@@ -275,7 +278,7 @@ class OpenScenes:
         Raises:
             InputError: whatever is wrong with the scene, which is named.
         """
-        with _named(path):
+        with about(path):
             scene = load_scene(path, splat=self.config.splat or None, options=self.config.data)
             if scene.views is None:
                 scene = with_views(scene, self.config.orbits, self.config.prepare.fusion.blend)
@@ -288,7 +291,7 @@ class OpenScenes:
             InputError: whatever is wrong with the scene, which is named.
         """
         scene, teacher = self.look(path)
-        with _named(path):
+        with about(path):
             scene = with_gaussians(scene, self.config.seeds)
             return replace(scene, name=path.name, metres_per_unit=unit_of(scene, self.config.model.voxel)), teacher
 
@@ -298,15 +301,6 @@ class OpenScenes:
         if self._shared is None:
             self._shared = build_teacher(self.config.teacher, scene, self.words)
         return self._shared
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """An error in the block says which of many scenes it is about."""
-    try:
-        yield
-    except InputError as error:
-        raise error if path.name in str(error) else InputError(f"{path}: {error}") from error
 
 
 def _digest_of(words: TextTable | None) -> str:

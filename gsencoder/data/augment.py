@@ -35,6 +35,9 @@ class AugmentConfig:
         for name in ("turn", "tilt", "jitter", "noise"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        for name in ("turn", "tilt"):
+            if getattr(self, name) > 360:
+                raise InputError(f"{name}: expected at most 360 degrees, got {getattr(self, name)}")
         for name in ("mirror", "drop", "scale", "light", "tint"):
             if not 0 <= getattr(self, name) <= (1 if name == "mirror" else 0.9):
                 most = 1 if name == "mirror" else 0.9

@@ -23,7 +23,7 @@ def find_file(name: str, option: str, *, folder: bool = False) -> Path:
     tried = [Path(name)]
     if models and not tried[0].is_absolute():
         tried.append(Path(models) / name)
-    for path in tried:
+    for path in tried if name else ():
         if path.is_dir() if folder else path.is_file():
             return path
     hint = "" if models else f", and {MODELS_VARIABLE} is not set (a folder to look for models in)"

@@ -119,6 +119,34 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     )
 
 
+def scene_name(path: Path) -> str:
+    """What `load_scene` will call the scene at a path that exists."""
+    if path.is_file():
+        return _name_of(path.absolute().parent) if _is_transforms(path) else path.stem
+    return _name_of(path)
+
+
+def check_names(paths: Sequence[Path]) -> None:
+    """Complains of two scenes of one name, whose results would lie in one folder.
+
+    Raises:
+        InputError: there are such.
+    """
+    first: dict[str, Path] = {}
+    for path in paths:
+        name = scene_name(path)
+        if name in first:
+            raise InputError(
+                f"{path} and {first[name]} are both called {name!r}, so their results would lie in one folder; "
+                "rename one, or give each an out= of its own"
+            )
+        first[name] = path
+
+
+def _is_transforms(path: Path) -> bool:
+    return path.suffix.lower() == ".json" and path.name != "meta.json"
+
+
 def _name_of(folder: Path) -> str:
     """What a scene and its output folders are called; of "..", the name of the folder that it leads to."""
     return (folder if folder.name not in ("", "..") else folder.resolve()).name or "scene"
@@ -127,12 +155,13 @@ def _name_of(folder: Path) -> str:
 def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
     """The scenes that paths name: a path that is a scene itself stays, a folder of scenes becomes its scenes by name.
 
-    A folder is a scene if it holds what `load_scene` looks for; of any other the direct subfolders are looked at.
+    A folder is a scene if it holds what `load_scene` looks for; of any other the direct subfolders are looked at. A
+    scene that is named twice, in whatever spelling, is taken once.
 
     Raises:
         InputError: a path that does not exist, or a folder with no scene in it.
     """
-    found: dict[Path, None] = {}
+    found: dict[Path, Path] = {}
     for given in map(Path, paths):
         try:
             if not given.exists():
@@ -147,8 +176,9 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
                 f"{given}: neither a scene nor a folder of scenes; a scene holds {' or '.join(TRANSFORMS)}, a COLMAP "
                 "model, a ScanNet export or a splat"
             )
-        found |= dict.fromkeys(inside)
-    return tuple(found)
+        for path in inside:
+            found.setdefault(path.resolve(), path)
+    return tuple(found.values())
 
 
 def _is_scene(path: Path) -> bool:
@@ -171,7 +201,7 @@ def _read_views(root: Path, options: SceneConfig) -> tuple[PosedImages | None, P
     """The posed pictures, and the scene folder; None for a bare splat."""
     outside, scale = options.allow_outside, options.depth_scale
     if root.is_file():
-        if root.suffix.lower() == ".json" and root.name != "meta.json":
+        if _is_transforms(root):
             return read_transforms(root, allow_outside=outside, depth_scale=scale), root.parent
         return None, root.parent
     transforms = next((root / file for file in TRANSFORMS if (root / file).is_file()), None)

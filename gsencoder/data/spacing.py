@@ -52,7 +52,15 @@ def unit_of(scene: Scene, voxel: float) -> float:
         return scene.metres_per_unit
     assert scene.gaussians is not None
     spacing = scene_spacing(scene.gaussians.means)
-    unit = voxel / spacing if spacing else 1.0
+    if not spacing:
+        warnings.warn(
+            f"the unit of scene {scene.name!r} is unknown, and its Gaussians all lie in one place; a unit is taken for "
+            "1 m; give data.metres_per_unit= if you know better",
+            SceneWarning,
+            stacklevel=3,
+        )
+        return 1.0
+    unit = voxel / spacing
     warnings.warn(
         f"the unit of scene {scene.name!r} is unknown; its Gaussians lie {spacing:.4g} units apart, which is taken for "
         f"{voxel:g} m, so a unit for {unit:.4g} m; give data.metres_per_unit= if you know better",

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from gsencoder.errors import about
 from gsencoder.infer.encode import EncodeConfig, encode
 from gsencoder.infer.pictures import contact_sheet, fit_pca_colors, pca_picture
 from gsencoder.models.encoder import GaussianEncoder
@@ -87,7 +88,8 @@ def validate_encoder(
     for scene in track(scenes, "validation"):
         seen = np.flatnonzero(scene.weights)
         everything = scene.gaussians(np.arange(len(scene)))
-        found = encode(everything, encoder, outputs, config, metres_per_unit=scene.metres_per_unit or 1.0)
+        with about(f"scene {scene.name}"):
+            found = encode(everything, encoder, outputs, config, metres_per_unit=scene.metres_per_unit or 1.0)
         predicted = outputs.standardize(found.features[seen])
         targets = scene.targets(seen)
         if len(pictures) < 3 * shown:

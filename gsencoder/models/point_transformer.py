@@ -12,6 +12,9 @@ from gsencoder.models.blocks import Block, Pool, Unpool
 from gsencoder.models.plan import ORDERS, Level, Plan
 from gsencoder.models.serialize import ALIGN, Order
 
+MOST_CHANNELS, MOST_BLOCKS, MOST_RATIO = 1 << 14, 1000, 64
+"""Beyond any network that was ever trained on points: such sizes are slips, or a file that wants the memory."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransformerConfig:
@@ -65,8 +68,14 @@ class TransformerConfig:
             raise InputError("orders: expected at least one of z, z-trans, hilbert, hilbert-trans")
         if not 0 <= self.drop_path < 1:
             raise InputError(f"drop_path: expected a share in [0, 1), got {self.drop_path}")
-        if not self.mlp_ratio > 0:
-            raise InputError(f"mlp_ratio: expected a positive number, got {self.mlp_ratio}")
+        if not 0 < self.mlp_ratio <= MOST_RATIO:
+            raise InputError(f"mlp_ratio: expected a number above 0 and at most {MOST_RATIO}, got {self.mlp_ratio}")
+        widest, deepest = (*self.encoder_channels, *self.decoder_channels), (*self.encoder_depths, *self.decoder_depths)
+        if max(widest) > MOST_CHANNELS or max(deepest) > MOST_BLOCKS:
+            raise InputError(
+                f"channels and depths: expected at most {MOST_CHANNELS} and {MOST_BLOCKS}, got {max(widest)} and "
+                f"{max(deepest)}"
+            )
 
     @property
     def levels(self) -> int:

@@ -44,18 +44,18 @@ def cells_of(points: Tensor, voxel: float, corner: Tensor | None = None) -> Int6
     """
     if not len(points):
         return torch.zeros(0, 3, dtype=torch.int64, device=points.device)
+    if not torch.isfinite(points).all():
+        bad = int((~torch.isfinite(points).all(dim=1)).sum())
+        raise InputError(f"grid: {bad} of {len(points)} positions are not finite")
     scaled = torch.floor(points.double() / voxel)
     low, high = scaled.aminmax(dim=0)
     if corner is not None:
         low = torch.minimum(low, torch.floor(corner.to(scaled) / voxel))
-    if not torch.isfinite(high - low).all():
-        bad = int((~torch.isfinite(scaled).all(dim=1)).sum())
-        raise InputError(f"grid: {bad} of {len(points)} positions are not finite")
     extent = (high - low + 1).max().item()
-    if extent >= LARGEST_EXTENT:
+    if not extent < LARGEST_EXTENT:
         raise InputError(
-            f"grid: the points spread over {extent:,.0f} cells of {voxel:g} units on an axis; the limit is 2²⁰; "
-            "take a larger voxel, or remove stray Gaussians (`gsencoder repair`)"
+            f"grid: the points spread over {extent:.3g} cells of {voxel:.3g} units on an axis; the limit is 2²⁰; "
+            "check the unit (data.metres_per_unit), and remove stray Gaussians (`gsencoder repair`)"
         )
     return (scaled - torch.floor(low / ALIGN) * ALIGN).long()
 

@@ -26,16 +26,20 @@ def find_weights(given: str) -> Path:
     Raises:
         InputError: there are none.
     """
-    if Path(given).is_dir():
-        return Path(given) / WEIGHTS_FILE
-    shipped = SHIPPED / given / WEIGHTS_FILE
-    if shipped.is_file():
-        return shipped
+    names = sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS_FILE}"))
     try:
+        own = Path(given) / WEIGHTS_FILE
+        if given and own.is_file():
+            return own
+        if given in names:
+            return SHIPPED / given / WEIGHTS_FILE
+        if given and Path(given).is_dir():
+            raise InputError(f"weights: the folder {given} holds no {WEIGHTS_FILE}")
         return find_file(given, "weights")
     except InputError as error:
-        names = ", ".join(sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS_FILE}")))
-        raise InputError(f"{error}; gsencoder comes with {names}") from error
+        raise InputError(f"{error}; gsencoder comes with {', '.join(names)}") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"weights: {given[:200]!r} is not a path ({type(error).__name__})") from error
 
 
 def save_weights(
@@ -60,9 +64,12 @@ def save_weights(
     """
     arrays, header = write_outputs(outputs)
     for name, value in encoder.state_dict().items():
-        if not torch.isfinite(value).all():
-            raise InputError(f"save_weights: parameter {name} is not finite")
-        arrays[f"encoder.{name}"] = value.detach().cpu().numpy().astype(dtype)
+        with np.errstate(over="ignore"):
+            stored = value.detach().cpu().numpy().astype(dtype)
+        if not np.isfinite(stored).all():
+            wide = f" in {dtype}; take store=float32, or a lower learning rate" if torch.isfinite(value).all() else ""
+            raise InputError(f"save_weights: parameter {name} is not finite{wide}")
+        arrays[f"encoder.{name}"] = stored
     header |= {"encoder": asdict(encoder.config), "dtype": dtype, "made_by": dict(made_by)}
     write_archive(path, arrays, header)
 
@@ -98,5 +105,5 @@ def _config(values: dict[str, Any]) -> EncoderConfig:
 
     try:
         return dacite.from_dict(EncoderConfig, values, dacite.Config(strict=True, cast=[tuple]))
-    except dacite.DaciteError as error:
+    except (dacite.DaciteError, TypeError) as error:
         raise InputError(f"the encoder's configuration is not one of this version: {error}") from error

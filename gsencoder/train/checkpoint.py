@@ -4,6 +4,7 @@ The schedule, the order of samples and everything random are functions of the se
 that has to be kept of them.
 """
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 
 from gsencoder.data.archive import first_difference, open_archive, write_archive
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, advised
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 
@@ -56,7 +57,8 @@ def save_checkpoint(
     for name, parameter in model.named_parameters():
         for key, value in optimizer.state.get(parameter, {}).items():
             arrays[f"optimizer.{key}.{name}"] = value.detach().float().cpu().numpy()
-    header = {**asdict(state), "settings": settings}
+    moved = [name for name, parameter in model.named_parameters() if optimizer.state.get(parameter)]
+    header = {**asdict(state), "settings": settings, "moved": moved}
     write_archive(path, arrays, header)
 
 
@@ -68,33 +70,46 @@ def load_checkpoint(
     Raises:
         InputError: damaged, of another network, or of a run with other settings; the first that differs is named.
     """
-    with open_archive(path) as file:
+    with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
         found = file.value("settings", dict)
         if found != settings:
             raise InputError(
-                f"{path}: was made with {first_difference(found, settings)}; "
-                "give the same settings, another out=, or resume=false to begin anew"
+                f"{path}: was made with {first_difference(found, settings)}; give the same settings or another out="
             )
         parameters = {
             name: torch.from_numpy(file.array(f"model.{name}", "float32", tuple(value.shape)))
             for name, value in model.state_dict().items()
         }
         moments: dict[torch.nn.Parameter, dict[str, torch.Tensor]] = {}
+        moved = file.value("moved", list)
         for name, parameter in model.named_parameters():
+            if name not in moved:
+                continue
             shape = tuple(parameter.shape)
             keys = (("step", ()), ("exp_avg", shape), ("exp_avg_sq", shape))
-            if f"optimizer.step.{name}" in file:
-                moments[parameter] = {
-                    key: torch.from_numpy(file.array(f"optimizer.{key}.{name}", "float32", size).copy())
-                    for key, size in keys
-                }
+            moments[parameter] = {
+                key: torch.from_numpy(file.array(f"optimizer.{key}.{name}", "float32", size).copy())
+                for key, size in keys
+            }
         state = TrainingState(
             step=file.value("step", int),
             seconds=float(file.value("seconds", float, int)),
             unlogged=tuple(file.value("unlogged", list)),
             closed=file.value("closed", bool),
         )
+        _check_state(state)
     model.load_state_dict(parameters)
     for parameter, values in moments.items():
         optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in values.items()}
     return state
+
+
+def _check_state(state: TrainingState) -> None:
+    numbers = all(
+        isinstance(row, dict) and all(isinstance(value, (int, float)) for value in row.values())
+        for row in state.unlogged
+    )
+    if state.step < 1 or not 0 <= state.seconds < math.inf or not numbers or not (state.unlogged or state.closed):
+        raise InputError(
+            f"a state that no run was in (step {state.step}, {len(state.unlogged)} steps that are not logged)"
+        )

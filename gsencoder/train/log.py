@@ -2,6 +2,7 @@
 
 import csv
 import io
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from gsencoder.data.atomic import atomic_file
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning
 
 LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
 
@@ -18,11 +19,15 @@ LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
 class Log:
     """Rows of numbers by step. The file is closed after every row, so that a kill loses none."""
 
-    def __init__(self, folder: Path, *, done: int, events: bool) -> None:
+    def __init__(self, folder: Path, *, done: int, events: bool, begun: bool = False) -> None:
         """Args:
         folder: where the log lies; rows of steps that will be done again are taken out.
         done: steps that are done; a row carries the number of steps that were done when it was written.
         events: whether to write TensorBoard events too.
+        begun: whether rows have been written before.
+
+        Warns:
+            SceneWarning: they have, and are gone.
 
         Raises:
             InputError: TensorBoard is asked for and not installed, or the log cannot be written.
@@ -37,15 +42,21 @@ class Log:
                 raise InputError(
                     "tensorboard=true needs the package tensorboard (pip install tensorboard), or tensorboard=false"
                 ) from error
-            # Events of later steps, left by a run that was killed, are no longer shown.
-            self._writer = SummaryWriter(str(folder / EVENTS_FOLDER), purge_step=done + 1)
+            try:
+                # Events of later steps, left by a run that was killed, are no longer shown.
+                self._writer = SummaryWriter(str(folder / EVENTS_FOLDER), purge_step=done + 1)
+            except OSError as error:
+                raise InputError(f"{folder / EVENTS_FOLDER}: cannot write: {error.strerror or error}") from error
         try:
+            if begun and not self.path.is_file():
+                warnings.warn(f"{self.path}: is gone; the log begins again at step {done}", SceneWarning, stacklevel=2)
             self._keep_until(done)
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, csv.Error) as error:
             raise InputError(f"{self.path}: cannot be continued: {error}") from error
 
     def _keep_until(self, done: int) -> None:
         if not self.path.is_file():
+            self._rewrite([])
             return
         kept = [row for row in read_log(self.path) if int(row["step"]) <= done]
         self._columns = list(dict.fromkeys(name for row in kept for name in row))

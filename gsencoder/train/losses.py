@@ -19,6 +19,8 @@ from gsencoder.errors import InputError
 from gsencoder.render import Blend
 
 EPS = 1e-12
+MOST_RARITY = 4.0
+"""Kinds of a million Gaussians then still count 1e-24 times as much as one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,11 +49,17 @@ class LossConfig:
         for name in ("cosine", "smooth_l1", "field_weight", "render_weight", "contrast_weight", "rarity"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if self.rarity > MOST_RARITY:
+            raise InputError(
+                f"rarity: expected at most {MOST_RARITY}, got {self.rarity}: all but the rarest would be 0"
+            )
         if not 0 < self.temperature < float("inf"):
             raise InputError(f"temperature: expected a positive number, got {self.temperature}")
         for name in ("min_alpha", "min_kept"):
             if not 0 < getattr(self, name) <= 1:
                 raise InputError(f"{name}: expected a share in (0, 1], got {getattr(self, name)}")
+        if not (self.cosine + self.smooth_l1 > 0 or self.contrast_weight > 0):
+            raise InputError("cosine and smooth_l1: expected one above 0, there is no loss left")
         if not self.field_weight + self.render_weight + self.contrast_weight > 0:
             raise InputError(
                 "field_weight, render_weight and contrast_weight: expected one above 0, there is no loss left"

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32
 
 from gsencoder.data.archive import first_difference, open_archive, write_archive
 from gsencoder.data.atomic import atomic_file
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, advised
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import capped
@@ -110,10 +110,17 @@ class PreparedDataset:
             if settings is not None:
                 folder.mkdir(parents=True, exist_ok=True)
             found: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-        except (OSError, ValueError) as error:
-            raise InputError(f"{folder}: cannot be used for prepared scenes: {error}") from error
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{path}: cannot be used: {error}; give another folder as prepared=") from error
+        if path.is_file() and not isinstance(found, dict):
+            raise InputError(f"{path}: expected settings, got {str(found)[:40]}; give another folder as prepared=")
         if found is None and settings is None:
             raise InputError(f"{folder}: expected prepared scenes, found no {SETTINGS_FILE}")
+        if found is None and any(not entry.name.startswith(".") for entry in folder.iterdir()):
+            raise InputError(
+                f"{folder}: holds something else than prepared scenes (no {SETTINGS_FILE}); give another folder as "
+                "prepared="
+            )
         wanted: dict[str, Any] = found if settings is None else json.loads(json.dumps(settings, default=str))
         self.settings = wanted
         if found is not None and found != wanted:
@@ -129,6 +136,11 @@ class PreparedDataset:
         """Finds the output space of the training scenes, unless it has been found."""
         if (self.folder / SPACE_FILE).is_file():
             return
+        if (self.folder / "scenes").is_dir() and any((self.folder / "scenes").iterdir()):
+            raise InputError(
+                f"{self.folder}: holds scenes, and not the space that they were prepared for ({SPACE_FILE}); give "
+                "another folder as prepared="
+            )
         outputs, codebook = dataset_space(scenes, open_scene, config.fusion, views=config.basis_views)
         arrays, header = write_outputs(outputs)
         if codebook is not None:
@@ -145,7 +157,7 @@ class PreparedDataset:
         Raises:
             InputError: missing or damaged.
         """
-        with open_archive(self.folder / SPACE_FILE) as file:
+        with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
             outputs = read_outputs(file)
             codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
         return outputs, codebook
@@ -163,7 +175,7 @@ class PreparedDataset:
         path = self.path_of(source.name)
         if not path.is_file():
             return False
-        with open_archive(path) as file:
+        with advised("remove the file, and it is prepared again"), open_archive(path) as file:
             made_from = file.value("source", str)
         if made_from != str(source.resolve()):
             raise InputError(
@@ -221,11 +233,14 @@ class PreparedDataset:
         Raises:
             InputError: missing or damaged.
         """
-        with open_archive(self.folder / RARITY_FILE) as file:
-            return Rarity(
-                codebook=file.array("codebook", "float32", ("C", "channels")),
-                counts=file.array("counts", "float64", ("C",)),
-            )
+        channels = self.load_space()[0].channels
+        path = self.folder / RARITY_FILE
+        with advised("remove the file, and it is counted again"), open_archive(path) as file:
+            codebook = file.array("codebook", "float32", ("C", channels))
+            counts = file.array("counts", "float64", ("C",))
+            if not len(counts) or not (counts >= 0).all():
+                raise InputError("expected kinds of target with counts from 0")
+            return Rarity(codebook=codebook, counts=counts)
 
     def scenes(self, names: Sequence[str]) -> list[PreparedScene]:
         """Prepared scenes by name."""

@@ -5,6 +5,9 @@ The file is memory-mapped: a sample reads the Gaussians and the views that it wa
 workers of one machine share what was read.
 """
 
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.data.archive import map_arrays, open_archive, write_archive
 from gsencoder.data.archived import camera_arrays, read_cameras
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, about, advised
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene
 
@@ -63,18 +66,32 @@ class PreparedScene:
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:
-        return map_arrays(self.path, _ARRAYS)
+        with self._whole():
+            arrays = map_arrays(self.path, _ARRAYS)
+            _check_arrays(arrays, len(self._header[0]))
+        return arrays
 
     @cached_property
     def _header(self) -> tuple[Cameras, float | None, list[float] | None, tuple[str, ...]]:
-        with open_archive(self.path) as file:
+        with self._whole(), open_archive(self.path) as file:
             names = tuple(str(name) for name in file.value("views", list))
-            return (
+            cameras, unit, up = (
                 read_cameras(file),
                 file.value("metres_per_unit", float, int, None),
                 file.value("up", list, None),
-                names,
             )
+            if len(names) != len(cameras):
+                raise InputError(f"{len(names)} names of views, and {len(cameras)} cameras")
+            if unit is not None and not 0 < unit < math.inf:
+                raise InputError(f"metres_per_unit: expected a positive number, got {unit}")
+            if up is not None and (len(up) != 3 or not all(isinstance(value, (int, float)) for value in up)):
+                raise InputError(f"up: expected three numbers, got {str(up)[:60]}")
+        return cameras, unit, up, names
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        with about(self.path), advised("remove the file, and it is prepared again"):
+            yield
 
     def close(self) -> None:
         """Lets go of the file, which is opened again when something is asked for."""
@@ -134,13 +151,38 @@ class PreparedScene:
         first, last = int(arrays["rows"][view]), int(arrays["rows"][view + 1])
         crow = np.array(arrays["crow"][first : last + 1])
         start, end = int(crow[0]), int(crow[-1])
-        return ViewRows(
+        found = ViewRows(
             crow=crow - start,
             col=np.array(arrays["col"][start:end]),
             weight=arrays["weight"][start:end].astype(np.float32),
             targets=arrays["row_targets"][first:last].astype(np.float32),
             valid=arrays["row_valid"][first:last].astype(bool),
         )
+        with self._whole():
+            inside = (found.col >= 0) & (found.col < len(self))
+            if not inside.all() or not (found.weight >= 0).all() or not np.isfinite(found.targets).all():
+                raise InputError(f"view {self.view_names[view]!r} has entries that no Blend has")
+        return found
+
+
+def _check_arrays(arrays: Mapping[str, np.ndarray], views: int) -> None:
+    """Whether the arrays fit together, and what is looked at of every Gaussian is sound. Entries of B and targets are
+    looked at where they are used: here that would read the whole file."""
+    sizes = {name: len(array) for name, array in arrays.items()}
+    columns = {name: array.shape[1:] for name, array in arrays.items()}
+    n, rows, crow = sizes["means"], arrays["rows"], arrays["crow"]
+    width = columns["targets"]
+    shapes = [("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ()), ("sh_dc", (3,)), ("weights", ())]
+    good = all(sizes[name] == n and columns[name] == wanted for name, wanted in [*shapes, ("targets", width)])
+    good &= columns["row_targets"] == width
+    good &= sizes["rows"] == views + 1 and bool((np.diff(rows) >= 0).all()) and rows[0] == 0
+    cells = int(rows[-1]) if sizes["rows"] else 0
+    good &= sizes["crow"] == cells + 1 and sizes["row_targets"] == sizes["row_valid"] == cells
+    good = bool(good) and crow[0] == 0 and bool((np.diff(crow) >= 0).all())
+    if not good or not crow[-1] == sizes["col"] == sizes["weight"]:
+        raise InputError("its arrays do not fit together")
+    if not np.isfinite(arrays["means"]).all() or not (arrays["weights"] >= 0).all():
+        raise InputError("it has positions that are not finite, or weights below 0")
 
 
 def write_prepared(

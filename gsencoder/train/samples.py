@@ -18,7 +18,7 @@ from torch.utils.data import Dataset, Sampler
 
 from gsencoder.data.augment import AugmentConfig, augment
 from gsencoder.data.batch import SamplingConfig, choose_part, crop_size, thin_out
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, about
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, Plan, join_plans
 from gsencoder.train.losses import LossConfig
@@ -121,7 +121,8 @@ class SampleDataset(Dataset[Sample]):
         size = crop_size(self.recipe.sampling, step)
         which = int(order[place])
         scene = self.scenes[which]
-        return make_sample(scene, self._codes_of(which), self.recipe, size, rng)
+        with about(f"scene {scene.name}"):
+            return make_sample(scene, self._codes_of(which), self.recipe, size, rng)
 
     def _codes_of(self, which: int) -> Int32[np.ndarray, " N"]:
         """Kinds of a scene's targets. Only so many scenes are kept open: each holds a file descriptor."""
@@ -193,10 +194,7 @@ def make_sample(
     # Code −1 is the last row of these tables, which gives the unseen 0. All kinds are equally often the centre.
     chances = np.append(recipe.rarity.each(1.0), np.float32(0))[codes]
     weights = np.append(recipe.rarity.each(recipe.losses.rarity), np.float32(0))[codes]
-    try:
-        views, selected = choose_part(scene.means, scene.cameras, chances, recipe.sampling, size, rng)
-    except InputError as error:
-        raise InputError(f"scene {scene.name}: {error}") from error
+    views, selected = choose_part(scene.means, scene.cameras, chances, recipe.sampling, size, rng)
     change = recipe.augmentation
     kept = thin_out(selected, change.drop, rng) if change is not None else selected
     voxel = recipe.encoder.voxel / (scene.metres_per_unit or 1.0)

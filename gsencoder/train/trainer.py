@@ -1,6 +1,7 @@
 """The training loop: one step after another, the same on one process or many, and after a kill."""
 
 import math
+import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -57,6 +58,8 @@ class TrainerConfig:
         for name in ("warmup", "weight_decay", "clip", "workers", "seed", "validate_every", "checkpoint_every"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if self.seed >= 1 << 63:
+            raise InputError(f"seed: expected a number below 2⁶³, got {self.seed}")
         if not 0 < self.learning_rate < math.inf:
             raise InputError(f"learning_rate: expected a positive number, got {self.learning_rate}")
         if not 0 <= self.final_rate <= 1:
@@ -129,9 +132,15 @@ class Trainer:
         self.validated: Validated | None = None
         if (folder / CHECKPOINT_FILE).is_file():
             self.state = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
+            if self.state.step > config.steps:
+                raise InputError(
+                    f"{folder / CHECKPOINT_FILE}: stands at step {self.state.step} of {config.steps}; give "
+                    "resume=false to begin anew"
+                )
         # A line that was written for a step whose closing was cut off is written again.
         done = self.state.step - (not self.state.closed)
-        self._log = Log(folder, done=done, events=tensorboard) if place.first else None
+        begun = self.state.step > len(self.state.unlogged)
+        self._log = Log(folder, done=done, events=tensorboard, begun=begun) if place.first else None
         network: nn.Module = torch.compile(encoder, dynamic=True) if config.compile else encoder  # type: ignore[assignment]
         self._parallel: nn.parallel.DistributedDataParallel | None = None
         if place.size > 1:
@@ -216,7 +225,7 @@ class Trainer:
             collate_fn=partial(join_samples, patch=self.encoder.config.transformer.patch),
             num_workers=config.workers,
             multiprocessing_context="spawn" if config.workers else None,
-            worker_init_fn=_one_thread if config.workers else None,
+            worker_init_fn=_begin_worker if config.workers else None,
             prefetch_factor=4 if config.workers else None,
         )
 
@@ -266,6 +275,12 @@ class Trainer:
                 raise one
         if found[-1]:
             raise InputError(STOPPED_ELSEWHERE)
+        if not any(found[:-1]):
+            names = "; ".join(name for batch in batches for name in batch.names)
+            raise InputError(
+                f"training: nothing is compared in {names}: no Gaussian has a target that counts, and no cell of the "
+                "teacher's; look at loss.min_alpha, loss.min_kept and loss.rarity, or at these scenes"
+            )
         return batches, {name: max(count, 1e-12) for name, count in zip(lambdas, found, strict=False)}
 
     def _seed(self, number: int) -> None:
@@ -281,7 +296,7 @@ class Trainer:
         Raises:
             InputError: a loss of any process, or the gradient, is not finite.
         """
-        blame = ""
+        blame = gradient = ""
         for batch, row in zip(batches, parts.tolist(), strict=True):
             for name, value in zip(self.distillation.lambdas, row, strict=True):
                 if not math.isfinite(value):
@@ -289,11 +304,12 @@ class Trainer:
         if not blame and not math.isfinite(norm):
             # Gradients have been summed by now: with several processes any of their samples may be the cause.
             names = "; ".join(name for batch in batches for name in batch.names)
-            blame = f"the gradient of {names}{' or of samples of other processes' if self.place.size > 1 else ''}"
-        flag = parts.new_tensor([float(bool(blame))])
-        *totals, blamed = sum_over_processes(torch.cat((parts.sum(dim=0), flag))).tolist()
-        if blamed:
-            where = blame or "a loss or gradient of another process"
+            gradient = f"the gradient of {names}{' or of samples of other processes' if self.place.size > 1 else ''}"
+        flag = parts.new_tensor([float(bool(blame)), float(bool(gradient))])
+        *totals, blamed, unsure = sum_over_processes(torch.cat((parts.sum(dim=0), flag))).tolist()
+        if blamed or unsure:
+            # A loss says whose it is; a gradient only where no loss does.
+            where = blame or ("a loss of another process" if blamed else gradient)
             raise InputError(
                 f"training: {where} is not finite at step {step}; nothing was changed by it. Lower learning_rate, or "
                 "look at these scenes (`gsencoder inspect`)"
@@ -345,5 +361,10 @@ def _on(batch: Batch, device: torch.device) -> Batch:
     )
 
 
-def _one_thread(worker: int) -> None:  # noqa: ARG001
+def _begin_worker(worker: int) -> None:  # noqa: ARG001
+    """One thread; and a signal to the whole group of processes is left to the training process, which ends its workers
+    once it has saved: a worker that dies first would be an error in the middle of that."""
     torch.set_num_threads(1)
+    for name in ("SIGTERM", "SIGHUP", "SIGINT"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
