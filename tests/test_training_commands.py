@@ -1,9 +1,12 @@
 """`train`, `encode` and `evaluate weights=`, one after the other, as a user runs them."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -255,3 +258,94 @@ def test_the_submitit_launcher_runs_a_sweep_as_jobs(rooms: Path, tmp_path: Path)
     command = [sys.executable, "-W", "ignore", "-m", "gsencoder", *asked, *quick, *launcher, "train.steps=1,2"]
     subprocess.run(command, check=True, timeout=500)
     assert [summary_of(out / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
+
+
+def test_two_scenes_of_one_name_are_refused_and_one_scene_named_twice_is_taken_once(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(rooms / "room_0", tmp_path / name / "room")
+    both = [str(tmp_path / "a" / "room"), str(tmp_path / "b" / "room")]
+    told = refusal(capsys, "encode", *both, f"weights={trained}", f"out={tmp_path / 'out'}")
+    assert "are both called 'room'" in told
+    assert not (tmp_path / "out").exists()
+    twice = [str(rooms / "room_0"), str(rooms / "." / ".." / rooms.name / "room_0")]
+    assert cli.main(["encode", *twice, f"weights={trained}", f"out={tmp_path / 'out'}", "quiet=true"]) == 0
+    assert (tmp_path / "out" / "features.safetensors").is_file()
+
+
+def test_weights_are_not_replaced_by_what_they_make(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "encoder"
+    shutil.copytree(trained, own)
+    told = refusal(capsys, "encode", str(rooms / "room_0"), f"weights={own}", f"out={own}", "overwrite=true")
+    assert "holds the input weights=" in told
+    assert (own / "encoder.safetensors").is_file()
+
+
+def test_folders_that_a_training_did_not_make_are_left_alone(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes = [str(rooms / f"room_{number}") for number in range(2)]
+    prepared = f"prepared={trained.with_name('encoder.prepared')}"
+    common = ["train", *scenes, f"teacher.words={rooms / 'words.safetensors'}", *QUICK[1:], "tensorboard=false"]
+    notes = tmp_path / "mine.training" / "notes.txt"
+    notes.parent.mkdir()
+    notes.touch()
+    for more in ((), ("resume=false",)):
+        assert "holds something else" in refusal(capsys, *common, prepared, f"out={tmp_path / 'mine'}", *more)
+    assert notes.is_file()
+    for inside in ("run", "run/prepared", "run.training", "run.training/prepared"):
+        told = refusal(capsys, *common, f"prepared={tmp_path / inside}", f"out={tmp_path / 'run'}")
+        assert "give another folder" in told
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.tex").touch()
+    told = refusal(capsys, *common, f"prepared={foreign}", f"out={tmp_path / 'run'}")
+    assert "something else than prepared scenes" in told
+    assert [path.name for path in foreign.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "train.seed=99999999999999999999",
+        "model.transformer.mlp_ratio=1e12",
+        "model.transformer.encoder_channels=32,32,32,32,32000000000",
+        "model.transformer.encoder_depths=1,1,1,1,300000",
+        "augment.turn=1e308",
+        "loss.rarity=1000",
+        "loss.cosine=0 loss.smooth_l1=0 loss.contrast_weight=0",
+    ],
+)
+def test_sizes_that_nobody_means_are_refused_before_the_work(
+    rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str
+) -> None:
+    told = refusal(capsys, "train", str(rooms / "room_0"), *setting.split(), f"out={tmp_path / 'out'}")
+    assert setting.partition("=")[0].rpartition(".")[2] in told
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_to_all_processes_of_a_training_leaves_a_checkpoint(
+    rooms: Path, trained: Path, tmp_path: Path
+) -> None:
+    """As SLURM and container runtimes end a job: the workers get it, too."""
+    scenes = [str(rooms / f"room_{number}") for number in range(2)]
+    quick = [word for word in QUICK if not word.startswith(("train.steps", "train.log_every"))]
+    common = ["train", *scenes, f"teacher.words={rooms / 'words.safetensors'}", *quick, "train.workers=1"]
+    places = [f"prepared={trained.with_name('encoder.prepared')}", f"out={tmp_path / 'run'}"]
+    words = [*common, *places, "train.steps=5000", "train.log_every=1", "tensorboard=false"]
+    running = subprocess.Popen(
+        [sys.executable, "-m", "gsencoder", *words], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    log, deadline = tmp_path / "run.training" / "log.csv", time.monotonic() + 180
+    while time.monotonic() < deadline and running.poll() is None:
+        if log.is_file() and len(log.read_text().splitlines()) > 5:
+            break
+        time.sleep(0.05)
+    os.killpg(running.pid, signal.SIGTERM)
+    _, told = running.communicate(timeout=60)
+    assert running.returncode == 143, told
+    assert "Traceback" not in told
+    assert (tmp_path / "run.training" / "checkpoint.safetensors").is_file()

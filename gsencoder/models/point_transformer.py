@@ -70,12 +70,10 @@ class TransformerConfig:
             raise InputError(f"drop_path: expected a share in [0, 1), got {self.drop_path}")
         if not 0 < self.mlp_ratio <= MOST_RATIO:
             raise InputError(f"mlp_ratio: expected a number above 0 and at most {MOST_RATIO}, got {self.mlp_ratio}")
-        widest, deepest = (*self.encoder_channels, *self.decoder_channels), (*self.encoder_depths, *self.decoder_depths)
-        if max(widest) > MOST_CHANNELS or max(deepest) > MOST_BLOCKS:
-            raise InputError(
-                f"channels and depths: expected at most {MOST_CHANNELS} and {MOST_BLOCKS}, got {max(widest)} and "
-                f"{max(deepest)}"
-            )
+        for ways, most in (("channels", MOST_CHANNELS), ("depths", MOST_BLOCKS)):
+            for name in (f"encoder_{ways}", f"decoder_{ways}"):
+                if max(getattr(self, name), default=0) > most:
+                    raise InputError(f"{name}: expected at most {most} a level, got {max(getattr(self, name))}")
 
     @property
     def levels(self) -> int:

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from gsencoder.data.archive import first_difference, open_archive, write_archive
+from gsencoder.data.archive import Archive, first_difference, open_archive, write_archive
 from gsencoder.errors import InputError, advised
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
@@ -91,25 +91,19 @@ def load_checkpoint(
                 key: torch.from_numpy(file.array(f"optimizer.{key}.{name}", "float32", size).copy())
                 for key, size in keys
             }
-        state = TrainingState(
-            step=file.value("step", int),
-            seconds=float(file.value("seconds", float, int)),
-            unlogged=tuple(file.value("unlogged", list)),
-            closed=file.value("closed", bool),
-        )
-        _check_state(state)
+        state = _state_in(file)
     model.load_state_dict(parameters)
     for parameter, values in moments.items():
         optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in values.items()}
     return state
 
 
-def _check_state(state: TrainingState) -> None:
+def _state_in(file: Archive) -> TrainingState:
+    step, seconds, unlogged = file.value("step", int), file.value("seconds", float, int), file.value("unlogged", list)
+    closed: bool = file.value("closed", bool)
     numbers = all(
-        isinstance(row, dict) and all(isinstance(value, (int, float)) for value in row.values())
-        for row in state.unlogged
+        isinstance(row, dict) and all(isinstance(value, (int, float)) for value in row.values()) for row in unlogged
     )
-    if state.step < 1 or not 0 <= state.seconds < math.inf or not numbers or not (state.unlogged or state.closed):
-        raise InputError(
-            f"a state that no run was in (step {state.step}, {len(state.unlogged)} steps that are not logged)"
-        )
+    if step < 1 or not 0 <= seconds < math.inf or not numbers or not (unlogged or closed):
+        raise InputError(f"a state that no run was in (step {step}, {len(unlogged)} steps that are not logged)")
+    return TrainingState(step=step, seconds=float(seconds), unlogged=tuple(unlogged), closed=closed)

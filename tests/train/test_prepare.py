@@ -1,17 +1,22 @@
 """Preparation: one space for all scenes, whole files, and no mixing of two datasets."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 from training_scenes import PREPARE, SPACE, TABLE, DenseSideTeacher, SideTeacher, prepared, scene
 
+from gsencoder.data.archive import write_archive
 from gsencoder.errors import InputError
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.tracking import untracked
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.prepare import RARITY_FILE, SETTINGS_FILE, SPACE_FILE, PreparedDataset
+from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.rarity import Rarity, cluster_targets, count_targets, nearest_codes
 from gsencoder.types import FeatureSpace
 
@@ -99,6 +104,104 @@ def test_a_damaged_scene_is_told_with_its_file(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(InputError, match=str(path)):
         len(dataset.scenes(names)[0])
+
+
+def set_nan(array: np.ndarray) -> None:
+    array[3] = np.nan
+
+
+def set_negative(array: np.ndarray) -> None:
+    array[3] = -1
+
+
+def set_too_large(array: np.ndarray) -> None:
+    array[3] = 10_000
+
+
+def clear(array: np.ndarray) -> None:
+    array[:] = 0
+
+
+def turn_round(array: np.ndarray) -> None:
+    array[:] = array[::-1].copy()
+
+
+def look_at_all(one: PreparedScene) -> None:
+    for view in range(len(one.cameras)):
+        one.view(view)
+
+
+def rewrite(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Other arrays under the header that the file has."""
+    with safe_open(path, framework="numpy") as file:
+        header = file.metadata()
+    save_file(arrays, path, header)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("means", set_nan),
+        ("weights", set_nan),
+        ("weights", set_negative),
+        ("weight", set_nan),
+        ("weight", set_negative),
+        ("crow", clear),
+        ("crow", turn_round),
+        ("rows", clear),
+        ("rows", turn_round),
+        ("col", set_negative),
+        ("col", set_too_large),
+        ("row_targets", set_nan),
+    ],
+)
+def test_values_that_no_preparation_writes_are_told_with_the_file_and_what_to_do(
+    tmp_path: Path, name: str, change: Callable[[np.ndarray], None]
+) -> None:
+    dataset, names = prepared(tmp_path, count=1)
+    path = dataset.path_of(names[0])
+    arrays = load_file(path)
+    change(arrays[name])
+    rewrite(path, arrays)
+    with pytest.raises(InputError, match=rf"{path}: .*; remove the file, and it is prepared again$"):
+        look_at_all(dataset.scenes(names)[0])
+
+
+@pytest.mark.parametrize("name", ["quats", "targets", "weights", "crow", "col", "row_valid", "means"])
+def test_arrays_that_do_not_fit_together_are_told_with_the_file(tmp_path: Path, name: str) -> None:
+    dataset, names = prepared(tmp_path, count=1)
+    path = dataset.path_of(names[0])
+    arrays = load_file(path)
+    rewrite(path, {**arrays, name: arrays[name][:-1].copy()})
+    with pytest.raises(InputError, match=rf"{path}: its arrays do not fit together; remove the file"):
+        len(dataset.scenes(names)[0])
+
+
+@pytest.mark.parametrize("text", ["null", "[]", "3", '"x"', "[" * 100_000])
+def test_settings_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
+    prepared(tmp_path, count=1)
+    (tmp_path / SETTINGS_FILE).write_text(text)
+    with pytest.raises(InputError, match=rf"{SETTINGS_FILE}: .*give another folder as prepared="):
+        PreparedDataset(tmp_path, {"made": "for a test"})
+
+
+def test_scenes_whose_settings_or_space_are_gone_are_not_taken_for_new_ones(tmp_path: Path) -> None:
+    dataset, _ = prepared(tmp_path, count=1)
+    (tmp_path / SPACE_FILE).unlink()
+    with pytest.raises(InputError, match="not the space that they were prepared for"):
+        dataset.find_space([Path("wall_0")], lambda path: (scene(0), SideTeacher()), PREPARE)
+    (tmp_path / SETTINGS_FILE).unlink()
+    with pytest.raises(InputError, match=rf"something else than prepared scenes \(no {SETTINGS_FILE}\)"):
+        PreparedDataset(tmp_path, {"made": "for a test"})
+
+
+@pytest.mark.parametrize("columns", [3, 5])
+def test_kinds_of_another_width_are_refused(tmp_path: Path, columns: int) -> None:
+    dataset, _ = prepared(tmp_path, count=1)
+    arrays = {"codebook": np.zeros((2, columns), np.float32), "counts": np.ones(2)}
+    write_archive(tmp_path / RARITY_FILE, arrays, {})
+    with pytest.raises(InputError, match="remove the file, and it is counted again"):
+        dataset.load_rarity()
 
 
 def test_scenes_of_two_spaces_are_refused() -> None:

@@ -1,5 +1,6 @@
 """The loop: it learns, it goes on after a kill, it does the same on several processes, and it stops before harm."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,17 +9,20 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.numpy import load_file
 from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
-from gsencoder.data.archive import open_archive
-from gsencoder.errors import InputError
+from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.errors import InputError, SceneWarning
 from gsencoder.train.checkpoint import CHECKPOINT_FILE
 from gsencoder.train.log import LOG_FILE, read_log
+from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.trainer import Trainer, TrainerConfig, Validated
 
@@ -146,6 +150,58 @@ def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, 
     trainer(dataset, tmp_path).run()
     with pytest.raises(InputError, match=r"was made with run=1, and this run asks run=2"):
         Trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
+
+
+def header_of(path: Path) -> dict[str, Any]:
+    with safe_open(path, framework="numpy") as file:
+        found: dict[str, Any] = json.loads(file.metadata()["gsencoder"])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("step", -5),
+        ("step", 0),
+        ("step", 1000),
+        ("seconds", -1.0),
+        ("unlogged", [3]),
+        ("unlogged", [{"loss": "x"}]),
+        ("closed", False),
+        ("moved", "all"),
+    ],
+)
+def test_a_state_that_no_run_was_in_is_refused(dataset: Prepared, tmp_path: Path, key: str, value: object) -> None:
+    trainer(dataset, tmp_path).run()
+    path = tmp_path / CHECKPOINT_FILE
+    header = header_of(path)
+    assert header["unlogged"] == []
+    write_archive(path, load_file(path), {**header, key: value})
+    with pytest.raises(InputError, match="give resume=false"):
+        trainer(dataset, tmp_path)
+
+
+def test_a_checkpoint_without_moments_is_refused(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path).run()
+    path = tmp_path / CHECKPOINT_FILE
+    arrays = {name: array for name, array in load_file(path).items() if not name.startswith("optimizer.step")}
+    write_archive(path, arrays, header_of(path))
+    with pytest.raises(InputError, match=r"'optimizer\.step\..*' is missing"):
+        trainer(dataset, tmp_path)
+
+
+def test_a_log_that_is_gone_is_told(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path).run()
+    (tmp_path / LOG_FILE).unlink()
+    with pytest.warns(SceneWarning, match=r"log\.csv: is gone; the log begins again at step 8"):
+        trainer(dataset, tmp_path)
+
+
+def test_a_training_that_compares_nothing_is_refused(dataset: Prepared, tmp_path: Path) -> None:
+    strict = LossConfig(field_weight=0.0, render_weight=1.0, min_alpha=1.0, min_kept=1.0)
+    nothing = samples(*dataset, losses=strict)
+    with pytest.raises(InputError, match=r"nothing is compared in wall_\d"):
+        Trainer(small_encoder(), nothing, strict, SHORT, folder=tmp_path, settings={}).run()
 
 
 def test_micro_batches_add_up_to_the_batch(dataset: Prepared, tmp_path: Path) -> None:
