@@ -82,7 +82,7 @@ def _coded_space(
     table: Float32[np.ndarray, "C D"], teacher: Teacher, config: FuseConfig
 ) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"]]:
     mean = teacher.mean if teacher.mean is not None else table.mean(axis=0)
-    scale = float(np.sqrt(np.square(table - mean, dtype=np.float64).sum(axis=1).mean()))
+    scale = _scale(np.square(table - mean, dtype=np.float64).sum(axis=1).mean(), teacher)
     wanted = config.basis and teacher.space.channels > config.narrow
     basis = table_basis(table, mean, teacher.space, energy=config.table_energy) if wanted else None
     space = OutputSpace(space=teacher.space, mean=mean, scale=scale, basis=basis)
@@ -92,10 +92,24 @@ def _coded_space(
 def _dense_space(moments: Moments, teacher: Teacher, config: FuseConfig) -> OutputSpace:
     # The mean of what was looked at, and not one that the teacher states: moments are taken about it.
     mean, covariance = moments.mean.astype(np.float32), moments.covariance()
+    scale = _scale(np.trace(covariance), teacher)
     basis = None
     if config.basis and teacher.space.channels > config.narrow:
         basis = fit_basis(
             mean.astype(np.float64), covariance, teacher.space, energy=config.energy, max_rank=config.max_rank
         )
-    scale = float(np.sqrt(np.trace(covariance)))
     return OutputSpace(space=teacher.space, mean=mean, scale=scale, basis=basis)
+
+
+def _scale(variance: float, teacher: Teacher) -> float:
+    """Root of the mean squared distance from the mean.
+
+    Raises:
+        InputError: there is none, so there is nothing to tell apart.
+    """
+    if not variance > 0:
+        raise InputError(
+            f"training: the teacher ({teacher.space.describe()}) gives the same features everywhere in these scenes; "
+            "there is nothing to learn. Look at their pictures, and at what the teacher says of them (`gsencoder fuse`)"
+        )
+    return float(np.sqrt(variance))

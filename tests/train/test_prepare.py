@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.prepare import RARITY_FILE, SETTINGS_FILE, SPACE_FILE, PreparedDataset
 from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.rarity import Rarity, cluster_targets, count_targets, nearest_codes
-from gsencoder.types import FeatureSpace
+from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 
 def test_targets_are_the_fused_features_in_standard_units(tmp_path: Path) -> None:
@@ -225,6 +226,17 @@ def test_the_space_of_a_dense_teacher_has_the_moments_of_its_maps() -> None:
     assert outputs.basis is not None
     assert outputs.basis.rank == 1  # Two vectors lie on one line.
     assert outputs.space == SPACE
+
+
+def test_a_teacher_that_says_the_same_everywhere_is_refused() -> None:
+    class Blind(DenseSideTeacher):
+        def feature_map(self, views: Views, view: int) -> FeatureMap:
+            seen = super().feature_map(views, view)
+            assert seen.features is not None
+            return replace(seen, features=np.ones_like(seen.features))
+
+    with pytest.raises(InputError, match="gives the same features everywhere"):
+        dataset_space([Path("a")], lambda path: (scene(0), Blind()), FuseConfig(), views=2)
 
 
 def test_rarity_gives_each_kind_its_power_of_the_count_and_a_mean_of_one() -> None:
