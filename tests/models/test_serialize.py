@@ -105,7 +105,7 @@ def test_cells_are_anchored_so_that_a_part_falls_into_the_cells_of_the_whole() -
 def test_a_cloud_may_spread_over_almost_a_million_cells_but_no_further() -> None:
     ends = torch.tensor([[0.0, 0, 0], [LARGEST_EXTENT - 1.5, 0, 0]])
     assert cells_of(ends, 1.0).max() < LARGEST_EXTENT + ALIGN
-    with pytest.raises(InputError, match="larger voxel"):
+    with pytest.raises(InputError, match="check the unit"):
         cells_of(torch.tensor([[0.0, 0, 0], [LARGEST_EXTENT + 0.0, 0, 0]]), 1.0)
 
 
