@@ -64,6 +64,25 @@ class Batch(NamedTuple):
     loss_weights: Float[Tensor, " N"]
     rows: Rows
 
+    def to(self, device: torch.device) -> "Batch":
+        """The same on a device."""
+        if self.attributes.device == device:
+            return self
+
+        def move(value: Tensor) -> Tensor:
+            return value.to(device, non_blocking=True)
+
+        return Batch(
+            names=self.names,
+            attributes=move(self.attributes),
+            opacities=move(self.opacities),
+            plan=self.plan.to(device),
+            targets=move(self.targets),
+            codes=move(self.codes),
+            loss_weights=move(self.loss_weights),
+            rows=Rows(*map(move, self.rows)),
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleRecipe:

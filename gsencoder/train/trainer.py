@@ -243,7 +243,7 @@ class Trainer:
             if self._parallel is not None:
                 self._parallel.require_backward_grad_sync = micro + 1 == len(batches)
             with torch.autocast(self.device.type, self._autocast, enabled=self._autocast is not None):
-                terms = self.distillation(_on(batch, self.device))
+                terms = self.distillation(batch.to(self.device))
             shares = torch.stack([terms[name] / divisors[name] for name in lambdas])
             loss = (shares * shares.new_tensor(list(lambdas.values()))).sum()
             # Gradients of several processes are averaged; what is wanted is their sum.
@@ -340,25 +340,6 @@ def _groups(encoder: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
     matrices = [value for value in encoder.parameters() if value.ndim > 1]
     rest = [value for value in encoder.parameters() if value.ndim <= 1]
     return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
-
-
-def _on(batch: Batch, device: torch.device) -> Batch:
-    if device.type == "cpu":
-        return batch
-
-    def move(value: Tensor) -> Tensor:
-        return value.to(device, non_blocking=True)
-
-    return Batch(
-        names=batch.names,
-        attributes=move(batch.attributes),
-        opacities=move(batch.opacities),
-        plan=batch.plan.to(device),
-        targets=move(batch.targets),
-        codes=move(batch.codes),
-        loss_weights=move(batch.loss_weights),
-        rows=type(batch.rows)(*map(move, batch.rows)),
-    )
 
 
 def _begin_worker(worker: int) -> None:  # noqa: ARG001
