@@ -4,6 +4,8 @@ It says what B is in few lines and in float64 serves tests as a check of the num
 runs until kernels are at hand.
 """
 
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
@@ -27,14 +29,54 @@ def blend_weights(
         stop: transmittance at which a ray ends, the Gaussian that would cross it excluded.
         keep: smallest weight stored.
     """
-    device = opacities.device
+    rows, cols, weights = [], [], []
+    side = lattice.side
+    for rays, members in _tiles(projected, lattice):
+        w = _composite(projected, opacities, members, _pixels(rays, lattice, opacities), stop)
+        cell = (rays[:, 1] // side) * lattice.width + rays[:, 0] // side
+        cells, slot = torch.unique(cell, return_inverse=True)
+        pooled = w.new_zeros(len(cells), len(members)).index_add_(0, slot, w) / side**2
+        at, member = (pooled >= keep if keep > 0 else pooled > 0).nonzero(as_tuple=True)
+        rows.append(cells[at])
+        cols.append(members[member])
+        weights.append(pooled[at, member])
+    row, col, weight = torch.cat(rows), torch.cat(cols), torch.cat(weights)
+    # Tiles emit whole rows in depth order; a stable sort by row only interleaves tiles.
+    order = torch.argsort(row, stable=True)
+    crow = torch.zeros(lattice.rows + 1, dtype=torch.int64, device=row.device)
+    crow[1:] = torch.bincount(row, minlength=lattice.rows).cumsum(0)
+    return crow, col[order].to(torch.int32), weight[order]
+
+
+def composite(
+    projected: Projected, opacities: Float[Tensor, " N"], values: Float[Tensor, "N D"], lattice: Lattice, *, stop: float
+) -> Float[Tensor, "P D"]:
+    """B @ values for single rays, differentiable in the geometry as well: the twin of raster_cpu.py.
+
+    Args:
+        projected: see geometry.project.
+        opacities: of the same N Gaussians.
+        values: what is composited.
+        lattice: where the rays are, one a row.
+        stop: transmittance at which a ray ends, the Gaussian that would cross it excluded.
+    """
+    rows, parts = [], []
+    for rays, members in _tiles(projected, lattice):
+        w = _composite(projected, opacities, members, _pixels(rays, lattice, opacities), stop)
+        rows.append(rays[:, 1] * lattice.width + rays[:, 0])
+        parts.append(w @ values[members])
+    return torch.cat(parts)[torch.argsort(torch.cat(rows))]
+
+
+def _tiles(projected: Projected, lattice: Lattice) -> Iterator[tuple[Int64[Tensor, "rays 2"], Int64[Tensor, " n"]]]:
+    """The rays (column, line) of each tile, and the Gaussians whose ellipse may touch it, front to back."""
+    device, dtype = projected.depths.device, projected.depths.dtype
     valid = projected.valid.nonzero().squeeze(1)
     order = valid[torch.argsort(projected.depths[valid], stable=True)]
-    origin = torch.tensor([lattice.x0, lattice.y0], device=device, dtype=opacities.dtype)
-    step = torch.tensor([lattice.dx, lattice.dy], device=device, dtype=opacities.dtype)
+    origin = torch.tensor([lattice.x0, lattice.y0], device=device, dtype=dtype)
+    step = torch.tensor([lattice.dx, lattice.dy], device=device, dtype=dtype)
     low = (projected.means2d - projected.extents - origin) / step
     high = (projected.means2d + projected.extents - origin) / step
-    rows, cols, weights = [], [], []
     tile, side = lattice.tile, lattice.side
     for v0 in range(0, lattice.height * side, tile):
         v1 = min(v0 + tile, lattice.height * side)
@@ -44,21 +86,12 @@ def blend_weights(
             members = line[(low[line, 0] <= u1 - 1) & (high[line, 0] >= u0)]
             u = torch.arange(u0, u1, device=device)
             v = torch.arange(v0, v1, device=device)
-            rays = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1).reshape(-1, 2)
-            w = _composite(projected, opacities, members, rays * step + origin, stop)
-            cell = (rays[:, 1] // side) * lattice.width + rays[:, 0] // side
-            cells, slot = torch.unique(cell, return_inverse=True)
-            pooled = w.new_zeros(len(cells), len(members)).index_add_(0, slot, w) / side**2
-            at, member = (pooled >= keep if keep > 0 else pooled > 0).nonzero(as_tuple=True)
-            rows.append(cells[at])
-            cols.append(members[member])
-            weights.append(pooled[at, member])
-    row, col, weight = torch.cat(rows), torch.cat(cols), torch.cat(weights)
-    # Tiles emit whole rows in depth order; a stable sort by row only interleaves tiles.
-    order = torch.argsort(row, stable=True)
-    crow = torch.zeros(lattice.rows + 1, dtype=torch.int64, device=device)
-    crow[1:] = torch.bincount(row, minlength=lattice.rows).cumsum(0)
-    return crow, col[order].to(torch.int32), weight[order]
+            yield torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1).reshape(-1, 2), members
+
+
+def _pixels(rays: Int64[Tensor, "rays 2"], lattice: Lattice, like: Tensor) -> Float[Tensor, "rays 2"]:
+    """Where rays pierce the image."""
+    return rays * like.new_tensor([lattice.dx, lattice.dy]) + like.new_tensor([lattice.x0, lattice.y0])
 
 
 def _composite(projected: Projected, opacities: Tensor, members: Tensor, rays: Tensor, stop: float) -> Tensor:

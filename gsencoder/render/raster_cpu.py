@@ -1,0 +1,310 @@
+"""Compositing that is differentiable in the geometry, on a CPU: numba kernels; the plain twin is in reference.py.
+
+Unlike a Blend, nothing is stored a pixel: the backward pass walks the same tiles front to back again. With
+v_i = Σ_c ∂L/∂out_c · value_ic and S = Σ_i w_i v_i over a ray, the light that comes from behind Gaussian i is
+S − Σ_{j≤i} w_j v_j, and
+
+    ∂L/∂α_i = T_i v_i − (S − Σ_{j≤i} w_j v_j) / (1 − α_i).
+
+Along a line of pixels exp(−quadratic) is a product of two geometric sequences, as in cpu.py.
+"""
+
+import math
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from jaxtyping import Float, Float64, Int32, Int64
+
+from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
+from gsencoder.render.threads import PIECES, even_cuts, kernel, parallel
+
+TILE = 16
+CHANNELS = 5
+"""What is composited of each Gaussian: three colours, depth, and 1 (whose sum is alpha)."""
+SPLAT = 9
+"""Columns of a splat on the image plane: u, v, half width, half height, conic a, b, c, squared radius, opacity."""
+PARTIAL = 10
+"""Partial derivatives of a splat: by u, v, conic a, b, c, opacity, and the four values."""
+
+
+class Tiles(NamedTuple):
+    """Which splats touch which tiles, front to back.
+
+    Attributes:
+        starts: first entry of each tile in `members`, row-major, and the number of all.
+        members: splats of each tile by depth.
+        owners: first entry of each splat in `entries`, and the number of all.
+        entries: where in `members` each splat stands.
+    """
+
+    starts: Int64[np.ndarray, " tiles_plus_1"]
+    members: Int32[np.ndarray, " entries"]
+    owners: Int64[np.ndarray, " M_plus_1"]
+    entries: Int64[np.ndarray, " entries"]
+
+
+@kernel
+@no_type_check
+def _bin_splats(splats, order, tiles_x, tiles_y, width, height):
+    n = len(order)
+    bounds = np.empty((n, 4), np.int32)
+    starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    owners = np.zeros(n + 1, np.int64)
+    for g in range(n):
+        u, v, hu, hv = splats[g, 0], splats[g, 1], splats[g, 2], splats[g, 3]
+        # Pixel i is hit at i + ½. Bounds are clipped as floats: what lies far outside overflows an integer.
+        u0, u1 = max(np.ceil(u - hu - 0.5), 0.0), min(np.floor(u + hu - 0.5), width - 1.0)
+        v0, v1 = max(np.ceil(v - hv - 0.5), 0.0), min(np.floor(v + hv - 0.5), height - 1.0)
+        if not (u0 <= u1 and v0 <= v1):
+            bounds[g, 0], bounds[g, 1], bounds[g, 2], bounds[g, 3] = 0, -1, 0, -1
+            continue
+        bounds[g, 0], bounds[g, 1] = int(u0) // TILE, int(u1) // TILE
+        bounds[g, 2], bounds[g, 3] = int(v0) // TILE, int(v1) // TILE
+        owners[g + 1] = (bounds[g, 1] - bounds[g, 0] + 1) * (bounds[g, 3] - bounds[g, 2] + 1)
+        for y in range(bounds[g, 2], bounds[g, 3] + 1):
+            for x in range(bounds[g, 0], bounds[g, 1] + 1):
+                starts[y * tiles_x + x + 1] += 1
+    for t in range(tiles_x * tiles_y):
+        starts[t + 1] += starts[t]
+    for g in range(n):
+        owners[g + 1] += owners[g]
+    where = starts[:-1].copy()
+    members, entries = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
+    for k in range(n):
+        g = order[k]
+        at = owners[g]
+        for y in range(bounds[g, 2], bounds[g, 3] + 1):
+            for x in range(bounds[g, 0], bounds[g, 1] + 1):
+                t = y * tiles_x + x
+                members[where[t]] = g
+                entries[at] = where[t]
+                where[t] += 1
+                at += 1
+    return starts, members, owners, entries
+
+
+def bin_splats(splats: Float[np.ndarray, "M 9"], depths: Float[np.ndarray, " M"], width: int, height: int) -> Tiles:
+    """Sorts splats into the tiles that their ellipses may touch; equal depths keep their order."""
+    order = np.argsort(depths, kind="stable").astype(np.int32)
+    return Tiles(*_bin_splats(splats, order, -(-width // TILE), -(-height // TILE), float(width), float(height)))
+
+
+@kernel
+@no_type_check
+def _row_span(a, b, c, u, dv, limit, last):
+    """First and last pixel of a row `dv` below a centre at `u` that lie in the ellipse; first > last if none does."""
+    root = b * b * dv * dv - a * (c * dv * dv - limit)
+    if not root >= 0:
+        return 0, -1
+    half, middle = math.sqrt(root) / a, u - b * dv / a
+    first, final = max(np.ceil(middle - half), 0.0), min(np.floor(middle + half), last)
+    if not first <= final:
+        return 0, -1
+    return int(first), int(final)
+
+
+@kernel
+@no_type_check
+def _composite(first, last, starts, members, splats, values, size, stop, out):
+    """out[y, x] = Σ w·(values, 1) in tiles [first, last), front to back."""
+    width, height, tiles_x = size
+    light = np.empty((TILE, TILE), np.float64)
+    sums = np.empty((TILE, TILE, CHANNELS), np.float64)
+    for t in range(first, last):
+        left, top = (t % tiles_x) * TILE, (t // tiles_x) * TILE
+        end_u, end_v = min(TILE, width - left), min(TILE, height - top)
+        light[:] = 1.0
+        sums[:] = 0.0
+        open_rays = end_u * end_v
+        for m in range(starts[t], starts[t + 1]):
+            g = members[m]
+            u, v, hv = splats[g, 0] - left - 0.5, splats[g, 1] - top - 0.5, splats[g, 3]
+            a, b, c, limit, opacity = splats[g, 4], splats[g, 5], splats[g, 6], splats[g, 7], splats[g, 8]
+            low, high = max(np.ceil(v - hv), 0.0), min(np.floor(v + hv), end_v - 1.0)
+            if not low <= high:
+                continue
+            v0, v1, v2, v3 = values[g, 0], values[g, 1], values[g, 2], values[g, 3]
+            falloff = math.exp(-a)
+            for j in range(int(low), int(high) + 1):
+                dv = j - v
+                u0, u1 = _row_span(a, b, c, u, dv, limit, end_u - 1.0)
+                if u0 > u1:
+                    continue
+                du = u0 - u
+                value = opacity * math.exp(-0.5 * (a * du * du + c * dv * dv) - b * du * dv)
+                ratio = math.exp(-a * (du + 0.5) - b * dv) if u1 > u0 else 0.0
+                for i in range(u0, u1 + 1):
+                    alpha = min(value, ALPHA_MAX)
+                    value *= ratio
+                    ratio *= falloff
+                    before = light[j, i]
+                    # A negative transmittance marks a ray that has stopped.
+                    if alpha < ALPHA_MIN or before < 0:
+                        continue
+                    after = before * (1.0 - alpha)
+                    if after <= stop:
+                        light[j, i] = -1.0
+                        open_rays -= 1
+                        continue
+                    light[j, i] = after
+                    w = alpha * before
+                    cell = sums[j, i]
+                    cell[0] += w * v0
+                    cell[1] += w * v1
+                    cell[2] += w * v2
+                    cell[3] += w * v3
+                    cell[4] += w
+            if open_rays == 0:
+                break
+        for j in range(end_v):
+            for i in range(end_u):
+                for k in range(CHANNELS):
+                    out[top + j, left + i, k] = sums[j, i, k]
+
+
+def composite(
+    tiles: Tiles,
+    splats: Float[np.ndarray, "M 9"],
+    values: Float[np.ndarray, "M 4"],
+    width: int,
+    height: int,
+    stop: float,
+) -> Float64[np.ndarray, "H W 5"]:
+    """Σ w·value for each of the four values of the splats, and Σ w, at every pixel."""
+    out = np.empty((height, width, CHANNELS), np.float64)
+    cuts = even_cuts(tiles.starts)
+    size = (width, height, -(-width // TILE))
+    arrays = (tiles.starts, tiles.members, splats, values, size, stop, out)
+    parallel(lambda piece: _composite(cuts[piece], cuts[piece + 1], *arrays), range(PIECES))
+    return out
+
+
+@kernel
+@no_type_check
+def _differentiate(first, last, starts, members, splats, values, size, stop, out, grads, partials):
+    """partials[entry] = derivatives of the loss by the splat of each entry of tiles [first, last)."""
+    width, height, tiles_x = size
+    light = np.empty((TILE, TILE), np.float64)
+    behind = np.empty((TILE, TILE), np.float64)
+    slope = np.empty((TILE, TILE, CHANNELS), np.float64)
+    for t in range(first, last):
+        left, top = (t % tiles_x) * TILE, (t // tiles_x) * TILE
+        end_u, end_v = min(TILE, width - left), min(TILE, height - top)
+        light[:] = 1.0
+        for j in range(end_v):
+            for i in range(end_u):
+                total = 0.0
+                for k in range(CHANNELS):
+                    slope[j, i, k] = grads[top + j, left + i, k]
+                    total += slope[j, i, k] * out[top + j, left + i, k]
+                behind[j, i] = total
+        open_rays = end_u * end_v
+        for m in range(starts[t], starts[t + 1]):
+            if open_rays == 0:
+                partials[m] = 0.0
+                continue
+            g = members[m]
+            u, v, hv = splats[g, 0] - left - 0.5, splats[g, 1] - top - 0.5, splats[g, 3]
+            a, b, c, limit, opacity = splats[g, 4], splats[g, 5], splats[g, 6], splats[g, 7], splats[g, 8]
+            v0, v1, v2, v3 = values[g, 0], values[g, 1], values[g, 2], values[g, 3]
+            low, high = max(np.ceil(v - hv), 0.0), min(np.floor(v + hv), end_v - 1.0)
+            falloff = math.exp(-a)
+            by_u = by_v = by_a = by_b = by_c = by_opacity = 0.0
+            by_0 = by_1 = by_2 = by_3 = 0.0
+            for j in range(int(low), int(high) + 1):
+                dv = j - v
+                u0, u1 = _row_span(a, b, c, u, dv, limit, end_u - 1.0)
+                if u0 > u1:
+                    continue
+                du = u0 - u
+                value = opacity * math.exp(-0.5 * (a * du * du + c * dv * dv) - b * du * dv)
+                ratio = math.exp(-a * (du + 0.5) - b * dv) if u1 > u0 else 0.0
+                # Sums of ∂L/∂(−quadratic) over the row, alone and times du and du².
+                s0 = s1 = s2 = 0.0
+                for i in range(u0, u1 + 1):
+                    alpha = min(value, ALPHA_MAX)
+                    clamped = value > ALPHA_MAX
+                    value *= ratio
+                    ratio *= falloff
+                    before = light[j, i]
+                    if alpha < ALPHA_MIN or before < 0:
+                        continue
+                    after = before * (1.0 - alpha)
+                    if after <= stop:
+                        light[j, i] = -1.0
+                        open_rays -= 1
+                        continue
+                    light[j, i] = after
+                    w = alpha * before
+                    line = slope[j, i]
+                    worth = line[0] * v0 + line[1] * v1 + line[2] * v2 + line[3] * v3 + line[4]
+                    by_0 += w * line[0]
+                    by_1 += w * line[1]
+                    by_2 += w * line[2]
+                    by_3 += w * line[3]
+                    rest = behind[j, i] - w * worth
+                    behind[j, i] = rest
+                    if not clamped:
+                        change = alpha * (before * worth - rest / (1.0 - alpha))
+                        du = i - u
+                        s0 += change
+                        s1 += change * du
+                        s2 += change * du * du
+                by_u += a * s1 + b * dv * s0
+                by_v += b * s1 + c * dv * s0
+                by_a -= 0.5 * s2
+                by_b -= dv * s1
+                by_c -= 0.5 * dv * dv * s0
+                by_opacity += s0
+            line = partials[m]
+            line[0], line[1], line[2], line[3], line[4] = by_u, by_v, by_a, by_b, by_c
+            line[5] = by_opacity / opacity
+            line[6], line[7], line[8], line[9] = by_0, by_1, by_2, by_3
+
+
+@kernel
+@no_type_check
+def _gather(first, last, owners, entries, partials, sums):
+    for g in range(first, last):
+        line = sums[g]
+        line[:] = 0.0
+        for e in range(owners[g], owners[g + 1]):
+            part = partials[entries[e]]
+            for k in range(PARTIAL):
+                line[k] += part[k]
+
+
+def differentiate(
+    tiles: Tiles,
+    splats: Float[np.ndarray, "M 9"],
+    values: Float[np.ndarray, "M 4"],
+    stop: float,
+    out: Float64[np.ndarray, "H W 5"],
+    grads: Float[np.ndarray, "H W 5"],
+) -> Float[np.ndarray, "M 10"]:
+    """Derivatives of a loss by u, v, a, b, c, opacity and the four values of each splat.
+
+    Partial sums are kept for each tile that a splat touches, and added in one order, so that a rerun gives the same
+    bits however many threads there are.
+
+    Args:
+        tiles: as `composite` had them.
+        splats: the same.
+        values: the same.
+        stop: the same.
+        out: what `composite` gave.
+        grads: derivatives of the loss by `out`.
+    """
+    height, width = out.shape[:2]
+    partials = np.empty((len(tiles.members), PARTIAL), splats.dtype)
+    cuts = even_cuts(tiles.starts)
+    size = (width, height, -(-width // TILE))
+    arrays = (tiles.starts, tiles.members, splats, values, size, stop, out, grads, partials)
+    parallel(lambda piece: _differentiate(cuts[piece], cuts[piece + 1], *arrays), range(PIECES))
+    sums = np.empty((len(splats), PARTIAL), splats.dtype)
+    parts = even_cuts(tiles.owners)
+    parallel(
+        lambda piece: _gather(parts[piece], parts[piece + 1], tiles.owners, tiles.entries, partials, sums),
+        range(PIECES),
+    )
+    return sums

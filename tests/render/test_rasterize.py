@@ -1,0 +1,191 @@
+"""Differentiable rendering: the kernels against their plain twin and finite differences, and both at the extremes."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from splats import front_camera, random_gaussians
+from torch import Tensor
+
+from gsencoder.errors import InputError
+from gsencoder.render import blend
+from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
+from gsencoder.types import Gaussians
+
+Inputs = dict[str, Tensor]
+CPU, REFERENCE = RasterConfig(backend="cpu"), RasterConfig(backend="reference")
+
+
+def inputs_of(g: Gaussians, dtype: torch.dtype = torch.float64) -> Inputs:
+    torch.manual_seed(0)
+    made = {
+        "means": torch.from_numpy(g.means),
+        "quats": torch.from_numpy(g.quats),
+        "scales": torch.from_numpy(g.scales),
+        "opacities": torch.from_numpy(g.opacities),
+        "colors": torch.rand(len(g), 3),
+    }
+    return {name: value.to(dtype).requires_grad_() for name, value in made.items()}
+
+
+def drawn(inputs: Inputs, config: RasterConfig, width: int = 61, height: int = 43) -> Raster:
+    camera = front_camera(width, height)
+    dtype = inputs["means"].dtype
+    pose, K = (torch.from_numpy(part[0]).to(dtype) for part in (camera.cam_from_world, camera.Ks))
+    return rasterize(**inputs, cam_from_world=pose, K=K, width=width, height=height, config=config)
+
+
+def slopes(inputs: Inputs, config: RasterConfig) -> tuple[Raster, list[Tensor]]:
+    """A view, and derivatives of a fixed random functional of all that it shows."""
+    raster = drawn(inputs, config)
+    weights = torch.Generator().manual_seed(1)
+    total = torch.zeros((), dtype=inputs["means"].dtype)
+    for part in (raster.rgb, raster.alpha, raster.depth):
+        total = total + (part * torch.randn(part.shape, generator=weights, dtype=torch.float64).to(part.dtype)).sum()
+    return raster, list(torch.autograd.grad(total, list(inputs.values())))
+
+
+@pytest.mark.parametrize("log_scale", [-6.0, -2.5, 0.0])
+def test_kernels_and_plain_twin_agree_in_values_and_gradients(log_scale: float) -> None:
+    inputs = inputs_of(random_gaussians(200, log_scale=log_scale))
+    fast, fast_slopes = slopes(inputs, CPU)
+    plain, plain_slopes = slopes(inputs, REFERENCE)
+    for found, expected in zip([*fast[:3], *fast_slopes], [*plain[:3], *plain_slopes], strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.detach().abs().max()))
+
+
+def test_gradients_in_float32_are_within_a_thousandth_of_those_in_float64() -> None:
+    splat = random_gaussians(400)
+    _, exact = slopes(inputs_of(splat), CPU)
+    _, found = slopes(inputs_of(splat, torch.float32), CPU)
+    for name, a, b in zip(inputs_of(splat), found, exact, strict=True):
+        assert float((a.double() - b).norm() / b.norm()) < 1e-3, name
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    # Soft and apart: no alpha comes near 1/255 or 0.999, no ray stops, no depths change places.
+    splat = random_gaussians(4, seed=3, log_scale=0.7)
+    inputs = inputs_of(splat)
+    inputs["opacities"] = torch.tensor([0.3, 0.5, 0.7, 0.4], dtype=torch.float64, requires_grad=True)
+
+    def draw(*values: Tensor) -> tuple[Tensor, ...]:
+        raster = drawn(dict(zip(inputs, values, strict=True)), CPU, width=9, height=7)
+        return raster.rgb, raster.alpha, raster.depth
+
+    assert torch.autograd.gradcheck(draw, tuple(inputs.values()), eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+def test_a_picture_is_what_the_blend_of_the_same_view_renders() -> None:
+    splat = random_gaussians(300)
+    inputs = inputs_of(splat, torch.float32)
+    raster = drawn(inputs, CPU)
+    b = blend(splat, front_camera())
+    torch.testing.assert_close(raster.rgb.reshape(-1, 3), b.render(inputs["colors"]), atol=2e-5, rtol=1e-4)
+    torch.testing.assert_close(raster.alpha.reshape(-1), b.alpha, atol=2e-5, rtol=1e-4)
+    torch.testing.assert_close(raster.depth.reshape(-1), b.render(b.depths), atol=1e-4, rtol=1e-4)
+
+
+def test_a_rerun_gives_the_same_bits_whatever_the_number_of_threads() -> None:
+    inputs = inputs_of(random_gaussians(300), torch.float32)
+    before = torch.get_num_threads()
+    runs = []
+    try:
+        for threads in (1, 2, 2):
+            torch.set_num_threads(threads)
+            raster, found = slopes(inputs, CPU)
+            runs.append([*raster[:3], *found])
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for run in runs[1:] for a, b in zip(runs[0], run, strict=True))
+
+
+def behind(inputs: Inputs) -> None:
+    inputs["means"][:, 2] = -1
+
+
+def on_the_camera(inputs: Inputs) -> None:
+    inputs["means"][:] = 0
+
+
+def needles(inputs: Inputs) -> None:
+    inputs["scales"][:] = torch.tensor([1e-6, 1e-6, 1.0])
+
+
+def discs(inputs: Inputs) -> None:
+    inputs["scales"][:] = torch.tensor([1.0, 1.0, 1e-6])
+
+
+def huge(inputs: Inputs) -> None:
+    inputs["scales"][:] = 1e4
+
+
+def tiny(inputs: Inputs) -> None:
+    inputs["scales"][:] = 1e-9
+
+
+def opaque(inputs: Inputs) -> None:
+    inputs["opacities"][:] = 1
+
+
+def clear(inputs: Inputs) -> None:
+    inputs["opacities"][:] = 0
+
+
+def zero_quats(inputs: Inputs) -> None:
+    inputs["quats"][:] = 0
+
+
+def coincident(inputs: Inputs) -> None:
+    inputs["means"][:] = torch.tensor([0.0, 0.0, 2.0])
+
+
+def far_away(inputs: Inputs) -> None:
+    inputs["means"][:, 2] += 1e6
+
+
+EXTREMES = [
+    behind,
+    on_the_camera,
+    needles,
+    discs,
+    huge,
+    tiny,
+    opaque,
+    clear,
+    zero_quats,
+    coincident,
+    far_away,
+]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("change", EXTREMES, ids=lambda change: change.__name__)
+def test_pictures_and_gradients_stay_finite_at_the_extremes(
+    change: Callable[[Inputs], None], dtype: torch.dtype
+) -> None:
+    inputs = {name: value.detach().clone() for name, value in inputs_of(random_gaussians(50), dtype).items()}
+    change(inputs)
+    raster, found = slopes({name: value.requires_grad_() for name, value in inputs.items()}, CPU)
+    assert all(bool(torch.isfinite(part).all()) for part in (*raster, *found))
+
+
+def test_an_empty_splat_gives_an_empty_picture() -> None:
+    inputs = {name: value.detach()[:0].requires_grad_() for name, value in inputs_of(random_gaussians(2)).items()}
+    raster, found = slopes(inputs, CPU)
+    assert raster.rgb.shape == (43, 61, 3)
+    assert not raster.rgb.any()
+    assert all(part.numel() == 0 for part in found)
+
+
+def test_radii_are_zero_where_nothing_reaches_the_picture() -> None:
+    inputs = {name: value.detach() for name, value in inputs_of(random_gaussians(20)).items()}
+    inputs["means"][5, 2] = -1
+    inputs["means"][6, 0] = 1e5
+    radii = drawn(inputs, CPU).radii
+    assert radii[5] == radii[6] == 0
+    assert float(radii.max()) > 1
+
+
+def test_a_backend_for_another_device_is_refused() -> None:
+    with pytest.raises(InputError, match="gsplat cannot render tensors on cpu"):
+        drawn(inputs_of(random_gaussians(2)), RasterConfig(backend="gsplat"))
