@@ -12,7 +12,7 @@ from gsencoder.types import Gaussians, Views
 LARGEST_ANGLE = 0.1
 """A point's spacing is at most this share of its distance to the nearest camera, so that strays near one stay small."""
 LARGEST_SPACING = 30.0
-"""… and at most this many times the median spacing of all points."""
+"""… and at most this many times the median spacing of all points, where not told otherwise."""
 PCA_CHUNK = 100_000
 
 
@@ -22,6 +22,7 @@ def seed_from_points(
     *,
     views: Views | None = None,
     voxel: float | None = None,
+    largest_spacing: float = LARGEST_SPACING,
 ) -> Gaussians:
     """Flat Gaussians on a point cloud, for example COLMAP's.
 
@@ -34,6 +35,7 @@ def seed_from_points(
         colors: RGB beside them; None makes them mid-grey, with a warning.
         views: cameras, which orient the normals and limit the size of strays.
         voxel: edge of the grid in world units; None keeps every distinct point.
+        largest_spacing: upper limit of a point's spacing, in median spacings of all points.
 
     Raises:
         InputError: no points, values that are not finite, colours of another length, a voxel that is not positive.
@@ -51,7 +53,7 @@ def seed_from_points(
     points, tints = average_in_voxels(points, colors, voxel)
     normals, flatness = sheet_normals(points)
     centers = None if views is None or not len(views) else views.cameras.centers
-    largest: float | Float32[np.ndarray, " n"] = LARGEST_SPACING * typical_spacing(points)
+    largest: float | Float32[np.ndarray, " n"] = largest_spacing * typical_spacing(points)
     if centers is None:
         outwards = points - np.median(points, axis=0)
     else:

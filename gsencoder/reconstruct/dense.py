@@ -1,0 +1,287 @@
+"""Seeds where structure from motion left none: nothing grows later, so every surface must be seeded before.
+
+Two sources, both judged by what other photographs show. Textured pixels get the depth of a plane sweep (stereo.py), if
+two other views find a surface at the same place. Pixels between those are given depths interpolated between their
+neighbours', and kept if their colours agree in two other views and no other view sees through them.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
+
+from gsencoder.errors import InputError
+from gsencoder.reconstruct.photographs import Photographs, Shot
+from gsencoder.reconstruct.stereo import (
+    DepthMap,
+    agreeing,
+    depth_range,
+    in_image,
+    neighbours_of,
+    sample_nearest,
+    sweep,
+    to_grid,
+    window_mean,
+    world_points,
+)
+from gsencoder.tracking import Track, untracked
+from gsencoder.types import Cameras
+
+FILLED_SPACING = 2.0
+"""Interpolated seeds stand on a grid so much coarser: they are where little is to be seen."""
+CELL = 1 / 40
+"""Side of the cells in which coverage is counted, as a share of the picture's longer side."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DenseConfig:
+    """When seeds are added, and how many."""
+
+    enough: float = field(
+        default=0.95,
+        metadata={"help": "seeds are added where points reach less than this share of the pictures' cells; 0 = never"},
+    )
+    spacing: float = field(default=3.0, metadata={"help": "distance of seeds in pixels of a typical photograph"})
+    samples: int = field(default=3, metadata={"help": "pixels that must agree on a seed, from all photographs"})
+    size: int = field(default=200, metadata={"help": "longer side in pixels of the pictures that are compared"})
+    sources: int = field(default=4, metadata={"help": "other photographs that each is compared with"})
+    alike: float = field(default=0.6, metadata={"help": "correlation from which windows count as the same, −1 to 1"})
+    agree: float = field(default=0.02, metadata={"help": "relative difference of depths that agree"})
+    color: float = field(
+        default=0.06, metadata={"help": "difference of colours (of 1) up to which interpolated points are kept"}
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.enough <= 1:
+            raise InputError(f"enough: expected a share from 0 to 1, got {self.enough}")
+        if not 0 < self.spacing < math.inf:
+            raise InputError(f"spacing: expected a positive number of pixels, got {self.spacing}")
+        if self.size < 32:
+            raise InputError(f"size: expected at least 32 pixels, got {self.size}")
+        if self.sources < 2:
+            raise InputError(f"sources: expected at least 2 photographs to compare with, got {self.sources}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dense:
+    """Points with what was added to them.
+
+    Attributes:
+        points: old and new, world units relative to the scene's origin.
+        colors: RGB.
+        swept: how many came from plane sweeps.
+        filled: how many were interpolated.
+        coverage: mean share of the pictures' cells with a point, before and after.
+        voxel: edge of the grid on which those from plane sweeps stand, world units.
+    """
+
+    points: Float32[np.ndarray, "P 3"]
+    colors: UInt8[np.ndarray, "P 3"]
+    swept: int
+    filled: int
+    coverage: tuple[float, float]
+    voxel: float
+
+
+def coverage(cameras: Cameras, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
+    """Mean share of the pictures' cells into which some point projects; what hides what is not looked at."""
+    shares = []
+    for view in views:
+        width, height = int(cameras.widths[view]), int(cameras.heights[view])
+        cell = max(1.0, CELL * max(width, height))
+        chosen = points[in_image(cameras, view, points)].astype(np.float64)
+        pose, K = cameras.cam_from_world[view].astype(np.float64), cameras.Ks[view]
+        camera = chosen @ pose[:3, :3].T + pose[:3, 3]
+        columns, rows = (((K[i, i] * camera[:, i] / camera[:, 2] + K[i, 2]) / cell).astype(np.int64) for i in (0, 1))
+        across, down = math.ceil(width / cell), math.ceil(height / cell)
+        shares.append(len(np.unique(rows * across + columns)) / (across * down))
+    return float(np.mean(shares))
+
+
+def densify(
+    photographs: Photographs,
+    training: Sequence[int],
+    points: Float32[np.ndarray, "P 3"],
+    colors: UInt8[np.ndarray, "P 3"],
+    config: DenseConfig = DenseConfig(),
+    *,
+    track: Track = untracked,
+) -> Dense | None:
+    """Points for every surface that the training photographs show; None where the given ones cover enough.
+
+    Args:
+        photographs: of all views.
+        training: the views that may be looked at.
+        points: from structure from motion.
+        colors: beside them.
+        config: see there.
+        track: progress.
+    """
+    cameras = photographs.cameras
+    before = coverage(cameras, training, points)
+    if before >= config.enough:
+        return None
+    neighbours = neighbours_of(cameras, points, training, config.sources)
+    shots, poses = {}, {}
+    for view in training:
+        longest = max(int(cameras.widths[view]), int(cameras.heights[view]))
+        shots[view] = photographs.shot(view, max(1, round(longest / config.size)))
+        poses[view] = torch.from_numpy(cameras.cam_from_world[view].copy())
+    maps: dict[int, DepthMap] = {}
+    for view in track(training, "sweeping planes"):
+        limits, others = depth_range(cameras, view, points), neighbours[view]
+        if limits is not None and len(others) >= 2:
+            found = sweep(shots[view], poses[view], [shots[o] for o in others], [poses[o] for o in others], *limits)
+            maps[view] = found._replace(depth=torch.where(found.score >= config.alike, found.depth, 0))
+    agreed = _agreed(maps, shots, poses, neighbours, config)
+    swept = _points_of(agreed, shots, poses)
+    seen = _fill_depths(agreed, shots, poses, points)
+    filled = _points_of(_gaps(seen, agreed, shots, poses, neighbours, config), shots, poses)
+    voxel = config.spacing * _pixel_size(cameras, agreed)
+    swept = thin(*swept, voxel, config.samples)
+    filled = thin(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
+    places, tints = (np.concatenate(parts) for parts in zip((points, colors), swept, filled, strict=True))
+    after = coverage(cameras, training, places)
+    return Dense(
+        points=places, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after), voxel=voxel
+    )
+
+
+def _pixel_size(cameras: Cameras, depths: Mapping[int, Float[Tensor, "h w"]]) -> float:
+    """What a pixel of a typical photograph covers of the surfaces that were found, in world units."""
+    found = [(view, depth[depth > 0]) for view, depth in depths.items()]
+    return float(np.median([float(z.median() / cameras.Ks[view, 0, 0]) for view, z in found if len(z)] or [1.0]))
+
+
+def thin(
+    points: Float32[np.ndarray, "P 3"],
+    colors: UInt8[np.ndarray, "P 3"],
+    voxel: float,
+    samples: int,
+    *,
+    beside: Float32[np.ndarray, "Q 3"] | None = None,
+) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Means of the points and colours of each voxel with at least so many samples; none where `beside` has points."""
+    cells = np.floor(points.astype(np.float64) / voxel).astype(np.int64)
+    taken = np.floor(np.empty((0, 3)) if beside is None else beside.astype(np.float64) / voxel).astype(np.int64)
+    found, inverse, counts = np.unique(np.concatenate((cells, taken)), axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.reshape(-1)
+    keep = counts >= samples
+    keep[inverse[len(cells) :]] = False
+    inverse = inverse[: len(cells)]
+    columns = (*points.T.astype(np.float64), *colors.T.astype(np.float64))
+    means = np.stack([np.bincount(inverse, column, len(found))[keep] / counts[keep] for column in columns], axis=1)
+    return means[:, :3].astype(np.float32), np.round(means[:, 3:]).astype(np.uint8)
+
+
+def _agreed(
+    maps: Mapping[int, DepthMap],
+    shots: Mapping[int, Shot],
+    poses: Mapping[int, Tensor],
+    neighbours: Mapping[int, Sequence[int]],
+    config: DenseConfig,
+) -> dict[int, Float[Tensor, "h w"]]:
+    """Depths at which two other views find a surface, too."""
+    kept = {}
+    for view, found in maps.items():
+        others = [(maps[other], shots[other], poses[other]) for other in neighbours[view] if other in maps]
+        votes = agreeing(found.depth, shots[view], poses[view], others, config.agree)
+        kept[view] = torch.where(votes >= 2, found.depth, 0)
+    return kept
+
+
+def _points_of(
+    depths: Mapping[int, Float[Tensor, "h w"]], shots: Mapping[int, Shot], poses: Mapping[int, Tensor]
+) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    parts: list[tuple[np.ndarray, np.ndarray]] = [(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))]
+    for view, depth in depths.items():
+        known = depth > 0
+        where = world_points(depth, shots[view], poses[view])[known]
+        parts.append((where.numpy(), (shots[view].image[known] * 255 + 0.5).to(torch.uint8).numpy()))
+    places, tints = zip(*parts, strict=True)
+    return np.concatenate(places), np.concatenate(tints)
+
+
+def _fill_depths(
+    agreed: Mapping[int, Float[Tensor, "h w"]],
+    shots: Mapping[int, Shot],
+    poses: Mapping[int, Tensor],
+    points: Float32[np.ndarray, "P 3"],
+) -> dict[int, Float[Tensor, "h w"]]:
+    """Depth at every pixel of every view: its own, else that of other views' points, else between its neighbours'."""
+    cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(_points_of(agreed, shots, poses)[0])))
+    return {
+        view: interpolate(torch.where(depth > 0, depth, splat_depths(cloud, shots[view], poses[view])))
+        for view, depth in agreed.items()
+    }
+
+
+def splat_depths(cloud: Float[Tensor, "P 3"], shot: Shot, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "h w"]:
+    """The nearest point of each pixel: its depth, 0 where there is none."""
+    camera = cloud @ pose[:3, :3].T + pose[:3, 3]
+    grid, inside = to_grid(camera, shot)
+    camera, grid = camera[inside], grid[inside]
+    column, row = ((grid + 1) / 2 * torch.tensor([shot.width, shot.height])).long().unbind(-1)
+    index = row.clamp(max=shot.height - 1) * shot.width + column.clamp(max=shot.width - 1)
+    nearest = torch.full((shot.height * shot.width,), torch.inf)
+    nearest.scatter_reduce_(0, index, camera[:, 2], "amin")
+    return torch.where(nearest.isfinite(), nearest, 0).reshape(shot.height, shot.width)
+
+
+def interpolate(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Fills what is 0 with means of ever larger surroundings, in 1/depth, in which planes are linear (push–pull)."""
+    known = (depth > 0).float()
+    inverse = torch.where(depth > 0, 1 / depth.clamp(min=1e-9), 0)
+    levels: list[tuple[Tensor, Tensor]] = [(inverse, known)]
+    while max(levels[-1][0].shape) > 1:
+        value, weight = (
+            torch.nn.functional.avg_pool2d(part[None], 2, ceil_mode=True)[0]
+            for part in (levels[-1][0] * levels[-1][1], levels[-1][1])
+        )
+        levels.append((value / weight.clamp(min=1e-9), (weight > 0).float()))
+    result = levels[-1][0]
+    for value, weight in reversed(levels[:-1]):
+        coarse = torch.nn.functional.interpolate(result[None, None], size=value.shape, mode="bilinear")[0, 0]
+        result = torch.where(weight > 0, value, coarse)
+    return torch.where(depth > 0, depth, torch.where(result > 0, 1 / result.clamp(min=1e-9), 0))
+
+
+def _gaps(
+    seen: Mapping[int, Float[Tensor, "h w"]],
+    agreed: Mapping[int, Float[Tensor, "h w"]],
+    shots: Mapping[int, Shot],
+    poses: Mapping[int, Tensor],
+    neighbours: Mapping[int, Sequence[int]],
+    config: DenseConfig,
+) -> dict[int, Float[Tensor, "h w"]]:
+    """Interpolated depths that other photographs do not speak against."""
+    smooth = {view: window_mean(shots[view].image.permute(2, 0, 1)[None])[0] for view in seen}
+    kept = {}
+    for view, depth in seen.items():
+        candidates = (agreed[view] == 0) & (depth > 0)
+        mask = shots[view].mask
+        if mask is not None:
+            candidates &= mask
+        where = world_points(depth, shots[view], poses[view])[candidates]
+        tints = smooth[view].permute(1, 2, 0)[candidates]
+        votes = torch.zeros(len(where), dtype=torch.int64)
+        against = torch.zeros(len(where), dtype=torch.bool)
+        for other in neighbours[view]:
+            if other not in seen:
+                continue
+            camera = where @ poses[other][:3, :3].T + poses[other][:3, 3]
+            grid, inside = to_grid(camera, shots[other])
+            there = torch.nn.functional.grid_sample(smooth[other][None], grid[None, None], align_corners=False)[
+                0, :, 0
+            ].T
+            votes += inside & ((there - tints).abs().mean(dim=-1) <= config.color)
+            measured = sample_nearest(agreed[other], grid)
+            against |= inside & (measured > 0) & (camera[:, 2] < (1 - 2 * config.agree) * measured)
+        chosen = torch.zeros_like(candidates)
+        chosen[candidates] = (votes >= 2) & ~against
+        kept[view] = torch.where(chosen, depth, 0)
+    return kept

@@ -1,0 +1,244 @@
+"""Fitting a splat to photographs: L1 + D-SSIM, depth where it is known, pruning, never growing."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsencoder.errors import InputError
+from gsencoder.reconstruct.parameters import (
+    Parameters,
+    camera_of,
+    gaussians_of,
+    parameters_from,
+    rows_in_view,
+    seen_colors,
+)
+from gsencoder.reconstruct.photographs import Photographs, Shot
+from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
+from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.render.quality import psnr, ssim
+from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
+from gsencoder.types import Gaussians
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OptimizeConfig:
+    """How long, how fast and against what a splat is fitted."""
+
+    steps: int = field(default=4000, metadata={"help": "photographs looked at, one a step"})
+    sh_degree: int = field(default=2, metadata={"help": "how colours may depend on the direction, 0 to 3"})
+    sh_every: float = field(default=0.2, metadata={"help": "share of the steps after which the degree rises by one"})
+    shrinks: tuple[int, ...] = field(
+        default=(4, 2, 1), metadata={"help": "photographs are made smaller so many times, one stage after the other"}
+    )
+    shares: tuple[float, ...] = field(
+        default=(0.15, 0.35, 0.5), metadata={"help": "share of the steps of each of these stages"}
+    )
+    ssim_weight: float = field(default=0.2, metadata={"help": "of 1 − SSIM; the rest of 1 is L1's"})
+    depth_weight: float = field(
+        default=0.1, metadata={"help": "of the relative error of depth, where a sensor measured it"}
+    )
+    means_rate: float = field(default=1.6e-4, metadata={"help": "learning rate of positions, times the scene's size"})
+    means_final: float = field(default=0.01, metadata={"help": "share of that rate which is left at the end"})
+    scales_rate: float = field(default=5e-3, metadata={"help": "learning rate of the logarithms of scales"})
+    quats_rate: float = field(default=1e-3, metadata={"help": "learning rate of rotations"})
+    opacities_rate: float = field(default=5e-2, metadata={"help": "learning rate of the logits of opacities"})
+    colors_rate: float = field(default=2.5e-3, metadata={"help": "learning rate of colours; a 20th for directions"})
+    seed: int = field(default=0, metadata={"help": "of the order in which photographs are looked at"})
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise InputError(f"steps: expected 0 or more, got {self.steps}")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
+        if len(self.shrinks) != len(self.shares) or not self.shrinks or min(self.shrinks) < 1:
+            raise InputError(f"shrinks and shares: expected as many of each, got {self.shrinks} and {self.shares}")
+        if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1, abs_tol=1e-6):
+            raise InputError(f"shares: expected numbers that add up to 1, got {self.shares}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise InputError(f"ssim_weight: expected a number from 0 to 1, got {self.ssim_weight}")
+
+    def shrink_at(self, step: int) -> int:
+        """How many times smaller the photographs of a step are."""
+        ends = np.cumsum(self.shares) * self.steps
+        return self.shrinks[min(int(np.searchsorted(ends, step, side="right")), len(self.shrinks) - 1)]
+
+    def degree_at(self, step: int) -> int:
+        """Degree of the colour coefficients that a step uses."""
+        return min(self.sh_degree, int(step / max(1.0, self.sh_every * self.steps)))
+
+    def rates_at(self, step: int, extent: float) -> dict[str, float]:
+        """Learning rates of a step; that of the positions falls exponentially."""
+        return {
+            "means": self.means_rate * extent * self.means_final ** (step / max(1, self.steps)),
+            "quats": self.quats_rate,
+            "log_scales": self.scales_rate,
+            "logit_opacities": self.opacities_rate,
+            "sh0": self.colors_rate,
+            "shN": self.colors_rate / 20,
+        }
+
+
+class Optimizer:
+    """A splat on its way.
+
+    Attributes:
+        adam: holds the parameters, and their moments.
+        step: steps that are done.
+        whole: whether the state is one between two steps.
+    """
+
+    def __init__(
+        self,
+        start: Gaussians,
+        photographs: Photographs,
+        training: Sequence[int],
+        config: OptimizeConfig,
+        *,
+        prune: PruneConfig,
+        raster: RasterConfig = RasterConfig(),
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Args:
+        start: where to begin.
+        photographs: of all views.
+        training: which of them are fitted.
+        config: see there.
+        prune: what is taken out, and when.
+        raster: accuracy of rendering.
+        device: where to compute.
+        """
+        self.photographs, self.training, self.config = photographs, tuple(training), config
+        self.pruning, self.raster, self.device = prune, raster, torch.device(device)
+        self.adam = RowAdam(parameters_from(start, config.sh_degree, device))
+        self.step, self.whole = 0, True
+        centers = photographs.cameras.centers
+        self.extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0)) or 1.0
+
+    @property
+    def raw(self) -> Parameters:
+        return self.adam.parameters
+
+    def view_at(self, step: int) -> int:
+        """Each view once in a round, in an order that depends on the seed and the round alone."""
+        turn, place = divmod(step, len(self.training))
+        order = np.random.default_rng((self.config.seed, turn)).permutation(len(self.training))
+        return self.training[int(order[place])]
+
+    def advance(self) -> dict[str, float]:
+        """One step; the terms of the loss.
+
+        Raises:
+            InputError: a loss or gradient that is not finite; view and term are named.
+        """
+        view = self.view_at(self.step)
+        shot = self.photographs.shot(view, self.config.shrink_at(self.step))
+        pose, K, center = camera_of(self.photographs.cameras, view, self.device)
+        K = shot.K.to(self.device)
+        size = (shot.width, shot.height)
+        rows = rows_in_view(self.raw, pose, K, *size, near=self.raster.near, eps2d=self.raster.eps2d)
+        terms: dict[str, float] = {}
+        if len(rows):
+            seen = {name: value[rows].requires_grad_() for name, value in self.raw.items()}
+            raster = render(seen, pose, K, center, *size, self.config.degree_at(self.step), self.raster)
+            losses = losses_of(raster, shot, self.config)
+            total = torch.stack([*losses.values()]).sum()
+            total.backward()
+            grads = {name: value.grad for name, value in seen.items() if value.grad is not None}
+            self._check(view, losses, grads)
+            self.whole = False
+            self.adam.step(rows, grads, self.config.rates_at(self.step, self.extent))
+            terms = {name: float(value.detach()) for name, value in losses.items()}
+        self.whole = False
+        self.step += 1
+        if self.pruning.due(self.step, self.config.steps):
+            self.prune()
+        self.whole = True
+        return terms
+
+    def prune(self) -> int:
+        """Takes out what does not contribute; how many were taken."""
+        before = len(self.raw["means"])
+        views = [(view, self.photographs.shot(view, 2)) for view in self.training]
+        self.adam.keep(rows_to_keep(self.raw, self.photographs.cameras, views, self.pruning, self.raster))
+        return before - len(self.raw["means"])
+
+    def _check(self, view: int, losses: Mapping[str, Tensor], grads: Mapping[str, Tensor]) -> None:
+        named = {f"the loss {name}": value for name, value in losses.items()}
+        named |= {f"the gradient of {name}": value for name, value in grads.items()}
+        for name, value in named.items():
+            if not bool(torch.isfinite(value.detach().sum())) and not bool(torch.isfinite(value).all()):
+                raise InputError(
+                    f"reconstruct: {name} is not finite at step {self.step}, photograph "
+                    f"{self.photographs.names[view]!r}; lower the learning rates, or look at this photograph"
+                )
+
+    def gaussians(self) -> Gaussians:
+        """The splat as it is now."""
+        return gaussians_of(self.raw)
+
+    @torch.no_grad()
+    def score(self, views: Sequence[int], shrink: int = 1) -> tuple[float, float]:
+        """Mean PSNR in dB and mean SSIM over views, of the pixels that masks leave."""
+        found = []
+        for view in views:
+            shot = self.photographs.shot(view, shrink)
+            picture = self.picture(view, shot)
+            found.append((psnr(picture, shot.image, shot.mask), float(ssim(picture, shot.image, shot.mask))))
+        return tuple(np.mean(found, axis=0).tolist())
+
+    @torch.no_grad()
+    def picture(self, view: int, shot: Shot) -> Float[Tensor, "H W 3"]:
+        """A view as it is now, in [0, 1]."""
+        pose, _, center = camera_of(self.photographs.cameras, view, self.device)
+        K, size = shot.K.to(self.device), (shot.width, shot.height)
+        rows = rows_in_view(self.raw, pose, K, *size, near=self.raster.near, eps2d=self.raster.eps2d)
+        seen = {name: value[rows] for name, value in self.raw.items()}
+        return render(seen, pose, K, center, *size, self.config.sh_degree, self.raster).rgb.clamp(0, 1).cpu()
+
+
+def render(
+    raw: Parameters,
+    pose: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+    center: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    degree: int,
+    config: RasterConfig,
+) -> Raster:
+    """One view of parameters, over black."""
+    colors = seen_colors(raw, degree, center)
+    scales, opacities = raw["log_scales"].exp(), raw["logit_opacities"].sigmoid()
+    return rasterize(raw["means"], raw["quats"], scales, opacities, colors, pose, K, width, height, config=config)
+
+
+def losses_of(raster: Raster, shot: Shot, config: OptimizeConfig) -> dict[str, Float[Tensor, ""]]:
+    """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, and the relative error of depth where it is known."""
+    image = shot.image.to(raster.rgb.device)
+    rgb = raster.rgb
+    losses = {}
+    if shot.mask is not None:
+        # What is masked is made equal: it gives no gradient, and no edge to windows that reach over it.
+        mask = shot.mask.to(rgb.device)
+        image = torch.where(mask.unsqueeze(-1), image, rgb.detach())
+        share = mask.float().mean().clamp(min=1e-6)
+    else:
+        share = torch.ones((), device=rgb.device)
+    losses["l1"] = (1 - config.ssim_weight) * (rgb - image).abs().mean() / share
+    if config.ssim_weight and min(shot.width, shot.height) >= 11:
+        losses["ssim"] = config.ssim_weight * (1 - ssim(rgb, image)) / share
+    if config.depth_weight and shot.depth is not None:
+        depth = shot.depth.to(rgb.device)
+        known = (depth > 0) & (raster.alpha.detach() > 0.5)
+        if shot.mask is not None:
+            known &= shot.mask.to(rgb.device)
+        found = raster.depth / raster.alpha.clamp(min=1e-3)
+        error = ((found - depth).abs() / depth.clamp(min=1e-6)).clamp(max=1)
+        losses["depth"] = config.depth_weight * torch.where(known, error, 0).mean()
+    return losses

@@ -1,0 +1,86 @@
+"""What the optimiser moves: a splat in unbounded numbers (logarithms of scales, logits of opacities)."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from gsencoder.geometry import colors_from_sh, normalize_quats
+from gsencoder.types import Cameras, Gaussians
+
+OPACITY_ENDS = 1e-3
+"""Opacities begin at least so far from 0 and 1, where a logit has no slope."""
+REACH = 3.33
+"""No splat reaches further than so many standard deviations: √(2 ln 255) at an opacity of 1."""
+
+Parameters = dict[str, Tensor]
+"""means [N, 3], quats [N, 4], log_scales [N, 3], logit_opacities [N], sh0 [N, 1, 3], shN [N, K − 1, 3], float32."""
+
+
+def parameters_from(gaussians: Gaussians, sh_degree: int, device: torch.device | str = "cpu") -> Parameters:
+    """The parameters of a splat; colour coefficients above those that it has begin at zero, more are cut."""
+    n, wanted = len(gaussians), (sh_degree + 1) ** 2
+    sh = np.zeros((n, wanted, 3), np.float32)
+    kept = min(wanted, gaussians.sh.shape[1])
+    sh[:, :kept] = gaussians.sh[:, :kept]
+    opacities = torch.from_numpy(gaussians.opacities.copy()).clamp(OPACITY_ENDS, 1 - OPACITY_ENDS)
+    raw = {
+        "means": torch.from_numpy(gaussians.means.copy()),
+        "quats": torch.from_numpy(gaussians.quats.copy()),
+        "log_scales": torch.from_numpy(gaussians.scales).log(),
+        "logit_opacities": torch.logit(opacities),
+        "sh0": torch.from_numpy(sh[:, :1].copy()),
+        "shN": torch.from_numpy(sh[:, 1:].copy()),
+    }
+    return {name: value.to(device) for name, value in raw.items()}
+
+
+def gaussians_of(raw: Parameters) -> Gaussians:
+    """The splat in physical values."""
+    found = {
+        "means": raw["means"],
+        "quats": normalize_quats(raw["quats"]),
+        "scales": raw["log_scales"].exp(),
+        "opacities": raw["logit_opacities"].sigmoid(),
+        "sh": torch.cat((raw["sh0"], raw["shN"]), dim=1),
+    }
+    return Gaussians(**{name: value.detach().cpu().numpy().copy() for name, value in found.items()})
+
+
+def seen_colors(raw: Parameters, degree: int, camera_center: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
+    """Colours from a camera with coefficients up to `degree`."""
+    sh = torch.cat((raw["sh0"], raw["shN"][:, : (degree + 1) ** 2 - 1]), dim=1) if degree else raw["sh0"]
+    return colors_from_sh(sh, raw["means"], camera_center)
+
+
+def rows_in_view(
+    raw: Parameters,
+    cam_from_world: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+    width: int,
+    height: int,
+    *,
+    near: float,
+    eps2d: float,
+) -> Int64[Tensor, " n"]:
+    """Rows that may touch the image: all that do, and few others.
+
+    A splat's half width is at most REACH·√((f·s/z)²(1 + t²) + eps2d), where s is its largest scale and t the tangent
+    at which geometry.project stops following it sideways.
+    """
+    x, y, z = (raw["means"] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]).unbind(1)
+    inside: Bool[Tensor, " N"] = z > near
+    largest = raw["log_scales"].amax(dim=1).exp() / z.clamp(min=near)
+    for along, focal, middle, size in ((x, K[0, 0], K[0, 2], width), (y, K[1, 1], K[1, 2], height)):
+        tangent = torch.maximum(middle, size - middle) / focal + 0.15 * size / focal
+        reach = REACH * torch.sqrt((focal * largest).square() * (1 + tangent.square()) + eps2d)
+        place = focal * along / z + middle
+        inside &= (place + reach > 0) & (place - reach < size)
+    return inside.nonzero().squeeze(1)
+
+
+def camera_of(cameras: Cameras, view: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
+    """cam_from_world, K and centre of a camera as float32 tensors."""
+    center = torch.from_numpy(cameras.centers[view]).float()
+    pose, K = (torch.from_numpy(part[view].copy()) for part in (cameras.cam_from_world, cameras.Ks))
+    return pose.to(device), K.to(device), center.to(device)

@@ -1,0 +1,85 @@
+"""The photographs that a reconstruction is fitted to, kept in memory and made smaller on demand."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gsencoder.errors import InputError
+from gsencoder.tracking import Track, untracked
+from gsencoder.types import Cameras, Views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shot:
+    """One photograph at one size.
+
+    Attributes:
+        image: RGB in [0, 1].
+        mask: pixels to look at; None = all.
+        depth: z in world units, 0 = unknown; None where there is no sensor.
+        K: intrinsics at this size, in pixels.
+    """
+
+    image: Float[Tensor, "H W 3"]
+    mask: Bool[Tensor, "H W"] | None
+    depth: Float[Tensor, "H W"] | None
+    K: Float[Tensor, "3 3"]
+
+    @property
+    def width(self) -> int:
+        return self.image.shape[1]
+
+    @property
+    def height(self) -> int:
+        return self.image.shape[0]
+
+
+class Photographs:
+    """Views of a scene as tensors: photographs as bytes, masks, and depth in float32.
+
+    Attributes:
+        cameras: of all views, at full size.
+        names: of all views.
+    """
+
+    def __init__(self, views: Views, *, track: Track = untracked) -> None:
+        """Decodes every picture once.
+
+        Raises:
+            InputError: no photographs, or a file that cannot be read.
+        """
+        if views.images is None:
+            raise InputError("reconstruct: the scene has cameras but no photographs, which is what is fitted")
+        self.cameras: Cameras = views.cameras
+        self.names = views.names
+        self._images, self._masks, self._depths = [], [], []
+        for view in track(range(len(views)), "reading photographs"):
+            self._images.append(torch.from_numpy(np.ascontiguousarray(views.images[view])))
+            mask = None if views.masks is None else torch.from_numpy(np.ascontiguousarray(views.masks[view]))
+            self._masks.append(None if mask is None or bool(mask.all()) else mask)
+            self._depths.append(None if views.depths is None else torch.from_numpy(views.depths[view].copy()))
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def shot(self, view: int, shrink: int = 1) -> Shot:
+        """A view; each of its pixels stands for `shrink` × `shrink` of the photograph's.
+
+        Colours are averaged. A pixel is looked at if all it covers is, and its depth is known if all it covers
+        differ by less than 5 %. Lines and columns that do not fill a pixel are left out.
+        """
+        image = self._images[view].float() / 255
+        mask, depth = self._masks[view], self._depths[view]
+        K = torch.from_numpy(self.cameras.Ks[view].copy())
+        if shrink > 1:
+            image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()
+            if mask is not None:
+                mask = torch.nn.functional.avg_pool2d(mask.float()[None], shrink)[0] > 1 - 1e-6
+            if depth is not None:
+                far, close = (torch.nn.functional.max_pool2d(sign * depth[None], shrink)[0] for sign in (1, -1))
+                depth = torch.where((far + close <= 0.05 * far) & (close < 0), (far - close) / 2, 0)
+            K[:2] /= shrink
+        return Shot(image=image, mask=mask, depth=depth, K=K)

@@ -1,0 +1,78 @@
+"""What is taken out of a splat while it is fitted; nothing is ever added (SplatDistill, section 3.1)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from gsencoder.errors import InputError
+from gsencoder.reconstruct.parameters import Parameters, camera_of, rows_in_view
+from gsencoder.reconstruct.photographs import Shot
+from gsencoder.render.rasterize import RasterConfig, rasterize
+from gsencoder.types import Cameras
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PruneConfig:
+    """What is taken out, and when."""
+
+    at: tuple[float, ...] = field(
+        default=(0.3, 0.6, 0.9), metadata={"help": "shares of the steps after which is pruned"}
+    )
+    opacity: float = field(default=0.005, metadata={"help": "opacities below are taken out"})
+    screen: float = field(
+        default=1.0, metadata={"help": "wider than so many times the picture's longer side in some view"}
+    )
+    contribution: float = field(
+        default=0.1, metadata={"help": "less than so many pixels' worth in every photograph, at its full size"}
+    )
+
+    def __post_init__(self) -> None:
+        if any(not 0 < share <= 1 for share in self.at):
+            raise InputError(f"at: expected shares in (0, 1], got {self.at}")
+        for name in ("opacity", "screen", "contribution"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+    def due(self, step: int, steps: int) -> bool:
+        """Whether is pruned after `step` of `steps`."""
+        return step in {round(share * steps) for share in self.at}
+
+
+def rows_to_keep(
+    raw: Parameters, cameras: Cameras, views: Sequence[tuple[int, Shot]], config: PruneConfig, raster: RasterConfig
+) -> Int64[Tensor, " n"]:
+    """Rows that are opaque enough, of sane size on every screen, and seen somewhere.
+
+    A splat's contribution to a view is its column sum of B. Rendering is linear in the colours, so that is the
+    gradient of the sum of a picture in which every colour is 1.
+
+    Args:
+        raw: parameters.
+        cameras: of all views.
+        views: photographs that count, at any size.
+        config: see there.
+        raster: accuracy of rendering.
+    """
+    means = raw["means"]
+    opacities = raw["logit_opacities"].sigmoid()
+    most, widest = torch.zeros_like(opacities), torch.zeros_like(opacities)
+    for view, shot in views:
+        pose, full, _ = camera_of(cameras, view, means.device)
+        K = shot.K.to(means.device)
+        pixels = float(full[0, 0] / K[0, 0]) ** 2
+        rows = rows_in_view(raw, pose, K, shot.width, shot.height, near=raster.near, eps2d=raster.eps2d)
+        if not len(rows):
+            continue
+        ones = torch.ones(len(rows), 3, device=means.device, requires_grad=True)
+        shape = (means[rows], raw["quats"][rows], raw["log_scales"][rows].exp(), opacities[rows])
+        seen = rasterize(*shape, ones, pose, K, shot.width, shot.height, config=raster)
+        (sums,) = torch.autograd.grad(seen.rgb[..., 0].sum(), ones)
+        most[rows] = torch.maximum(most[rows], pixels * sums[:, 0])
+        widest[rows] = torch.maximum(widest[rows], seen.radii / max(shot.width, shot.height))
+    good = (opacities >= config.opacity) & (most >= config.contribution)
+    if config.screen:
+        good &= widest <= config.screen
+    return good.nonzero().squeeze(1)

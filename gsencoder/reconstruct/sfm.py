@@ -1,0 +1,148 @@
+"""Photographs without poses: structure from motion by pycolmap, on a CPU."""
+
+import math
+import os
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from gsencoder.data.undistort import load_pycolmap
+from gsencoder.errors import InputError
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".webp")
+MOST_EXHAUSTIVE = 150
+"""Up to so many photographs all pairs are compared."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SfmConfig:
+    """How photographs are placed."""
+
+    pairs: Literal["auto", "exhaustive", "sequential"] = field(
+        default="auto",
+        metadata={
+            "help": "which photographs are compared: all pairs, or neighbours by name; auto = all pairs up to "
+            f"{MOST_EXHAUSTIVE} photographs"
+        },
+    )
+    size: int = field(default=1600, metadata={"help": "longer side in pixels at which features are sought"})
+    features: int = field(default=8192, metadata={"help": "most features of a photograph"})
+    camera: str = field(default="SIMPLE_RADIAL", metadata={"help": "COLMAP's camera model"})
+
+    def __post_init__(self) -> None:
+        if self.size < 64 or self.features < 64:
+            raise InputError(f"size and features: expected at least 64, got {self.size} and {self.features}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placed:
+    """What structure from motion made of a folder of photographs.
+
+    Attributes:
+        model: folder of the COLMAP model.
+        placed: names of the photographs that have a pose.
+        missing: names of those that have none.
+        points: points of the model.
+        error: mean reprojection error in pixels.
+    """
+
+    model: Path
+    placed: tuple[str, ...]
+    missing: tuple[str, ...]
+    points: int
+    error: float
+
+
+def photographs_in(folder: Path) -> list[str]:
+    """Names of the pictures directly in a folder, sorted."""
+    return sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.suffix.lower() in SUFFIXES)
+
+
+def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed:
+    """Finds poses and intrinsics.
+
+    Args:
+        folder: of the photographs.
+        work: an existing folder for COLMAP's database; the model is written to `sparse/0` in it.
+        config: see there.
+
+    Raises:
+        InputError: fewer than three photographs, no two that fit together, or pycolmap refuses.
+    """
+    names = photographs_in(folder)
+    if len(names) < 3:
+        raise InputError(f"{folder}: expected at least 3 photographs ({', '.join(SUFFIXES)}), found {len(names)}")
+    pycolmap = load_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR
+    database, attempts, model = work / "database.db", work / "attempts", work / "sparse" / "0"
+    for stale in (database, attempts, model):
+        shutil.rmtree(stale, ignore_errors=True)
+        stale.unlink(missing_ok=True)
+    attempts.mkdir()
+    try:
+        _find_features(pycolmap, database, folder, names, config)
+        _match(pycolmap, database, len(names), config)
+        models = pycolmap.incremental_mapping(database, folder, attempts, options=_mapping(pycolmap))
+    except (RuntimeError, ValueError) as error:
+        said = " ".join(str(error).split())[:160]
+        raise InputError(f"{folder}: pycolmap cannot place these photographs: {said}") from error
+    if not models:
+        raise InputError(
+            f"{folder}: none of {len(names)} photographs could be placed: no two show enough of the same; take more, "
+            "with larger overlap, of a scene that holds still and has texture"
+        )
+    best: Any = max(models.values(), key=lambda each: (each.num_reg_images(), each.num_points3D()))
+    whole = model.with_name(f".{model.name}.{os.getpid()}")
+    whole.mkdir(parents=True)
+    best.write(whole)
+    os.replace(whole, model)
+    shutil.rmtree(attempts, ignore_errors=True)
+    database.unlink(missing_ok=True)
+    placed = sorted(best.images[number].name for number in best.reg_image_ids())
+    return Placed(
+        model=model,
+        placed=tuple(placed),
+        missing=tuple(name for name in names if name not in set(placed)),
+        points=best.num_points3D(),
+        error=float(best.compute_mean_reprojection_error()),
+    )
+
+
+def _find_features(pycolmap: Any, database: Path, folder: Path, names: list[str], config: SfmConfig) -> None:
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = config.size
+    extraction.use_gpu = False
+    extraction.sift.max_num_features = config.features
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = config.camera
+    pycolmap.extract_features(
+        database,
+        folder,
+        image_names=names,
+        camera_mode=pycolmap.CameraMode.AUTO,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _match(pycolmap: Any, database: Path, count: int, config: SfmConfig) -> None:
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    every = config.pairs == "exhaustive" or (config.pairs == "auto" and count <= MOST_EXHAUSTIVE)
+    if every:
+        pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+        return
+    # Neighbours by name, and those 2, 4, 8, … places away.
+    pairing = pycolmap.SequentialPairingOptions()
+    pairing.overlap = max(10, math.ceil(math.log2(count)))
+    pairing.quadratic_overlap = True
+    pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu)
+
+
+def _mapping(pycolmap: Any) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 0
+    options.ba_refine_principal_point = False
+    return options

@@ -1,0 +1,98 @@
+"""Where a reconstruction begins: everything that will be there at the end must be there at the start."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.seeds_points import seed_from_points
+from gsencoder.errors import InputError
+from gsencoder.reconstruct.dense import Dense, DenseConfig, densify
+from gsencoder.reconstruct.photographs import Photographs
+from gsencoder.tracking import Track, untracked
+from gsencoder.types import Gaussians, Scene, Views
+
+DENSE_SPACING = 4.0
+"""Seeds of dense points are at most so many median spacings apart: strays among them must not become great blobs."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """The first Gaussians.
+
+    Attributes:
+        gaussians: to be optimised.
+        source: splat, depth, points, mesh or tsdf.
+        dense: what was added to structure-from-motion points; None where nothing was.
+    """
+
+    gaussians: Gaussians
+    source: str
+    dense: Dense | None = None
+
+
+class _Chosen(Sequence[Any]):
+    """Some entries of a lazy sequence."""
+
+    def __init__(self, items: Sequence[Any], rows: Sequence[int]) -> None:
+        self.items, self.rows = items, rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.items[self.rows[index]]
+
+
+def chosen_views(views: Views, rows: Sequence[int]) -> Views:
+    """Some of the views; pictures stay on disk until they are asked for."""
+    lazy = {
+        name: None if getattr(views, name) is None else _Chosen(getattr(views, name), rows)
+        for name in ("images", "depths", "masks", "instances")
+    }
+    return Views(cameras=views.cameras.select(rows), names=tuple(views.names[row] for row in rows), **lazy)
+
+
+def start_of(
+    scene: Scene,
+    photographs: Photographs,
+    training: Sequence[int],
+    seeds: SeedConfig = SeedConfig(),
+    dense: DenseConfig = DenseConfig(),
+    *,
+    track: Track = untracked,
+) -> Start:
+    """The first Gaussians of a scene: its own splat, else seeds from what its training views hold.
+
+    Args:
+        scene: with views.
+        photographs: of all its views.
+        training: the views that may be looked at.
+        seeds: which source, and how large the grid is.
+        dense: when points are added to those of structure from motion.
+        track: progress.
+
+    Raises:
+        InputError: there is nothing to begin with.
+    """
+    if scene.gaussians is not None:
+        return Start(gaussians=scene.gaussians, source="splat")
+    assert scene.views is not None
+    views = chosen_views(scene.views, list(training))
+    source = seeds.source
+    if source == "auto":
+        source = "depth" if views.depths is not None else "points"
+    seen = replace(scene, views=views)
+    points = scene.sfm_points
+    if source != "points" or points is None or dense.enough == 0:
+        return Start(gaussians=seed(seen, replace(seeds, source=source)), source=source)
+    colors = scene.sfm_colors if scene.sfm_colors is not None else np.full((len(points), 3), 128, np.uint8)
+    added = densify(photographs, training, points, colors, dense, track=track)
+    if added is None:
+        return Start(gaussians=seed(seen, replace(seeds, source="points")), source="points")
+    gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=DENSE_SPACING)
+    if not len(gaussians):
+        raise InputError(f"reconstruct: scene {scene.name!r} has no points to begin with")
+    return Start(gaussians=gaussians, source="points", dense=added)

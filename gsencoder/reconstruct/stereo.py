@@ -1,0 +1,248 @@
+"""Depth along the rays of textured pixels: plane sweeps between neighbouring photographs (Collins 1996).
+
+For every pixel of a reference view, planes z = d of many depths carry it into a few other views; the depth at which
+small windows look most alike there is kept, if they look alike enough.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int64
+from torch import Tensor
+
+from gsencoder.reconstruct.photographs import Shot
+from gsencoder.types import Cameras
+
+WINDOW = 5
+"""Side of the windows that are compared, in pixels of the small pictures."""
+PLANE_STEP = 0.7
+"""Neighbouring planes move a pixel by so many pixels in the view where it moves most."""
+MOST_PLANES = 128
+LEAST_CONTRAST = 0.01
+"""Windows whose colours deviate less (of 1) say nothing."""
+BEST_ANGLE = np.deg2rad(8.0)
+"""Views whose rays meet at about this angle are compared: further ones look different, nearer ones measure little."""
+
+
+class DepthMap(NamedTuple):
+    """Depths of one view at the size of its small picture.
+
+    Attributes:
+        depth: z in world units; 0 = not found.
+        score: mean zero-mean normalised cross-correlation with the two most alike views, −1 to 1.
+        step: relative distance of neighbouring planes at each pixel's depth.
+    """
+
+    depth: Float[Tensor, "h w"]
+    score: Float[Tensor, "h w"]
+    step: Float[Tensor, "h w"]
+
+
+def neighbours_of(
+    cameras: Cameras, points: Float32[np.ndarray, "P 3"], chosen: Sequence[int], count: int
+) -> dict[int, list[int]]:
+    """For each of the chosen views the others to compare it with: those that share many points at a good angle.
+
+    A shared point counts exp(−(ln(angle / BEST_ANGLE))²), so that both half and twice the best angle count a little
+    over a half.
+    """
+    inside = {view: in_image(cameras, view, points) for view in chosen}
+    centers = cameras.centers
+    found: dict[int, list[int]] = {}
+    for view in chosen:
+        worth = []
+        for other in chosen:
+            both = np.flatnonzero(inside[view] & inside[other])
+            if other == view or not both.size:
+                continue
+            rays = [centers[camera] - points[both] for camera in (view, other)]
+            norms = np.prod([np.linalg.norm(ray, axis=1) for ray in rays], axis=0)
+            cosine = np.einsum("ij,ij->i", *rays) / np.maximum(norms, 1e-12)
+            angle = np.arccos(np.clip(cosine, -1, 1))
+            worth.append((float(np.exp(-np.square(np.log(np.maximum(angle, 1e-6) / BEST_ANGLE))).sum()), other))
+        found[view] = [other for value, other in sorted(worth, reverse=True)[:count] if value > 0]
+    return found
+
+
+def in_image(cameras: Cameras, view: int, points: Float32[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+    """Points in front of a camera that project into its picture, hidden ones included."""
+    pose, K = cameras.cam_from_world[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
+    camera = points @ pose[:3, :3].T + pose[:3, 3]
+    z = np.maximum(camera[:, 2], 1e-9)
+    u, v = (K[i, i] * camera[:, i] / z + K[i, 2] for i in (0, 1))
+    return (camera[:, 2] > 0) & (u > 0) & (u < cameras.widths[view]) & (v > 0) & (v < cameras.heights[view])
+
+
+def depth_range(cameras: Cameras, view: int, points: Float32[np.ndarray, "P 3"]) -> tuple[float, float] | None:
+    """Where to look: the depths of the points in the picture, 2 % of the strays cut off at each end, and a margin."""
+    pose = cameras.cam_from_world[view]
+    z = points[in_image(cameras, view, points)] @ pose[2, :3] + pose[2, 3]
+    if len(z) < 10:
+        return None
+    near, far = np.quantile(z, (0.02, 0.98))
+    return 0.85 * float(near), 1.3 * float(far)
+
+
+def _relative(reference: Float[Tensor, "4 4"], source: Float[Tensor, "4 4"]) -> tuple[Tensor, Tensor]:
+    """Rotation and translation source_from_reference."""
+    rotation = source[:3, :3] @ reference[:3, :3].T
+    return rotation, source[:3, 3] - rotation @ reference[:3, 3]
+
+
+def _pixel_rays(shot: Shot) -> Float[Tensor, "h w 3"]:
+    """Directions of z = 1 through the pixel centres."""
+    v, u = torch.meshgrid(torch.arange(shot.height) + 0.5, torch.arange(shot.width) + 0.5, indexing="ij")
+    K = shot.K
+    return torch.stack(((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)), dim=-1).float()
+
+
+def _planes(
+    rays: Tensor, poses: Sequence[tuple[Tensor, Tensor]], sources: Sequence[Shot], near: float, far: float
+) -> Float[Tensor, " D"]:
+    """Depths from near to far, evenly spaced in 1/depth, as close as pixels ask."""
+    corners = rays[:: max(1, rays.shape[0] - 1), :: max(1, rays.shape[1] - 1)].reshape(-1, 3)
+    longest = 0.0
+    for (rotation, translation), source in zip(poses, sources, strict=True):
+        ends = []
+        for depth in (near, far):
+            x, y, z = (depth * corners @ rotation.T + translation).unbind(-1)
+            ends.append(
+                torch.stack(
+                    (source.K[0, 0] * x / z.clamp(min=1e-3 * near), source.K[1, 1] * y / z.clamp(min=1e-3 * near)), -1
+                )
+            )
+        moved = (ends[0] - ends[1]).norm(dim=-1)
+        longest = max(longest, float(moved.median()))
+    count = int(np.clip(np.ceil(longest / PLANE_STEP), 16, MOST_PLANES))
+    return 1 / torch.linspace(1 / near, 1 / far, count)
+
+
+def sweep(
+    reference: Shot,
+    pose: Float[Tensor, "4 4"],
+    sources: Sequence[Shot],
+    source_poses: Sequence[Float[Tensor, "4 4"]],
+    near: float,
+    far: float,
+) -> DepthMap:
+    """Depths of a view by comparing it with others.
+
+    Args:
+        reference: the view.
+        pose: its cam_from_world.
+        sources: views to compare with, at least two for hidden pixels to be told.
+        source_poses: their cam_from_world.
+        near: smallest depth, world units.
+        far: largest depth.
+    """
+    rays = _pixel_rays(reference)
+    relative = [_relative(pose, other) for other in source_poses]
+    depths = _planes(rays, relative, sources, near, far)
+    windows = _Windows(reference.image.mean(dim=-1)[None, None])
+    scores = torch.stack(
+        [
+            _alike(windows, rays, rotation, translation, source, depths)
+            for (rotation, translation), source in zip(relative, sources, strict=True)
+        ]
+    )
+    best = scores.topk(min(2, len(sources)), dim=0).values.mean(dim=0)
+    score, plane = best.max(dim=0)
+    # A parabola through the best plane and its neighbours, in 1/depth, where planes are evenly spaced.
+    inner = plane.clamp(1, len(depths) - 2)
+    left, middle, right = (best.gather(0, (inner + shift)[None])[0] for shift in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    shift = torch.where(bend < -1e-6, 0.5 * (left - right) / bend.clamp(max=-1e-6), 0).clamp(-0.5, 0.5)
+    inverse = 1 / depths
+    spacing = inverse[1] - inverse[0]
+    at = torch.where(inner == plane, inverse[plane] + shift * spacing, inverse[plane])
+    textured = windows.deviation[0, 0] >= LEAST_CONTRAST
+    ends = (plane == 0) | (plane == len(depths) - 1)
+    good = textured & ~ends
+    if reference.mask is not None:
+        good &= reference.mask
+    return DepthMap(torch.where(good, 1 / at, 0), torch.where(good, score, -1), spacing.abs() / at)
+
+
+class _Windows:
+    """Means and standard deviations of the windows of pictures [n, 1, h, w]."""
+
+    def __init__(self, pictures: Tensor) -> None:
+        self.pictures = pictures
+        self.mean = window_mean(pictures)
+        self.deviation = (window_mean(pictures * pictures) - self.mean.square()).clamp(min=0).sqrt()
+
+
+def window_mean(maps: Float[Tensor, "n c h w"], side: int = WINDOW) -> Float[Tensor, "n c h w"]:
+    """Means over windows, of what lies in the picture."""
+    pool = torch.nn.functional.avg_pool2d
+    lines = pool(maps, (side, 1), stride=1, padding=(side // 2, 0), count_include_pad=False)
+    return pool(lines, (1, side), stride=1, padding=(0, side // 2), count_include_pad=False)
+
+
+def _alike(
+    reference: _Windows, rays: Tensor, rotation: Tensor, translation: Tensor, source: Shot, depths: Tensor
+) -> Float[Tensor, "D h w"]:
+    """Zero-mean normalised cross-correlation of each pixel's window with where each plane carries it."""
+    turned = rays @ rotation.T
+    points = depths[:, None, None, None] * turned + translation
+    grid, inside = to_grid(points, source)
+    picture = source.image.mean(dim=-1)[None, None]
+    warped = torch.nn.functional.grid_sample(
+        picture.expand(len(depths), -1, -1, -1), grid, align_corners=False, padding_mode="border"
+    )
+    other = _Windows(warped)
+    covariance = window_mean(warped * reference.pictures) - other.mean * reference.mean
+    found = covariance / (other.deviation * reference.deviation + 1e-4)
+    return torch.where(inside, found[:, 0], -1)
+
+
+def to_grid(points: Float[Tensor, "*n 3"], shot: Shot) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    """Where points in a camera lie in its picture, as grid_sample counts (−1 to 1), and whether they are in it."""
+    x, y, z = points.unbind(-1)
+    safe = z.clamp(min=1e-6)
+    u = shot.K[0, 0] * x / safe + shot.K[0, 2]
+    v = shot.K[1, 1] * y / safe + shot.K[1, 2]
+    inside = (z > 1e-6) & (u > 0) & (u < shot.width) & (v > 0) & (v < shot.height)
+    return torch.stack((2 * u / shot.width - 1, 2 * v / shot.height - 1), dim=-1), inside
+
+
+def sample_nearest(values: Float[Tensor, "h w"], grid: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
+    """The pixel that each place of `to_grid` lies in; 0 outside."""
+    return torch.nn.functional.grid_sample(
+        values[None, None], grid[None, None], mode="nearest", align_corners=False, padding_mode="zeros"
+    )[0, 0, 0]
+
+
+def agreeing(
+    depth: Float[Tensor, "h w"],
+    shot: Shot,
+    pose: Float[Tensor, "4 4"],
+    others: Sequence[tuple[DepthMap, Shot, Float[Tensor, "4 4"]]],
+    tolerance: float,
+) -> Int64[Tensor, "h w"]:
+    """In how many other depth maps a pixel's point lies where they, too, found a surface.
+
+    Args:
+        depth: of the view, 0 = unknown.
+        shot: the view.
+        pose: its cam_from_world.
+        others: depth maps of other views.
+        tolerance: relative difference of depths.
+    """
+    points = (_pixel_rays(shot) * depth.unsqueeze(-1)).reshape(-1, 3)
+    votes = torch.zeros(len(points), dtype=torch.int64)
+    for found, other, other_pose in others:
+        rotation, translation = _relative(pose, other_pose)
+        there = points @ rotation.T + translation
+        grid, inside = to_grid(there, other)
+        measured = sample_nearest(found.depth, grid)
+        votes += inside & (measured > 0) & ((there[:, 2] - measured).abs() <= tolerance * measured)
+    return torch.where(depth.reshape(-1) > 0, votes, 0).reshape(depth.shape)
+
+
+def world_points(depth: Float[Tensor, "h w"], shot: Shot, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "h w 3"]:
+    """Where the pixels' surfaces lie in the world."""
+    camera = _pixel_rays(shot) * depth.unsqueeze(-1)
+    return (camera - pose[:3, 3]) @ pose[:3, :3]

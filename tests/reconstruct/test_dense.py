@@ -1,0 +1,108 @@
+"""Plane sweeps and what is filled between them, on a wall whose depths are known."""
+
+import numpy as np
+import pytest
+import torch
+from walls import DEPTH, TILT, cameras, seen, wall_points, wall_views
+
+from gsencoder.errors import InputError
+from gsencoder.reconstruct.dense import DenseConfig, coverage, densify, interpolate, splat_depths, thin
+from gsencoder.reconstruct.photographs import Photographs
+from gsencoder.reconstruct.stereo import DepthMap, agreeing, neighbours_of, sweep, world_points
+
+SMALL = DenseConfig(size=96, sources=3, samples=1)
+
+
+def pose(view: int, count: int = 4) -> torch.Tensor:
+    return torch.from_numpy(cameras(count).cam_from_world[view])
+
+
+def test_a_sweep_finds_the_depth_of_a_slanted_wall() -> None:
+    photographs = Photographs(wall_views())
+    shots = [photographs.shot(view) for view in range(4)]
+    found = sweep(shots[1], pose(1), [shots[0], shots[2], shots[3]], [pose(0), pose(2), pose(3)], 2.0, 5.0)
+    truth = torch.from_numpy(seen(cameras(), 1)[1])
+    known = (found.depth > 0) & (found.score > 0.8)
+    assert known.float().mean() > 0.6
+    error = ((found.depth - truth).abs() / truth)[known]
+    assert error.median() < 0.01
+    assert error.quantile(0.9) < 0.03
+
+
+def test_depths_agree_where_they_are_true_and_nowhere_else() -> None:
+    photographs = Photographs(wall_views())
+    shots = [photographs.shot(view) for view in range(3)]
+    truths = [torch.from_numpy(seen(cameras(), view)[1]) for view in range(3)]
+    others = [
+        (DepthMap(truths[view], torch.ones_like(truths[view]), truths[view]), shots[view], pose(view))
+        for view in (0, 2)
+    ]
+    votes = agreeing(truths[1], shots[1], pose(1), others, 0.02)
+    assert (votes[:, 16:-16] == 2).all()
+    assert (agreeing(1.1 * truths[1], shots[1], pose(1), others, 0.02) == 0).all()
+    assert (agreeing(0 * truths[1], shots[1], pose(1), others, 0.02) == 0).all()
+
+
+def test_points_go_to_the_world_and_back() -> None:
+    photographs = Photographs(wall_views())
+    shot, truth = photographs.shot(2), torch.from_numpy(seen(cameras(), 2)[1])
+    points = world_points(truth, shot, pose(2))
+    torch.testing.assert_close(points[..., 2], DEPTH + TILT * points[..., 0])
+    torch.testing.assert_close(splat_depths(points.reshape(-1, 3), shot, pose(2)), truth)
+
+
+def test_views_that_share_points_at_a_good_angle_are_neighbours() -> None:
+    made = cameras(6, step=0.2)
+    found = neighbours_of(made, wall_points(200), range(6), 2)
+    assert all(len(others) == 2 and view not in others for view, others in found.items())
+    assert 5 not in found[0]
+    alone = neighbours_of(made, wall_points(200) + np.float32([0, 0, -100]), range(6), 2)
+    assert all(others == [] for others in alone.values())
+
+
+def test_holes_in_a_plane_are_filled_with_the_plane() -> None:
+    truth = torch.from_numpy(seen(cameras(), 0)[1])
+    holes = truth.clone()
+    holes[20:40, 30:50] = 0
+    filled = interpolate(holes)
+    assert torch.equal(filled[holes > 0], truth[holes > 0])
+    assert ((filled - truth).abs() / truth).max() < 0.05
+    assert not interpolate(torch.zeros(5, 7)).any()
+
+
+def test_a_voxel_gives_the_mean_of_enough_samples_and_nothing_beside_others() -> None:
+    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [5.5, 0, 0], [9.1, 0, 0], [9.3, 0, 0]], np.float32)
+    colors = np.array([[0] * 3, [10] * 3, [20] * 3, [30] * 3, [40] * 3], np.uint8)
+    places, tints = thin(points, colors, 1.0, 2)
+    np.testing.assert_allclose(places, [[0.2, 0.1, 0.1], [9.2, 0, 0]], atol=1e-6)
+    assert tints.tolist() == [[5] * 3, [35] * 3]
+    places, _ = thin(points, colors, 1.0, 2, beside=np.array([[9.9, 0.5, 0.5]], np.float32))
+    np.testing.assert_allclose(places, [[0.2, 0.1, 0.1]], atol=1e-6)
+    assert thin(points[:0], colors[:0], 1.0, 1)[0].shape == (0, 3)
+
+
+def test_few_points_on_a_wall_become_many_that_lie_on_it() -> None:
+    photographs, points = Photographs(wall_views()), wall_points()
+    found = densify(photographs, range(4), points, np.full((len(points), 3), 128, np.uint8), SMALL)
+    assert found is not None
+    # What fewer than three of the views show stays bare.
+    assert found.coverage[0] < 0.2 < 0.65 < found.coverage[1]
+    assert found.swept > 500
+    new = found.points[len(points) :]
+    off = np.abs(new[:, 2] - DEPTH - TILT * new[:, 0]) / DEPTH
+    assert np.median(off) < 0.01
+    assert np.quantile(off, 0.95) < 0.05
+
+
+def test_points_that_cover_the_pictures_are_left_alone() -> None:
+    points = wall_points(20_000)
+    assert coverage(cameras(), range(4), points) > 0.95
+    assert densify(Photographs(wall_views()), range(4), points, np.zeros((len(points), 3), np.uint8), SMALL) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("enough", 2.0), ("spacing", 0.0), ("spacing", float("inf")), ("size", 8), ("sources", 1)]
+)
+def test_settings_that_mean_nothing_are_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=name):
+        DenseConfig(**{name: value})

@@ -1,0 +1,209 @@
+"""Fitting: it gets better, it takes up where it stopped, it prunes what does nothing, and nothing bad gets in."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from splats import front_camera, random_gaussians
+from walls import wall_views
+
+from gsencoder.data.seeds import seed_from_depth
+from gsencoder.errors import InputError
+from gsencoder.reconstruct.checkpoint import load_state, save_state
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.parameters import camera_of, gaussians_of, parameters_from, rows_in_view
+from gsencoder.reconstruct.photographs import Photographs
+from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
+from gsencoder.render.rasterize import RasterConfig
+from gsencoder.types import Gaussians
+
+QUICK = OptimizeConfig(steps=40, sh_degree=1, shrinks=(2, 1), shares=(0.5, 0.5))
+NEVER = PruneConfig(at=())
+
+
+def seeds() -> Gaussians:
+    return seed_from_depth(wall_views(depth=True), voxel=0.06)
+
+
+def optimizer(config: OptimizeConfig = QUICK, start: Gaussians | None = None, **changes: object) -> Optimizer:
+    photographs = Photographs(wall_views(depth=True))
+    return Optimizer(start or seeds(), photographs, [0, 1, 3], config, **{"prune": NEVER, **changes})
+
+
+def test_parameters_give_back_the_splat() -> None:
+    splat = random_gaussians(50, degree=1)
+    found = gaussians_of(parameters_from(splat, 2))
+    assert found.sh.shape == (50, 9, 3)
+    np.testing.assert_array_equal(found.sh[:, :4], splat.sh)
+    assert not found.sh[:, 4:].any()
+    for name in ("means", "quats", "scales"):
+        np.testing.assert_allclose(getattr(found, name), getattr(splat, name), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found.opacities, splat.opacities.clip(1e-3, 1 - 1e-3), atol=1e-6)
+    assert gaussians_of(parameters_from(splat, 0)).sh.shape == (50, 1, 3)
+
+
+@pytest.mark.parametrize("log_scale", [-6.0, -2.0, 1.0])
+def test_rows_in_view_are_all_that_a_picture_shows(log_scale: float) -> None:
+    splat = random_gaussians(600, center=(0, 0, 1.5), log_scale=log_scale)
+    camera = front_camera()
+    raw = parameters_from(splat, 0)
+    pose, K, _ = camera_of(camera, 0, "cpu")
+    rows = set(rows_in_view(raw, pose, K, 61, 43, near=0.01, eps2d=0.3).tolist())
+    from gsencoder.render import blend
+
+    assert set(blend(splat, camera).columns.tolist()) <= rows
+    assert len(rows) < 600
+
+
+def test_a_splat_gets_nearer_to_photographs_that_it_was_not_fitted_to() -> None:
+    one = optimizer(replace(QUICK, steps=120))
+    before = one.score([2])
+    terms = [one.advance() for _ in range(120)]
+    after = one.score([2])
+    assert after[0] > before[0] + 1.5
+    assert after[1] > before[1]
+    assert set(terms[0]) == {"l1", "ssim", "depth"}
+    assert len(one.gaussians()) == len(seeds())
+
+
+def test_each_round_shows_every_photograph_once() -> None:
+    one = optimizer()
+    for turn in range(3):
+        assert sorted(one.view_at(3 * turn + place) for place in range(3)) == [0, 1, 3]
+
+
+def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    whole, cut = optimizer(), optimizer()
+    for _ in range(20):
+        whole.advance()
+    for _ in range(8):
+        cut.advance()
+    save_state(tmp_path / "state", cut, 1.5, {"run": 1})
+    again = optimizer()
+    assert load_state(tmp_path / "state", again, {"run": 1}) == 1.5
+    for _ in range(12):
+        again.advance()
+    for name, value in whole.raw.items():
+        assert torch.equal(value, again.raw[name]), name
+    with pytest.raises(InputError, match=r"run=1, and this run asks run=2; give resume=false"):
+        load_state(tmp_path / "state", optimizer(), {"run": 2})
+
+
+def test_what_does_nothing_is_taken_out_and_nothing_else() -> None:
+    splat, photographs = seeds(), Photographs(wall_views(depth=True))
+    raw = parameters_from(splat, 0)
+    raw["logit_opacities"][3] = -9
+    raw["means"][5] = torch.tensor([0.0, 0, -5])
+    raw["log_scales"][7] = 3
+    raw["means"][9] += torch.tensor([0.0, 0, 2.0])  # Behind the wall.
+    shots = [(view, photographs.shot(view, 2)) for view in range(4)]
+    kept = rows_to_keep(raw, photographs.cameras, shots, PruneConfig(screen=0.9), RasterConfig())
+    gone = sorted(set(range(len(splat))) - set(kept.tolist()))
+    assert {3, 5, 7} <= set(gone)
+    raw["log_scales"][7] = raw["log_scales"][8]
+    kept = rows_to_keep(raw, photographs.cameras, shots, PruneConfig(screen=0.9), RasterConfig())
+    assert {3, 5, 9} <= set(range(len(splat))) - set(kept.tolist())
+    assert len(kept) > 0.8 * len(splat)
+
+
+def test_pruning_happens_when_it_is_due() -> None:
+    start = seeds()
+    start.opacities[:20] = 0.001
+    one = optimizer(start=start, prune=PruneConfig(at=(0.5,), opacity=0.01, contribution=0.0, screen=0.0))
+    counts = []
+    for _ in range(40):
+        one.advance()
+        counts.append(len(one.raw["means"]))
+    assert counts[18] == len(start)
+    assert counts[20] < len(start)
+    assert all(len(moments["means"]) == counts[-1] for moments in (one.adam.averages, one.adam.squares))
+
+
+def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
+    """Opacities at the ends, splats behind and on the camera, needles and discs, black and saturated pictures."""
+    made = np.random.default_rng(0)
+    start = random_gaussians(400, center=(0, 0, 2.0))
+    start.opacities[:100] = made.integers(0, 2, 100)
+    start.means[100:140] = start.means[100:140] * (1, 1, -1)
+    start.means[140:160] = 0
+    start.scales[160:220] = (1e-6, 1e-6, 1)
+    start.scales[220:280] = (1, 1, 1e-6)
+    start.scales[280:290] = 1e-9
+    start.scales[290:300] = 1e3
+    views = wall_views()
+    images = [np.array(image) for image in views.images or ()]
+    images[0][:], images[1][:] = 0, 255
+    photographs = Photographs(replace(views, images=images))
+    config = OptimizeConfig(steps=150, sh_degree=3, shrinks=(1,), shares=(1.0,))
+    one = Optimizer(start, photographs, range(4), config, prune=PruneConfig(at=(0.5,)))
+    for _ in range(150):
+        one.advance()
+    assert all(bool(torch.isfinite(value).all()) for value in one.raw.values())
+    assert len(one.gaussians()) > 0
+
+
+def test_a_gradient_that_is_not_finite_stops_before_the_step() -> None:
+    one = optimizer()
+    one.photographs._images[one.view_at(0)] = torch.full((72, 96, 3), torch.nan)
+    before = {name: value.clone() for name, value in one.raw.items()}
+    with pytest.raises(InputError, match=r"the loss l1 is not finite at step 0, photograph 'view_\d.png'"):
+        one.advance()
+    assert all(torch.equal(value, before[name]) for name, value in one.raw.items())
+
+
+def test_masked_pixels_do_not_count() -> None:
+    views = wall_views()
+    mask = np.ones((72, 96), bool)
+    mask[:, :40] = False
+    spoilt = [np.where(mask[..., None], image, 255).astype(np.uint8) for image in views.images or ()]
+    raws = []
+    for images in (views.images, spoilt):
+        photographs = Photographs(replace(views, images=images, masks=[mask] * 4))
+        one = Optimizer(seeds(), photographs, range(4), replace(QUICK, shrinks=(1,), shares=(1.0,)), prune=NEVER)
+        for _ in range(4):
+            one.advance()
+        raws.append(one.raw)
+    for name, value in raws[0].items():
+        torch.testing.assert_close(value, raws[1][name], rtol=1e-4, atol=1e-5)
+
+
+def test_smaller_photographs_keep_their_rays() -> None:
+    photographs = Photographs(wall_views(depth=True))
+    whole, half = photographs.shot(1), photographs.shot(1, 2)
+    assert (half.width, half.height) == (48, 36)
+    torch.testing.assert_close(half.image[3, 4], whole.image[6:8, 8:10].mean(dim=(0, 1)))
+    assert half.depth is not None
+    assert whole.depth is not None
+    torch.testing.assert_close(half.depth[3, 4], whole.depth[6:8, 8:10].mean(), rtol=1e-2, atol=0)
+    ray = (5.0 - half.K[0, 2]) / half.K[0, 0]
+    torch.testing.assert_close(ray, (10.0 - whole.K[0, 2]) / whole.K[0, 0])
+
+
+def test_a_scene_without_photographs_is_refused() -> None:
+    with pytest.raises(InputError, match="no photographs"):
+        Photographs(replace(wall_views(), images=None))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"steps": -1},
+        {"sh_degree": 4},
+        {"shrinks": (0,), "shares": (1.0,)},
+        {"shares": (1.0,)},
+        {"shrinks": (2, 1), "shares": (0.7, 0.7)},
+        {"ssim_weight": 1.5},
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(InputError, match="expected"):
+        OptimizeConfig(**changes)
+
+
+def test_the_stages_follow_the_shares() -> None:
+    config = OptimizeConfig(steps=100)
+    assert [config.shrink_at(step) for step in (0, 14, 15, 49, 50, 99)] == [4, 4, 2, 2, 1, 1]
+    assert [config.degree_at(step) for step in (0, 19, 20, 40, 99)] == [0, 0, 1, 2, 2]
+    assert config.rates_at(100, 2.0)["means"] == pytest.approx(0.01 * config.rates_at(0, 2.0)["means"])
