@@ -1,0 +1,149 @@
+"""`reconstruct`, as a user runs it: RGB-D, points, a splat to refine, photographs alone, and what goes wrong."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsencoder import cli
+from gsencoder.commands import reconstruct
+from gsencoder.data.splats import load_splat
+from gsencoder.data.synthetic import make_room
+from gsencoder.data.synthetic_write import write_room
+from gsencoder.errors import InputError
+
+QUICK = ("quiet=true", "optimize.steps=12", "holdout=4", "seeds.voxel=0.08", "optimize.sh_degree=1")
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return found
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line that a refused command prints."""
+    capsys.readouterr()
+    assert cli.main(["reconstruct", *arguments]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rooms") / "room"
+    write_room(make_room(0, objects=4, views=6, width=120, height=90), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def built(room: Path) -> Path:
+    out = room.parent / "built"
+    assert cli.main(["reconstruct", str(room), f"out={out}", *QUICK]) == 0
+    return out
+
+
+def test_a_room_becomes_a_splat_with_a_log_and_pictures(built: Path) -> None:
+    results = summary_of(built)["results"]
+    assert (results["source"], results["steps"], results["views"], results["held_out"]) == ("depth", 12, 4, 2)
+    splat = load_splat(built / results["splat"])
+    assert len(splat) == results["gaussians"] > 500
+    assert splat.sh_degree == 1
+    lines = (built / "log.csv").read_text().splitlines()
+    assert lines[0] == "step,seconds,gaussians,psnr,ssim"
+    first, last = (dict(zip(lines[0].split(","), map(float, line.split(",")), strict=True)) for line in lines[1:])
+    assert (first["step"], last["step"]) == (0, 12)
+    assert last["psnr"] == results["psnr"] > first["psnr"]
+    assert (built / "held_out.png").is_file()
+    assert not built.with_name("built.reconstruction").exists()
+
+
+def test_a_splat_is_refined(room: Path, built: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = [str(room), f"splat={built / 'splat.ply'}", f"out={out}", *QUICK]
+    assert cli.main(["reconstruct", *words]) == 0
+    results = summary_of(out)["results"]
+    assert results["source"] == "splat"
+    assert results["psnr"] > summary_of(built)["results"]["psnr"]
+
+
+def test_a_run_that_is_interrupted_goes_on_to_the_same_splat(
+    room: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    advance = reconstruct.Optimizer.advance
+
+    def stop_at_five(self: reconstruct.Optimizer) -> dict[str, float]:
+        if self.step == 5:
+            raise KeyboardInterrupt
+        return advance(self)
+
+    words = ["reconstruct", str(room), f"out={out}", *QUICK]
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", stop_at_five)
+        assert cli.main(words) == 130
+    assert not out.exists()
+    assert cli.main(words) == 0
+    found, whole = load_splat(out / "splat.ply"), load_splat(built / "splat.ply")
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", stop_at_five)
+        assert cli.main([*words, "overwrite=true"]) == 130
+    assert (out / "splat.ply").is_file()
+
+
+def test_photographs_alone_are_placed_or_refused_in_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], room: Path
+) -> None:
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    assert "neither a scene nor a folder of scenes" in refusal(capsys, str(alone))
+    for number, path in enumerate(sorted((room / "images").iterdir())[:2]):
+        shutil.copy(path, alone / f"{number}{path.suffix}")
+    assert "expected at least 3 photographs" in refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
+    from PIL import Image
+
+    for number in range(4):
+        Image.new("RGB", (80, 60), (60 * number, 90, 20)).save(alone / f"{number}.png")
+    told = refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
+    assert "could be placed" in told or "cannot place these photographs" in told
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["holdout=1"], "holdout: expected 0 (none) or 2 and more"),
+        (["data.max_views=2", "holdout=2"], "expected at least 2 photographs to fit"),
+        (["optimize.steps=-1"], "optimize.steps: expected 0 or more"),
+        (["seeds.source=points"], "has no structure-from-motion points"),
+        pytest.param(
+            ["device=cuda"], "sees no GPU", marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is one")
+        ),
+        (["splat=nothing.ply"], "nothing.ply"),
+    ],
+)
+def test_what_cannot_be_is_told(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], told: str
+) -> None:
+    assert told in refusal(capsys, str(room), f"out={tmp_path / 'out'}", *words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bare_splat_cannot_be_fitted_to_anything(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = refusal(capsys, str(built / "splat.ply"), f"out={tmp_path / 'out'}")
+    assert "a splat without photographs" in told
+
+
+def test_every_eighth_photograph_is_kept() -> None:
+    assert reconstruct.split(10, 4) == ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
+    assert reconstruct.split(3, 0) == ([0, 1, 2], [])
+    with pytest.raises(InputError, match="at least 2 photographs"):
+        reconstruct.split(2, 2)
