@@ -33,6 +33,8 @@ from gsencoder.types import Cameras
 
 FILLED_SPACING = 2.0
 """Interpolated seeds stand on a grid so much coarser: they are where little is to be seen."""
+SEEN_THROUGH = 1
+"""So many views may see through a point that no view finds."""
 CELL = 1 / 40
 """Side of the cells in which coverage is counted, as a share of the picture's longer side."""
 
@@ -142,8 +144,9 @@ def densify(
     seen = _fill_depths(agreed, shots, poses, points)
     filled = _points_of(_gaps(seen, agreed, shots, poses, neighbours, config), shots, poses)
     voxel = config.spacing * _pixel_size(cameras, agreed)
-    swept = thin(*swept, voxel, config.samples)
+    swept = carve(*thin(*swept, voxel, config.samples), agreed, shots, poses, config.agree)
     filled = thin(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
+    filled = carve(*filled, agreed, shots, poses, config.agree)
     places, tints = (np.concatenate(parts) for parts in zip((points, colors), swept, filled, strict=True))
     after = coverage(cameras, training, places)
     return Dense(
@@ -155,6 +158,38 @@ def _pixel_size(cameras: Cameras, depths: Mapping[int, Float[Tensor, "h w"]]) ->
     """What a pixel of a typical photograph covers of the surfaces that were found, in world units."""
     found = [(view, depth[depth > 0]) for view, depth in depths.items()]
     return float(np.median([float(z.median() / cameras.Ks[view, 0, 0]) for view, z in found if len(z)] or [1.0]))
+
+
+def carve(
+    points: Float32[np.ndarray, "P 3"],
+    colors: UInt8[np.ndarray, "P 3"],
+    agreed: Mapping[int, Float[Tensor, "h w"]],
+    shots: Mapping[int, Shot],
+    poses: Mapping[int, Tensor],
+    tolerance: float,
+) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Takes out points that stand in the way: more views see through them, to a surface that was found behind, than
+    find one where they are.
+
+    Args:
+        points: world units.
+        colors: beside them.
+        agreed: depths of each view, 0 = unknown.
+        shots: the views.
+        poses: their cam_from_world.
+        tolerance: relative difference of depths that agree; what lies in front by twice as much is seen through.
+    """
+    places = torch.from_numpy(points)
+    through, there = (torch.zeros(len(points), dtype=torch.int64) for _ in range(2))
+    for view, depth in agreed.items():
+        camera = places @ poses[view][:3, :3].T + poses[view][:3, 3]
+        grid, inside = to_grid(camera, shots[view])
+        measured = sample_nearest(depth, grid)
+        known = inside & (measured > 0)
+        through += known & (camera[:, 2] < (1 - 2 * tolerance) * measured)
+        there += known & ((camera[:, 2] - measured).abs() <= tolerance * measured)
+    kept = (through <= there.clamp(min=SEEN_THROUGH)).numpy()
+    return points[kept], colors[kept]
 
 
 def thin(

@@ -6,7 +6,7 @@ import torch
 from walls import DEPTH, TILT, cameras, seen, wall_points, wall_views
 
 from gsencoder.errors import InputError
-from gsencoder.reconstruct.dense import DenseConfig, coverage, densify, interpolate, splat_depths, thin
+from gsencoder.reconstruct.dense import DenseConfig, carve, coverage, densify, interpolate, splat_depths, thin
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.stereo import DepthMap, agreeing, neighbours_of, sweep, world_points
 
@@ -79,6 +79,22 @@ def test_a_voxel_gives_the_mean_of_enough_samples_and_nothing_beside_others() ->
     places, _ = thin(points, colors, 1.0, 2, beside=np.array([[9.9, 0.5, 0.5]], np.float32))
     np.testing.assert_allclose(places, [[0.2, 0.1, 0.1]], atol=1e-6)
     assert thin(points[:0], colors[:0], 1.0, 1)[0].shape == (0, 3)
+
+
+def test_what_stands_in_the_way_is_carved_out() -> None:
+    photographs = Photographs(wall_views())
+    shots = {view: photographs.shot(view) for view in range(4)}
+    depths = {view: torch.from_numpy(seen(cameras(), view)[1]) for view in range(4)}
+    poses = {view: pose(view) for view in range(4)}
+    on = np.array([[0.2, 0.1, DEPTH + 0.2 * TILT], [0.0, 0.0, DEPTH]], np.float32)
+    floating, hidden, elsewhere = ([[0.2, 0.1, 2.0]], [[0.2, 0.1, 4.0]], [[50.0, 0.0, 2.0]])
+    points = np.concatenate((on, np.array(floating + hidden + elsewhere, np.float32)))
+    colors = np.arange(15, dtype=np.uint8).reshape(5, 3)
+    kept, tints = carve(points, colors, depths, shots, poses, 0.02)
+    np.testing.assert_array_equal(kept, points[[0, 1, 3, 4]])
+    np.testing.assert_array_equal(tints, colors[[0, 1, 3, 4]])
+    unknown = {view: torch.zeros_like(depth) for view, depth in depths.items()}
+    assert len(carve(points, colors, unknown, shots, poses, 0.02)[0]) == 5
 
 
 def test_few_points_on_a_wall_become_many_that_lie_on_it() -> None:
