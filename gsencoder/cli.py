@@ -173,8 +173,9 @@ def _run(command: Command, config: Any, debug: bool) -> None:
 
     cls, run = command.load()
     check_required(cls, config)
-    refuse_to_replace_inputs(config.out, settings(config))
-    summary = Summary(command.name, settings(config))
+    given = settings(config)
+    refuse_to_replace_inputs(config.out, given)
+    summary = Summary(command.name, given)
     with _collected_warnings(summary.warnings, debug):
         run(config, summary)
 

@@ -1,8 +1,7 @@
 """`gsencoder reconstruct SCENE`: photographs to Gaussians, on a CPU or a GPU."""
 
-import csv
-import io
 import os
+import shutil
 import time
 import warnings
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.pictures import contact_sheet
 from gsencoder.models.device import Device, choose_device
 from gsencoder.models.heap import keep_heap
-from gsencoder.outputs import close_work_folder, open_work_folder, output_folder, refuse_to_replace_inputs, write_bytes
+from gsencoder.outputs import close_work_folder, open_work_folder, output_folder, refuse_to_replace_inputs
 from gsencoder.progress import Progress, console
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, load_state, save_state
 from gsencoder.reconstruct.dense import DenseConfig
@@ -32,12 +31,13 @@ from gsencoder.reconstruct.sfm import SfmConfig, photographs_in, place_photograp
 from gsencoder.reconstruct.start import start_of
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.summary import Summary
+from gsencoder.train.log import LOG_FILE, Log, read_log
 from gsencoder.types import Scene
 
-PLY_FILE, LOG_FILE, PICTURES_FILE = "splat.ply", "log.csv", "held_out.png"
+PLY_FILE, PICTURES_FILE = "splat.ply", "held_out.png"
 SHOWN_VIEWS = 4
 Row = dict[str, int | float]
-"""One line of the log: step, seconds, gaussians, psnr, ssim."""
+"""One line of the log, without the step: seconds, gaussians, psnr, ssim."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +100,7 @@ def run(config: ReconstructConfig, summary: Summary) -> None:
             spent = load_state(work / CHECKPOINT_FILE, optimizer, identity)
         with summary.step("optimise"):
             rows = optimise(optimizer, held_out, config, work, identity, spent, track)
-        write_results(folder, scene, optimizer, held_out, rows, summary)
+        write_results(folder, scene, optimizer, held_out, rows, work, summary)
     close_work_folder(work)
     last: Row = rows[-1] if rows else {}
     told = f"; {last['psnr']:.2f} dB, SSIM {last['ssim']:.3f} on {len(held_out)} held-out photographs" if last else ""
@@ -127,9 +127,11 @@ def open_scene(given: Path, work: Path, config: ReconstructConfig, summary: Summ
             placed = place_photographs(pictures, work, config.sfm)
         summary.results.update(placed=len(placed.placed), missing=list(placed.missing), sfm_error=placed.error)
         if placed.missing:
-            _warn(
+            warnings.warn(
                 f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "
-                f"and are not used: {', '.join(placed.missing[:8])}{', …' if len(placed.missing) > 8 else ''}"
+                f"and are not used: {', '.join(placed.missing[:8])}{', …' if len(placed.missing) > 8 else ''}",
+                SceneWarning,
+                stacklevel=2,
             )
         return load_scene(work, options=replace(config.data, images=str(pictures)))
     assert path is not None
@@ -194,16 +196,16 @@ def optimise(
 ) -> list[Row]:
     """All steps that are left; the rows of the log. Whatever stops the run between two steps leaves a checkpoint."""
     screen, steps = console(config.quiet), config.optimize.steps
-    rows = _rows_until(work / LOG_FILE, optimizer.step)
+    log = Log(work, done=optimizer.step, events=False)
+    rows: list[Row] = [{name: float(cell) for name, cell in row.items()} for row in read_log(work / LOG_FILE)]
     begun, saved = time.monotonic() - spent, time.monotonic()
 
     def judge() -> None:
         quality, similarity = optimizer.score(held_out)
         seconds, count = time.monotonic() - begun, len(optimizer.raw["means"])
-        rows.append(
-            {"step": optimizer.step, "seconds": seconds, "gaussians": count, "psnr": quality, "ssim": similarity}
-        )
-        _write_rows(work / LOG_FILE, rows)
+        row: Row = {"seconds": seconds, "gaussians": count, "psnr": quality, "ssim": similarity}
+        log.add(optimizer.step, row)
+        rows.append(row)
         screen.print(
             f"step {optimizer.step} of {steps}: {quality:.2f} dB, SSIM {similarity:.3f}, {count:,} Gaussians, "
             f"{seconds:.0f} s"
@@ -233,12 +235,13 @@ def write_results(
     optimizer: Optimizer,
     held_out: Sequence[int],
     rows: Sequence[Row],
+    work: Path,
     summary: Summary,
 ) -> None:
     """The splat in the world of the scene, the log, and held-out photographs beside what the splat shows."""
     gaussians = optimizer.gaussians()
     save_splat(folder / PLY_FILE, gaussians, origin=scene.origin if scene.origin.any() else None)
-    _write_rows(folder / LOG_FILE, rows)
+    shutil.copy(work / LOG_FILE, folder / LOG_FILE)
     shown = (
         [held_out[i] for i in np.unique(np.linspace(0, len(held_out) - 1, SHOWN_VIEWS).round().astype(int))]
         if held_out
@@ -267,24 +270,6 @@ def write_results(
     )
 
 
-def _rows_until(path: Path, step: int) -> list[Row]:
-    if not path.is_file():
-        return []
-    found: list[Row] = []
-    for row in csv.DictReader(path.read_text(encoding="utf-8").splitlines()):
-        numbers: Row = {name: int(row[name]) for name in ("step", "gaussians")}
-        found.append(numbers | {name: float(row[name]) for name in ("seconds", "psnr", "ssim")})
-    return [row for row in found if row["step"] <= step]
-
-
-def _write_rows(path: Path, rows: Sequence[Row]) -> None:
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, ("step", "seconds", "gaussians", "psnr", "ssim"), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_bytes(path, stream.getvalue().encode())
-
-
 def _identity(config: ReconstructConfig) -> dict[str, Any]:
     """What a run must have in common with one that it continues."""
     names = ("data", "seeds", "sfm", "dense", "optimize", "prune", "raster")
@@ -293,7 +278,3 @@ def _identity(config: ReconstructConfig) -> dict[str, Any]:
         "holdout": config.holdout,
         "splat": config.splat,
     }
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, SceneWarning, stacklevel=3)

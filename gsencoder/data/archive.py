@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, about
 
 VERSION = 1
 DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", "I64": "int64", "U8": "uint8"}
@@ -151,16 +151,14 @@ def open_archive(path: Path) -> Iterator[Archive]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected one that gsencoder wrote")
     try:
-        with safe_open(path, framework="numpy") as file:
+        with about(path), safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
             if not isinstance(header, dict) or header.get("version") != VERSION:
                 found = header.get("version") if isinstance(header, dict) else None
                 raise InputError(f"{path}: expected version {VERSION} of the format, got {found}")
             yield Archive(path, file, header)
-    except InputError as error:
-        if str(path) in str(error):
-            raise
-        raise InputError(f"{path}: {error}") from error
+    except InputError:
+        raise
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged or no safetensors file: {message}") from error

@@ -15,14 +15,15 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from gsencoder.errors import InputError
+from gsencoder.geometry import transform
 from gsencoder.reconstruct.photographs import Photographs, Shot
 from gsencoder.reconstruct.stereo import (
     DepthMap,
     agreeing,
     depth_range,
     in_image,
+    look_up,
     neighbours_of,
-    sample_nearest,
     sweep,
     to_grid,
     window_mean,
@@ -78,7 +79,6 @@ class Dense:
         swept: how many came from plane sweeps.
         filled: how many were interpolated.
         coverage: mean share of the pictures' cells with a point, before and after.
-        voxel: edge of the grid on which those from plane sweeps stand, world units.
     """
 
     points: Float32[np.ndarray, "P 3"]
@@ -86,7 +86,6 @@ class Dense:
     swept: int
     filled: int
     coverage: tuple[float, float]
-    voxel: float
 
 
 def coverage(cameras: Cameras, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
@@ -149,9 +148,7 @@ def densify(
     filled = carve(*filled, agreed, shots, poses, config.agree)
     places, tints = (np.concatenate(parts) for parts in zip((points, colors), swept, filled, strict=True))
     after = coverage(cameras, training, places)
-    return Dense(
-        points=places, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after), voxel=voxel
-    )
+    return Dense(points=places, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after))
 
 
 def _pixel_size(cameras: Cameras, depths: Mapping[int, Float[Tensor, "h w"]]) -> float:
@@ -182,12 +179,10 @@ def carve(
     places = torch.from_numpy(points)
     through, there = (torch.zeros(len(points), dtype=torch.int64) for _ in range(2))
     for view, depth in agreed.items():
-        camera = places @ poses[view][:3, :3].T + poses[view][:3, 3]
-        grid, inside = to_grid(camera, shots[view])
-        measured = sample_nearest(depth, grid)
-        known = inside & (measured > 0)
-        through += known & (camera[:, 2] < (1 - 2 * tolerance) * measured)
-        there += known & ((camera[:, 2] - measured).abs() <= tolerance * measured)
+        z, measured = look_up(places, depth, shots[view], poses[view])
+        known = measured > 0
+        through += known & (z < (1 - 2 * tolerance) * measured)
+        there += known & ((z - measured).abs() <= tolerance * measured)
     kept = (through <= there.clamp(min=SEEN_THROUGH)).numpy()
     return points[kept], colors[kept]
 
@@ -257,7 +252,7 @@ def _fill_depths(
 
 def splat_depths(cloud: Float[Tensor, "P 3"], shot: Shot, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "h w"]:
     """The nearest point of each pixel: its depth, 0 where there is none."""
-    camera = cloud @ pose[:3, :3].T + pose[:3, 3]
+    camera = transform(pose, cloud)
     grid, inside = to_grid(camera, shot)
     camera, grid = camera[inside], grid[inside]
     column, row = ((grid + 1) / 2 * torch.tensor([shot.width, shot.height])).long().unbind(-1)
@@ -308,14 +303,13 @@ def _gaps(
         for other in neighbours[view]:
             if other not in seen:
                 continue
-            camera = where @ poses[other][:3, :3].T + poses[other][:3, 3]
-            grid, inside = to_grid(camera, shots[other])
+            grid, inside = to_grid(transform(poses[other], where), shots[other])
             there = torch.nn.functional.grid_sample(smooth[other][None], grid[None, None], align_corners=False)[
                 0, :, 0
             ].T
             votes += inside & ((there - tints).abs().mean(dim=-1) <= config.color)
-            measured = sample_nearest(agreed[other], grid)
-            against |= inside & (measured > 0) & (camera[:, 2] < (1 - 2 * config.agree) * measured)
+            z, measured = look_up(where, agreed[other], shots[other], poses[other])
+            against |= (measured > 0) & (z < (1 - 2 * config.agree) * measured)
         chosen = torch.zeros_like(candidates)
         chosen[candidates] = (votes >= 2) & ~against
         kept[view] = torch.where(chosen, depth, 0)

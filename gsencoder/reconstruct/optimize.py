@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsencoder.errors import InputError
@@ -138,14 +138,9 @@ class Optimizer:
         """
         view = self.view_at(self.step)
         shot = self.photographs.shot(view, self.config.shrink_at(self.step))
-        pose, K, center = camera_of(self.photographs.cameras, view, self.device)
-        K = shot.K.to(self.device)
-        size = (shot.width, shot.height)
-        rows = rows_in_view(self.raw, pose, K, *size, near=self.raster.near, eps2d=self.raster.eps2d)
         terms: dict[str, float] = {}
+        raster, rows, seen = self._look(view, shot, self.config.degree_at(self.step))
         if len(rows):
-            seen = {name: value[rows].requires_grad_() for name, value in self.raw.items()}
-            raster = render(seen, pose, K, center, *size, self.config.degree_at(self.step), self.raster)
             losses = losses_of(raster, shot, self.config)
             total = torch.stack([*losses.values()]).sum()
             total.backward()
@@ -161,12 +156,20 @@ class Optimizer:
         self.whole = True
         return terms
 
-    def prune(self) -> int:
-        """Takes out what does not contribute; how many were taken."""
-        before = len(self.raw["means"])
+    def _look(self, view: int, shot: Shot, degree: int) -> tuple[Raster, Int64[Tensor, " n"], Parameters]:
+        """A view over black, the rows that may show in it, and these rows as leaves that gradients go to."""
+        pose, center = camera_of(self.photographs.cameras, view, self.device)
+        K, size = shot.K.to(self.device), (shot.width, shot.height)
+        rows = rows_in_view(self.raw, pose, K, *size, near=self.raster.near, eps2d=self.raster.eps2d)
+        seen = {name: value[rows].requires_grad_() for name, value in self.raw.items()}
+        shape = (seen["means"], seen["quats"], seen["log_scales"].exp(), seen["logit_opacities"].sigmoid())
+        raster = rasterize(*shape, seen_colors(seen, degree, center), pose, K, *size, config=self.raster)
+        return raster, rows, seen
+
+    def prune(self) -> None:
+        """Takes out what does not contribute."""
         views = [(view, self.photographs.shot(view, 2)) for view in self.training]
         self.adam.keep(rows_to_keep(self.raw, self.photographs.cameras, views, self.pruning, self.raster))
-        return before - len(self.raw["means"])
 
     def _check(self, view: int, losses: Mapping[str, Tensor], grads: Mapping[str, Tensor]) -> None:
         named = {f"the loss {name}": value for name, value in losses.items()}
@@ -183,11 +186,11 @@ class Optimizer:
         return gaussians_of(self.raw)
 
     @torch.no_grad()
-    def score(self, views: Sequence[int], shrink: int = 1) -> tuple[float, float]:
+    def score(self, views: Sequence[int]) -> tuple[float, float]:
         """Mean PSNR in dB and mean SSIM over views, of the pixels that masks leave."""
         found = []
         for view in views:
-            shot = self.photographs.shot(view, shrink)
+            shot = self.photographs.shot(view)
             picture = self.picture(view, shot)
             found.append((psnr(picture, shot.image, shot.mask), float(ssim(picture, shot.image, shot.mask))))
         return tuple(np.mean(found, axis=0).tolist())
@@ -195,27 +198,7 @@ class Optimizer:
     @torch.no_grad()
     def picture(self, view: int, shot: Shot) -> Float[Tensor, "H W 3"]:
         """A view as it is now, in [0, 1]."""
-        pose, _, center = camera_of(self.photographs.cameras, view, self.device)
-        K, size = shot.K.to(self.device), (shot.width, shot.height)
-        rows = rows_in_view(self.raw, pose, K, *size, near=self.raster.near, eps2d=self.raster.eps2d)
-        seen = {name: value[rows] for name, value in self.raw.items()}
-        return render(seen, pose, K, center, *size, self.config.sh_degree, self.raster).rgb.clamp(0, 1).cpu()
-
-
-def render(
-    raw: Parameters,
-    pose: Float[Tensor, "4 4"],
-    K: Float[Tensor, "3 3"],
-    center: Float[Tensor, "3"],
-    width: int,
-    height: int,
-    degree: int,
-    config: RasterConfig,
-) -> Raster:
-    """One view of parameters, over black."""
-    colors = seen_colors(raw, degree, center)
-    scales, opacities = raw["log_scales"].exp(), raw["logit_opacities"].sigmoid()
-    return rasterize(raw["means"], raw["quats"], scales, opacities, colors, pose, K, width, height, config=config)
+        return self._look(view, shot, self.config.sh_degree)[0].rgb.clamp(0, 1).cpu()
 
 
 def losses_of(raster: Raster, shot: Shot, config: OptimizeConfig) -> dict[str, Float[Tensor, ""]]:

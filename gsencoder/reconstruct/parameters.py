@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gsencoder.geometry import colors_from_sh, normalize_quats
+from gsencoder.geometry import colors_from_sh, normalize_quats, transform
 from gsencoder.types import Cameras, Gaussians
 
 OPACITY_ENDS = 1e-3
@@ -68,7 +68,7 @@ def rows_in_view(
     A splat's half width is at most REACH·√((f·s/z)²(1 + t²) + eps2d), where s is its largest scale and t the tangent
     at which geometry.project stops following it sideways.
     """
-    x, y, z = (raw["means"] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]).unbind(1)
+    x, y, z = transform(cam_from_world, raw["means"]).unbind(1)
     inside: Bool[Tensor, " N"] = z > near
     largest = raw["log_scales"].amax(dim=1).exp() / z.clamp(min=near)
     for along, focal, middle, size in ((x, K[0, 0], K[0, 2], width), (y, K[1, 1], K[1, 2], height)):
@@ -79,8 +79,7 @@ def rows_in_view(
     return inside.nonzero().squeeze(1)
 
 
-def camera_of(cameras: Cameras, view: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
-    """cam_from_world, K and centre of a camera as float32 tensors."""
+def camera_of(cameras: Cameras, view: int, device: torch.device | str) -> tuple[Tensor, Tensor]:
+    """cam_from_world and centre of a camera as float32 tensors; its K depends on how small the photograph is."""
     center = torch.from_numpy(cameras.centers[view]).float()
-    pose, K = (torch.from_numpy(part[view].copy()) for part in (cameras.cam_from_world, cameras.Ks))
-    return pose.to(device), K.to(device), center.to(device)
+    return torch.from_numpy(cameras.cam_from_world[view].copy()).to(device), center.to(device)

@@ -60,9 +60,9 @@ def rows_to_keep(
     opacities = raw["logit_opacities"].sigmoid()
     most, widest = torch.zeros_like(opacities), torch.zeros_like(opacities)
     for view, shot in views:
-        pose, full, _ = camera_of(cameras, view, means.device)
+        pose, _ = camera_of(cameras, view, means.device)
         K = shot.K.to(means.device)
-        pixels = float(full[0, 0] / K[0, 0]) ** 2
+        pixels = float(cameras.Ks[view, 0, 0] / shot.K[0, 0]) ** 2
         rows = rows_in_view(raw, pose, K, shot.width, shot.height, near=raster.near, eps2d=raster.eps2d)
         if not len(rows):
             continue

@@ -8,7 +8,6 @@ import numpy as np
 
 from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.data.seeds_points import seed_from_points
-from gsencoder.errors import InputError
 from gsencoder.reconstruct.dense import Dense, DenseConfig, densify
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.tracking import Track, untracked
@@ -93,6 +92,4 @@ def start_of(
     if added is None:
         return Start(gaussians=seed(seen, replace(seeds, source="points")), source="points")
     gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=DENSE_SPACING)
-    if not len(gaussians):
-        raise InputError(f"reconstruct: scene {scene.name!r} has no points to begin with")
     return Start(gaussians=gaussians, source="points", dense=added)

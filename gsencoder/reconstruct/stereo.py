@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
+from gsencoder.geometry import transform
 from gsencoder.reconstruct.photographs import Shot
 from gsencoder.types import Cameras
 
@@ -215,6 +216,15 @@ def sample_nearest(values: Float[Tensor, "h w"], grid: Float[Tensor, "n 2"]) -> 
     )[0, 0, 0]
 
 
+def look_up(
+    points: Float[Tensor, "n 3"], depth: Float[Tensor, "h w"], shot: Shot, pose: Float[Tensor, "4 4"]
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Depths of world points in a view, and the depths that were found where they project: 0 = none, or outside."""
+    camera = transform(pose, points)
+    grid, inside = to_grid(camera, shot)
+    return camera[:, 2], torch.where(inside, sample_nearest(depth, grid), 0)
+
+
 def agreeing(
     depth: Float[Tensor, "h w"],
     shot: Shot,
@@ -231,14 +241,11 @@ def agreeing(
         others: depth maps of other views.
         tolerance: relative difference of depths.
     """
-    points = (_pixel_rays(shot) * depth.unsqueeze(-1)).reshape(-1, 3)
+    points = world_points(depth, shot, pose).reshape(-1, 3)
     votes = torch.zeros(len(points), dtype=torch.int64)
     for found, other, other_pose in others:
-        rotation, translation = _relative(pose, other_pose)
-        there = points @ rotation.T + translation
-        grid, inside = to_grid(there, other)
-        measured = sample_nearest(found.depth, grid)
-        votes += inside & (measured > 0) & ((there[:, 2] - measured).abs() <= tolerance * measured)
+        z, measured = look_up(points, found.depth, other, other_pose)
+        votes += (measured > 0) & ((z - measured).abs() <= tolerance * measured)
     return torch.where(depth.reshape(-1) > 0, votes, 0).reshape(depth.shape)
 
 

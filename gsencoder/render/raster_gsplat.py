@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -45,4 +44,4 @@ def rasterize_gsplat(
     )
     radii = found["radii"][0].to(means.dtype)
     radii = radii.amax(dim=-1) if radii.ndim == 2 else radii
-    return rendered[0, ..., :3], alphas[0, ..., 0], rendered[0, ..., 3], found["means2d"][0], radii * torch.ones(())
+    return rendered[0, ..., :3], alphas[0, ..., 0], rendered[0, ..., 3], found["means2d"][0], radii
