@@ -22,11 +22,14 @@ from gsencoder.models.device import Device, choose_device
 from gsencoder.models.heap import keep_heap
 from gsencoder.outputs import close_work_folder, open_work_folder, output_folder, refuse_to_replace_inputs
 from gsencoder.progress import Progress, console
-from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, load_state, save_state
+from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.dense import DenseConfig
+from gsencoder.reconstruct.judge import Score, score, seen_pixels
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.sfm import SfmConfig, photographs_in, place_photographs
 from gsencoder.reconstruct.start import start_of
 from gsencoder.render.rasterize import RasterConfig
@@ -37,7 +40,7 @@ from gsencoder.types import Scene
 PLY_FILE, PICTURES_FILE = "splat.ply", "held_out.png"
 SHOWN_VIEWS = 4
 Row = dict[str, int | float]
-"""One line of the log, without the step: seconds, gaussians, psnr, ssim."""
+"""One line of the log, without the step: seconds, gaussians, and what a Score holds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,22 +91,29 @@ def run(config: ReconstructConfig, summary: Summary) -> None:
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         refuse_to_replace_inputs(work, settings(config))
         open_work_folder(work, anew=not config.resume)
+        identity = {"scene": str(given.resolve()), **_identity(config)}
+        optimize, checkpoint = config.optimize, work / CHECKPOINT_FILE
+        state = None
+        if checkpoint.is_file():
+            state = load_state(checkpoint, identity, steps=optimize.steps, sh_degree=optimize.sh_degree, device=device)
         scene = open_scene(given, work, config, summary)
         assert scene.views is not None
         with summary.step("read"):
             photographs = Photographs(scene.views, track=track)
         training, held_out = split(len(photographs), config.holdout)
-        optimizer = start(scene, photographs, training, config, summary, track, device)
-        identity = {"scene": str(given.resolve()), **_identity(config)}
-        spent = 0.0
-        if (work / CHECKPOINT_FILE).is_file():
-            spent = load_state(work / CHECKPOINT_FILE, optimizer, identity)
+        if state is None:
+            with summary.step("seeds"):
+                state = begin(scene, photographs, training, config, track, device)
+            save_state(checkpoint, state, identity)
+        summary.results.update(state.facts)
+        optimizer = Optimizer(
+            state.adam, photographs, training, optimize, prune=config.prune, raster=config.raster, step=state.step
+        )
         with summary.step("optimise"):
-            rows = optimise(optimizer, held_out, config, work, identity, spent, track)
+            rows = optimise(optimizer, state, held_out, config, work, identity, track)
         write_results(folder, scene, optimizer, held_out, rows, work, summary)
     close_work_folder(work)
-    last: Row = rows[-1] if rows else {}
-    told = f"; {last['psnr']:.2f} dB, SSIM {last['ssim']:.3f} on {len(held_out)} held-out photographs" if last else ""
+    told = f"; {_told(rows[-1])} on {len(held_out)} held-out photographs" if rows else ""
     console(config.quiet).print(f"{out / PLY_FILE}: {summary.results['gaussians']:,} Gaussians{told}")
 
 
@@ -123,6 +133,11 @@ def open_scene(given: Path, work: Path, config: ReconstructConfig, summary: Summ
             raise
         path = None
     if path is None and pictures is not None:
+        if config.splat:
+            raise InputError(
+                f"{given}: splat={config.splat} lies in a world of its own, and photographs without poses are placed "
+                "in another; give a scene with the poses that belong to the splat"
+            )
         with summary.step("place"):
             placed = place_photographs(pictures, work, config.sfm)
         summary.results.update(placed=len(placed.placed), missing=list(placed.missing), sfm_error=placed.error)
@@ -154,62 +169,56 @@ def split(count: int, every: int) -> tuple[list[int], list[int]]:
     return training, held_out
 
 
-def start(
+def begin(
     scene: Scene,
     photographs: Photographs,
     training: Sequence[int],
     config: ReconstructConfig,
-    summary: Summary,
     track: Progress,
     device: torch.device,
-) -> Optimizer:
-    """The optimiser of a scene at its first step."""
-    with summary.step("seeds"):
-        begun = start_of(scene, photographs, training, config.seeds, config.dense, track=track)
-    summary.results.update(seeds=len(begun.gaussians), source=begun.source)
+) -> State:
+    """The state before the first step, and how it came about."""
+    begun = start_of(scene, photographs, training, config.seeds, config.dense, track=track)
+    facts: dict[str, Any] = {"seeds": len(begun.gaussians), "source": begun.source}
     if begun.dense is not None:
         dense = begun.dense
-        summary.results.update(swept=dense.swept, filled=dense.filled, coverage=list(dense.coverage))
+        facts |= {"swept": dense.swept, "filled": dense.filled, "coverage": list(dense.coverage)}
         console(config.quiet).print(
             f"points reach {dense.coverage[0]:.0%} of the pictures' cells: {dense.swept:,} were added from plane "
             f"sweeps and {dense.filled:,} between them, which reach {dense.coverage[1]:.0%}"
         )
-    return Optimizer(
-        begun.gaussians,
-        photographs,
-        training,
-        config.optimize,
-        prune=config.prune,
-        raster=config.raster,
-        device=device,
-    )
+    adam = RowAdam(parameters_from(begun.gaussians, config.optimize.sh_degree, device))
+    return State(adam=adam, step=0, seconds=0.0, facts=facts)
 
 
 def optimise(
     optimizer: Optimizer,
+    state: State,
     held_out: Sequence[int],
     config: ReconstructConfig,
     work: Path,
     identity: dict[str, Any],
-    spent: float,
     track: Progress,
 ) -> list[Row]:
     """All steps that are left; the rows of the log. Whatever stops the run between two steps leaves a checkpoint."""
     screen, steps = console(config.quiet), config.optimize.steps
     log = Log(work, done=optimizer.step, events=False)
     rows: list[Row] = [{name: float(cell) for name, cell in row.items()} for row in read_log(work / LOG_FILE)]
-    begun, saved = time.monotonic() - spent, time.monotonic()
+    seen = seen_pixels(optimizer.photographs, held_out, optimizer.training)
+    begun, saved = time.monotonic() - state.seconds, time.monotonic()
 
     def judge() -> None:
-        quality, similarity = optimizer.score(held_out)
-        seconds, count = time.monotonic() - begun, len(optimizer.raw["means"])
-        row: Row = {"seconds": seconds, "gaussians": count, "psnr": quality, "ssim": similarity}
+        found = {name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None}
+        row: Row = {"seconds": time.monotonic() - begun, "gaussians": len(optimizer.raw["means"]), **found}
         log.add(optimizer.step, row)
         rows.append(row)
         screen.print(
-            f"step {optimizer.step} of {steps}: {quality:.2f} dB, SSIM {similarity:.3f}, {count:,} Gaussians, "
-            f"{seconds:.0f} s"
+            f"step {optimizer.step} of {steps}: {_told(row)}, {row['gaussians']:,} Gaussians, {row['seconds']:.0f} s"
         )
+
+    def save() -> None:
+        now = State(adam=optimizer.adam, step=optimizer.step, seconds=time.monotonic() - begun, facts=state.facts)
+        save_state(work / CHECKPOINT_FILE, now, identity)
 
     if held_out and not rows and not optimizer.step:
         judge()
@@ -220,11 +229,11 @@ def optimise(
             if held_out and due:
                 judge()
             if time.monotonic() - saved >= config.checkpoint_every:
-                save_state(work / CHECKPOINT_FILE, optimizer, time.monotonic() - begun, identity)
+                save()
                 saved = time.monotonic()
     except BaseException:
         if optimizer.whole and optimizer.step:
-            save_state(work / CHECKPOINT_FILE, optimizer, time.monotonic() - begun, identity)
+            save()
         raise
     return rows
 
@@ -263,8 +272,7 @@ def write_results(
         steps=optimizer.step,
         views=len(optimizer.training),
         held_out=len(held_out),
-        psnr=last.get("psnr"),
-        ssim=last.get("ssim"),
+        **{name: last.get(name) for name in Score._fields},
         splat=PLY_FILE,
         log=LOG_FILE,
     )
@@ -278,3 +286,11 @@ def _identity(config: ReconstructConfig) -> dict[str, Any]:
         "holdout": config.holdout,
         "splat": config.splat,
     }
+
+
+def _told(row: Row) -> str:
+    """A judgement in words."""
+    whole = f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}"
+    if "seen_psnr" not in row:
+        return whole
+    return f"{row['seen_psnr']:.2f} dB where a fitted photograph shows the surface ({row['seen']:.0%}), {whole} in all"

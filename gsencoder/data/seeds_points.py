@@ -47,10 +47,7 @@ def seed_from_points(
         raise InputError(f"seeds: {bad.size} of {len(points)} points are not finite (first: row {bad[0]}); remove them")
     if colors is not None and len(colors) != len(points):
         raise InputError(f"seeds: expected {len(points)} colours, one a point, got {len(colors)}")
-    if colors is None:
-        warnings.warn(f"seeds: {len(points)} points without colours are made mid-grey", SceneWarning, stacklevel=2)
-        colors = np.full((len(points), 3), 128, np.uint8)
-    points, tints = average_in_voxels(points, colors, voxel)
+    points, tints = average_in_voxels(points, colors_or_grey(points, colors), voxel)
     normals, flatness = sheet_normals(points)
     centers = None if views is None or not len(views) else views.cameras.centers
     largest: float | Float32[np.ndarray, " n"] = largest_spacing * typical_spacing(points)
@@ -63,6 +60,16 @@ def seed_from_points(
     normals = np.where(np.einsum("ij,ij->i", normals, outwards)[:, None] < 0, -normals, normals)
     thickness = np.maximum(np.float32(THICKNESS), flatness)
     return flat_gaussians(points, normals, tints, largest=largest, thickness=thickness)
+
+
+def colors_or_grey(
+    points: Float32[np.ndarray, "P 3"], colors: UInt8[np.ndarray, "P 3"] | None
+) -> UInt8[np.ndarray, "P 3"]:
+    """The points' colours; mid-grey, with a warning, where they have none."""
+    if colors is not None:
+        return colors
+    warnings.warn(f"seeds: {len(points)} points without colours are made mid-grey", SceneWarning, stacklevel=3)
+    return np.full((len(points), 3), 128, np.uint8)
 
 
 def average_in_voxels(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +10,35 @@ import torch
 
 from gsencoder.data.archive import first_difference, open_archive, write_archive
 from gsencoder.errors import InputError, advised
-from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.parameters import shapes_of
+from gsencoder.reconstruct.row_adam import RowAdam
 
 CHECKPOINT_FILE = "reconstruction.safetensors"
-_KINDS = ("parameters", "averages", "squares")
 
 
-def save_state(path: Path, optimizer: Optimizer, seconds: float, settings: Mapping[str, Any]) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class State:
+    """A reconstruction between two steps. The first is of step 0: seeds are sought once.
+
+    Attributes:
+        adam: parameters and moments.
+        step: steps that are done.
+        seconds: that they took.
+        facts: how it began, as JSON values: number and source of the seeds, photographs that have no place.
+    """
+
+    adam: RowAdam
+    step: int
+    seconds: float
+    facts: Mapping[str, Any]
+
+
+def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
     """Writes the state; the one before stays until the new one is whole.
 
     Args:
         path: the file.
-        optimizer: whose state it is.
-        seconds: that its steps took.
+        state: to keep.
         settings: what a run must have in common to go on from here, as JSON values.
 
     Raises:
@@ -29,20 +46,30 @@ def save_state(path: Path, optimizer: Optimizer, seconds: float, settings: Mappi
     """
     arrays = {
         f"{kind}.{name}": value.detach().cpu().numpy()
-        for kind in _KINDS
-        for name, value in getattr(optimizer.adam, kind).items()
+        for kind, table in state.adam.tables().items()
+        for name, value in table.items()
     }
     header = {
-        "step": optimizer.step,
-        "adam_steps": optimizer.adam.steps,
-        "seconds": seconds,
+        "step": state.step,
+        "adam_steps": state.adam.steps,
+        "seconds": state.seconds,
+        "facts": dict(state.facts),
         "settings": dict(settings),
     }
     write_archive(path, arrays, header)
 
 
-def load_state(path: Path, optimizer: Optimizer, settings: Mapping[str, Any]) -> float:
-    """Puts the optimiser where the state was saved; the seconds that its steps took.
+def load_state(
+    path: Path, settings: Mapping[str, Any], *, steps: int, sh_degree: int, device: torch.device | str = "cpu"
+) -> State:
+    """The state that a run has left.
+
+    Args:
+        path: the file.
+        settings: of this run.
+        steps: that this run takes.
+        sh_degree: of its colours.
+        device: where it computes.
 
     Raises:
         InputError: damaged, or of a run with other settings; the first that differs is named.
@@ -52,17 +79,14 @@ def load_state(path: Path, optimizer: Optimizer, settings: Mapping[str, Any]) ->
         if found != settings:
             raise InputError(f"{path}: was made with {first_difference(found, settings)}")
         step, adam_steps = file.value("step", int), file.value("adam_steps", int)
-        seconds = float(file.value("seconds", float, int))
-        if not (0 <= adam_steps <= step <= optimizer.config.steps and 0 <= seconds < math.inf):
-            raise InputError(f"a state that no run was in (step {step} of {optimizer.config.steps})")
+        seconds, facts = float(file.value("seconds", float, int)), file.value("facts", dict)
+        if not (0 <= adam_steps <= step <= steps and 0 <= seconds < math.inf):
+            raise InputError(f"a state that no run was in (step {step} of {steps})")
         tables = {
             kind: {
-                name: torch.from_numpy(file.array(f"{kind}.{name}", "float32", ("N", *value.shape[1:])).copy())
-                for name, value in optimizer.raw.items()
+                name: torch.from_numpy(file.array(f"{kind}.{name}", "float32", ("N", *shape)).copy()).to(device)
+                for name, shape in shapes_of(sh_degree).items()
             }
-            for kind in _KINDS
+            for kind in RowAdam.KINDS
         }
-    for kind, table in tables.items():
-        setattr(optimizer.adam, kind, {name: value.to(optimizer.device) for name, value in table.items()})
-    optimizer.adam.steps, optimizer.step = adam_steps, step
-    return seconds
+    return State(adam=RowAdam.restored(tables, adam_steps), step=step, seconds=seconds, facts=facts)

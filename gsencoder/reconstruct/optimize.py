@@ -14,14 +14,13 @@ from gsencoder.reconstruct.parameters import (
     Parameters,
     camera_of,
     gaussians_of,
-    parameters_from,
     rows_in_view,
     seen_colors,
 )
 from gsencoder.reconstruct.photographs import Photographs, Shot
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.render.quality import psnr, ssim
+from gsencoder.render.quality import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Gaussians
 
@@ -95,28 +94,28 @@ class Optimizer:
 
     def __init__(
         self,
-        start: Gaussians,
+        adam: RowAdam,
         photographs: Photographs,
         training: Sequence[int],
         config: OptimizeConfig,
         *,
         prune: PruneConfig,
         raster: RasterConfig = RasterConfig(),
-        device: torch.device | str = "cpu",
+        step: int = 0,
     ) -> None:
         """Args:
-        start: where to begin.
+        adam: the parameters to begin with, on the device where to compute.
         photographs: of all views.
         training: which of them are fitted.
         config: see there.
         prune: what is taken out, and when.
         raster: accuracy of rendering.
-        device: where to compute.
+        step: steps that are done.
         """
         self.photographs, self.training, self.config = photographs, tuple(training), config
-        self.pruning, self.raster, self.device = prune, raster, torch.device(device)
-        self.adam = RowAdam(parameters_from(start, config.sh_degree, device))
-        self.step, self.whole = 0, True
+        self.pruning, self.raster = prune, raster
+        self.adam, self.step, self.whole = adam, step, True
+        self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
         self.extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0)) or 1.0
 
@@ -184,16 +183,6 @@ class Optimizer:
     def gaussians(self) -> Gaussians:
         """The splat as it is now."""
         return gaussians_of(self.raw)
-
-    @torch.no_grad()
-    def score(self, views: Sequence[int]) -> tuple[float, float]:
-        """Mean PSNR in dB and mean SSIM over views, of the pixels that masks leave."""
-        found = []
-        for view in views:
-            shot = self.photographs.shot(view)
-            picture = self.picture(view, shot)
-            found.append((psnr(picture, shot.image, shot.mask), float(ssim(picture, shot.image, shot.mask))))
-        return tuple(np.mean(found, axis=0).tolist())
 
     @torch.no_grad()
     def picture(self, view: int, shot: Shot) -> Float[Tensor, "H W 3"]:

@@ -17,6 +17,19 @@ Parameters = dict[str, Tensor]
 """means [N, 3], quats [N, 4], log_scales [N, 3], logit_opacities [N], sh0 [N, 1, 3], shN [N, K − 1, 3], float32."""
 
 
+def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """The size of one row of each parameter."""
+    rest = (sh_degree + 1) ** 2 - 1
+    return {
+        "means": (3,),
+        "quats": (4,),
+        "log_scales": (3,),
+        "logit_opacities": (),
+        "sh0": (1, 3),
+        "shN": (rest, 3),
+    }
+
+
 def parameters_from(gaussians: Gaussians, sh_degree: int, device: torch.device | str = "cpu") -> Parameters:
     """The parameters of a splat; colour coefficients above those that it has begin at zero, more are cut."""
     n, wanted = len(gaussians), (sh_degree + 1) ** 2

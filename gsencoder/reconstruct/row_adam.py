@@ -36,6 +36,8 @@ class RowAdam:
         steps: steps that were taken.
     """
 
+    KINDS = ("parameters", "averages", "squares")
+
     def __init__(self, parameters: Mapping[str, Tensor]) -> None:
         """Args:
         parameters: float32 tensors of N rows each, stepped in place.
@@ -44,6 +46,18 @@ class RowAdam:
         self.averages = {name: torch.zeros_like(value) for name, value in parameters.items()}
         self.squares = {name: torch.zeros_like(value) for name, value in parameters.items()}
         self.steps = 0
+
+    @classmethod
+    def restored(cls, tables: Mapping[str, Mapping[str, Tensor]], steps: int) -> "RowAdam":
+        """One that stands where `tables` of another, and its steps, were taken."""
+        made = cls(tables["parameters"])
+        made.averages, made.squares = dict(tables["averages"]), dict(tables["squares"])
+        made.steps = steps
+        return made
+
+    def tables(self) -> dict[str, dict[str, Tensor]]:
+        """Parameters and moments."""
+        return dict(zip(self.KINDS, (self.parameters, self.averages, self.squares), strict=True))
 
     def step(self, rows: Int64[Tensor, " n"], grads: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
         """One step.
@@ -84,6 +98,6 @@ class RowAdam:
 
     def keep(self, rows: Int64[Tensor, " n"]) -> None:
         """Drops all rows but these, of parameters and moments."""
-        for table in (self.parameters, self.averages, self.squares):
+        for table in self.tables().values():
             for name, value in table.items():
                 table[name] = value[rows].contiguous()

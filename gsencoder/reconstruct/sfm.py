@@ -1,16 +1,19 @@
 """Photographs without poses: structure from motion by pycolmap, on a CPU."""
 
+import json
 import math
 import os
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from gsencoder.data.atomic import atomic_file
 from gsencoder.data.undistort import load_pycolmap
 from gsencoder.errors import InputError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".webp")
+PLACED_FILE = "placed.json"
 MOST_EXHAUSTIVE = 150
 """Up to so many photographs all pairs are compared."""
 
@@ -60,7 +63,8 @@ def photographs_in(folder: Path) -> list[str]:
 
 
 def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed:
-    """Finds poses and intrinsics.
+    """Finds poses and intrinsics, or takes those that an earlier call left in `work` for the same photographs: with
+    several threads a second search need not find the same.
 
     Args:
         folder: of the photographs.
@@ -73,10 +77,14 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
     names = photographs_in(folder)
     if len(names) < 3:
         raise InputError(f"{folder}: expected at least 3 photographs ({', '.join(SUFFIXES)}), found {len(names)}")
+    asked = {"photographs": [_stamp(folder / name) for name in names], "settings": asdict(config)}
+    earlier = _placed_before(work, asked)
+    if earlier is not None:
+        return earlier
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR
     database, attempts, model = work / "database.db", work / "attempts", work / "sparse" / "0"
-    for stale in (database, attempts, model):
+    for stale in (work / PLACED_FILE, database, attempts, model):
         shutil.rmtree(stale, ignore_errors=True)
         stale.unlink(missing_ok=True)
     attempts.mkdir()
@@ -100,12 +108,39 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
     shutil.rmtree(attempts, ignore_errors=True)
     database.unlink(missing_ok=True)
     placed = sorted(best.images[number].name for number in best.reg_image_ids())
+    found = {
+        "placed": placed,
+        "missing": [name for name in names if name not in set(placed)],
+        "points": best.num_points3D(),
+        "error": float(best.compute_mean_reprojection_error()),
+    }
+    with atomic_file(work / PLACED_FILE) as stream:
+        stream.write(json.dumps({"asked": asked, "found": found}).encode())
+    return _placed(model, found)
+
+
+def _stamp(path: Path) -> list[str | int]:
+    """What tells a file from another of its name."""
+    status = path.stat()
+    return [path.name, status.st_size, status.st_mtime_ns]
+
+
+def _placed_before(work: Path, asked: dict[str, Any]) -> Placed | None:
+    """What an earlier call found, if it was asked the same and came to its end."""
+    try:
+        record = json.loads((work / PLACED_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return _placed(work / "sparse" / "0", record["found"]) if record["asked"] == asked else None
+
+
+def _placed(model: Path, found: dict[str, Any]) -> Placed:
     return Placed(
         model=model,
-        placed=tuple(placed),
-        missing=tuple(name for name in names if name not in set(placed)),
-        points=best.num_points3D(),
-        error=float(best.compute_mean_reprojection_error()),
+        placed=tuple(found["placed"]),
+        missing=tuple(found["missing"]),
+        points=found["points"],
+        error=found["error"],
     )
 
 

@@ -4,10 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from gsencoder.data.seeds import SeedConfig, seed
-from gsencoder.data.seeds_points import seed_from_points
+from gsencoder.data.seeds_points import colors_or_grey, seed_from_points
 from gsencoder.reconstruct.dense import Dense, DenseConfig, densify
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.tracking import Track, untracked
@@ -87,9 +85,9 @@ def start_of(
     points = scene.sfm_points
     if source != "points" or points is None or dense.enough == 0:
         return Start(gaussians=seed(seen, replace(seeds, source=source)), source=source)
-    colors = scene.sfm_colors if scene.sfm_colors is not None else np.full((len(points), 3), 128, np.uint8)
+    colors = colors_or_grey(points, scene.sfm_colors)
     added = densify(photographs, training, points, colors, dense, track=track)
     if added is None:
-        return Start(gaussians=seed(seen, replace(seeds, source="points")), source="points")
+        return Start(gaussians=seed(replace(seen, sfm_colors=colors), replace(seeds, source="points")), source="points")
     gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=DENSE_SPACING)
     return Start(gaussians=gaussians, source="points", dense=added)

@@ -1,0 +1,93 @@
+"""How well a splat shows photographs that it was not fitted to: the whole picture, and what could be known of it."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.photographs import Photographs
+from gsencoder.reconstruct.stereo import look_up, world_points
+from gsencoder.render.quality import inner, psnr, ssim
+
+SAME_DEPTH = 0.02
+"""Relative difference of measured depths up to which two photographs show the same surface."""
+
+
+class Score(NamedTuple):
+    """Means over views.
+
+    Attributes:
+        psnr: in dB, of the pixels that masks leave.
+        ssim: structural similarity of the same.
+        seen_psnr: in dB, of those of them that some fitted photograph shows too; None where no sensor tells.
+        seen_ssim: structural similarity of the same.
+        seen: share of the pixels that are such.
+    """
+
+    psnr: float
+    ssim: float
+    seen_psnr: float | None = None
+    seen_ssim: float | None = None
+    seen: float | None = None
+
+
+def seen_pixels(
+    photographs: Photographs, views: Sequence[int], training: Sequence[int]
+) -> dict[int, Bool[Tensor, "H W"]]:
+    """For each view the pixels whose surface some other photograph shows; nothing else can be known about the rest.
+
+    Measured depth carries a pixel into the other photographs; it is seen where one measured the same depth there, and
+    not where one looks past it, before it, or where a depth is unknown.
+
+    Args:
+        photographs: of all views; views without measured depth are left out of the result.
+        views: to be judged.
+        training: the photographs that a splat is fitted to.
+    """
+    shots = {view: photographs.shot(view) for view in (*views, *training)}
+    poses = {view: torch.from_numpy(photographs.cameras.cam_from_world[view].copy()) for view in shots}
+    found = {}
+    for view in views:
+        depth = shots[view].depth
+        if depth is None:
+            continue
+        points, seen = world_points(depth, shots[view], poses[view])[depth > 0], depth > 0
+        shown = torch.zeros(len(points), dtype=torch.bool)
+        for other in training:
+            there = shots[other].depth
+            if there is not None:
+                z, measured = look_up(points, there, shots[other], poses[other])
+                shown |= (measured > 0) & ((z - measured).abs() <= SAME_DEPTH * measured)
+        found[view] = seen.masked_scatter(seen, shown)
+    return found
+
+
+@torch.no_grad()
+def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Tensor, "H W"]] = {}) -> Score:
+    """How well an optimiser's splat shows some views.
+
+    Args:
+        optimizer: as it is now.
+        views: to look at.
+        seen: what `seen_pixels` found; a view of which nothing is seen, or its edges alone, in which no window of SSIM
+            has its middle, counts in the whole pictures alone.
+    """
+    whole, known, shares = [], [], []
+    for view in views:
+        shot = optimizer.photographs.shot(view)
+        picture = optimizer.picture(view, shot)
+        whole.append((psnr(picture, shot.image, shot.mask), float(ssim(picture, shot.image, shot.mask))))
+        if view in seen:
+            mask = seen[view] if shot.mask is None else seen[view] & shot.mask
+            shares.append(float(mask.float().mean()))
+            if inner(mask).any():
+                known.append((psnr(picture, shot.image, mask), float(ssim(picture, shot.image, mask))))
+    found = Score(*(float(mean) for mean in np.mean(whole, axis=0)))
+    if not known:
+        return found
+    seen_psnr, seen_ssim = (float(mean) for mean in np.mean(known, axis=0))
+    return found._replace(seen_psnr=seen_psnr, seen_ssim=seen_ssim, seen=float(np.mean(shares)))
