@@ -29,22 +29,22 @@ from gsencoder.types import Gaussians
 class OptimizeConfig:
     """How long, how fast and against what a splat is fitted."""
 
-    steps: int = field(default=4000, metadata={"help": "photographs looked at, one a step"})
+    steps: int = field(default=1500, metadata={"help": "photographs looked at, one a step"})
     sh_degree: int = field(default=2, metadata={"help": "how colours may depend on the direction, 0 to 3"})
     sh_every: float = field(default=0.2, metadata={"help": "share of the steps after which the degree rises by one"})
     shrinks: tuple[int, ...] = field(
-        default=(4, 2, 1), metadata={"help": "photographs are made smaller so many times, one stage after the other"}
+        default=(2, 1), metadata={"help": "photographs are made smaller so many times, one stage after the other"}
     )
     shares: tuple[float, ...] = field(
-        default=(0.15, 0.35, 0.5), metadata={"help": "share of the steps of each of these stages"}
+        default=(0.3, 0.7), metadata={"help": "share of the steps of each of these stages"}
     )
     ssim_weight: float = field(default=0.2, metadata={"help": "of 1 − SSIM; the rest of 1 is L1's"})
     depth_weight: float = field(
-        default=0.1, metadata={"help": "of the relative error of depth, where a sensor measured it"}
+        default=0.5, metadata={"help": "of the relative error of depth, where a sensor measured it"}
     )
-    means_rate: float = field(default=1.6e-4, metadata={"help": "learning rate of positions, times the scene's size"})
+    means_rate: float = field(default=3e-4, metadata={"help": "learning rate of positions, times the scene's size"})
     means_final: float = field(default=0.01, metadata={"help": "share of that rate which is left at the end"})
-    scales_rate: float = field(default=5e-3, metadata={"help": "learning rate of the logarithms of scales"})
+    scales_rate: float = field(default=2e-2, metadata={"help": "learning rate of the logarithms of scales"})
     quats_rate: float = field(default=1e-3, metadata={"help": "learning rate of rotations"})
     opacities_rate: float = field(default=5e-2, metadata={"help": "learning rate of the logits of opacities"})
     colors_rate: float = field(default=2.5e-3, metadata={"help": "learning rate of colours; a 20th for directions"})

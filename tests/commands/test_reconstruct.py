@@ -33,6 +33,10 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return lines[0]
 
 
+def never(*_: object, **__: object) -> None:
+    raise AssertionError("was called again")
+
+
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rooms") / "room"
@@ -89,7 +93,13 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_splat(
         patched.setattr(reconstruct.Optimizer, "advance", stop_at_five)
         assert cli.main(words) == 130
     assert not out.exists()
-    assert cli.main(words) == 0
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct, "start_of", never)
+        assert cli.main(words) == 0
+    results = summary_of(out)["results"]
+    assert {name: results[name] for name in ("seeds", "source")} == {
+        name: summary_of(built)["results"][name] for name in ("seeds", "source")
+    }
     found, whole = load_splat(out / "splat.ply"), load_splat(built / "splat.ply")
     for name in ("means", "quats", "scales", "opacities", "sh"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
@@ -115,6 +125,39 @@ def test_photographs_alone_are_placed_or_refused_in_words(
     told = refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
     assert "could be placed" in told or "cannot place these photographs" in told
     assert not (tmp_path / "out").exists()
+
+
+def test_photographs_alone_are_placed_once_and_become_a_splat(
+    tmp_path: Path, shared: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    folder, out = tmp_path / "photographs", tmp_path / "out"
+    folder.mkdir()
+    for path in sorted((shared / "scenes" / "plush" / "images").iterdir())[:10]:
+        shutil.copy(path, folder)
+    Image.new("RGB", (720, 540), (90, 90, 90)).save(folder / "grey.jpg")
+    words = ["reconstruct", str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25"]
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", _interrupt)
+        assert cli.main(words) == 130
+    with monkeypatch.context() as patched:
+        patched.setattr("gsencoder.reconstruct.sfm.load_pycolmap", never)
+        capsys.readouterr()
+        assert cli.main(words) == 0
+    assert "could not be placed and are not used: grey.jpg" in capsys.readouterr().err
+    results = summary_of(out)["results"]
+    assert results["missing"] == ["grey.jpg"]
+    assert results["placed"] == 10
+    assert results["swept"] > results["filled"] / 10 > 0
+    assert len(load_splat(out / "splat.ply")) > 5000
+    assert "in another; give a scene with the poses" in refusal(
+        capsys, str(folder), f"out={tmp_path / 'refined'}", f"splat={out / 'splat.ply'}"
+    )
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(
