@@ -16,7 +16,7 @@ from gsencoder.config import CommonConfig, settings
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.splats import READABLE, save_splat
-from gsencoder.errors import InputError, SceneWarning
+from gsencoder.errors import InputError, SceneWarning, advised
 from gsencoder.infer.pictures import contact_sheet
 from gsencoder.models.device import Device, choose_device
 from gsencoder.models.heap import keep_heap
@@ -30,14 +30,16 @@ from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.sfm import SfmConfig, photographs_in, place_photographs
+from gsencoder.reconstruct.sfm import SfmConfig, photographs_in, place_photographs, placed_before
 from gsencoder.reconstruct.start import start_of
+from gsencoder.render.quality import inner
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.summary import Summary
 from gsencoder.train.log import LOG_FILE, Log, read_log
 from gsencoder.types import Scene
 
 PLY_FILE, PICTURES_FILE = "splat.ply", "held_out.png"
+ANEW = "give resume=false to begin anew"
 SHOWN_VIEWS = 4
 Row = dict[str, int | float]
 """One line of the log, without the step: seconds, gaussians, and what a Score holds."""
@@ -91,17 +93,18 @@ def run(config: ReconstructConfig, summary: Summary) -> None:
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         refuse_to_replace_inputs(work, settings(config))
         open_work_folder(work, anew=not config.resume)
-        identity = {"scene": str(given.resolve()), **_identity(config)}
-        optimize, checkpoint = config.optimize, work / CHECKPOINT_FILE
-        state = None
-        if checkpoint.is_file():
-            state = load_state(checkpoint, identity, steps=optimize.steps, sh_degree=optimize.sh_degree, device=device)
         scene = open_scene(given, work, config, summary)
         assert scene.views is not None
         with summary.step("read"):
             photographs = Photographs(scene.views, track=track)
         training, held_out = split(len(photographs), config.holdout)
-        if state is None:
+        held_out = judged(photographs, held_out)
+        identity = {"scene": str(given.resolve()), "photographs": photographs.digest(), **_identity(config)}
+        optimize, checkpoint = config.optimize, work / CHECKPOINT_FILE
+        if os.path.lexists(checkpoint):
+            shape = {"steps": optimize.steps, "sh_degree": optimize.sh_degree}
+            state = load_state(checkpoint, identity, **shape, device=device)
+        else:
             with summary.step("seeds"):
                 state = begin(scene, photographs, training, config, track, device)
             save_state(checkpoint, state, identity)
@@ -138,8 +141,15 @@ def open_scene(given: Path, work: Path, config: ReconstructConfig, summary: Summ
                 f"{given}: splat={config.splat} lies in a world of its own, and photographs without poses are placed "
                 "in another; give a scene with the poses that belong to the splat"
             )
-        with summary.step("place"):
-            placed = place_photographs(pictures, work, config.sfm)
+        placed = placed_before(pictures, work, config.sfm)
+        if placed is None and os.path.lexists(work / CHECKPOINT_FILE):
+            raise InputError(
+                f"{work}: a run was cut off here, and where its photographs were placed is gone, or belongs to other "
+                "photographs or settings; put these back, or give resume=false to begin anew"
+            )
+        if placed is None:
+            with summary.step("place"):
+                placed = place_photographs(pictures, work, config.sfm)
         summary.results.update(placed=len(placed.placed), missing=list(placed.missing), sfm_error=placed.error)
         if placed.missing:
             warnings.warn(
@@ -148,7 +158,8 @@ def open_scene(given: Path, work: Path, config: ReconstructConfig, summary: Summ
                 SceneWarning,
                 stacklevel=2,
             )
-        return load_scene(work, options=replace(config.data, images=str(pictures)))
+        with advised(ANEW):
+            return load_scene(work, options=replace(config.data, images=str(pictures)))
     assert path is not None
     scene = load_scene(path, splat=config.splat or None, options=config.data)
     if scene.views is None:
@@ -169,6 +180,24 @@ def split(count: int, every: int) -> tuple[list[int], list[int]]:
     return training, held_out
 
 
+def judged(photographs: Photographs, held_out: Sequence[int]) -> list[int]:
+    """Those of which a mask leaves something to judge by.
+
+    Warns:
+        SceneWarning: the others are named.
+    """
+    masks = {view: photographs.shot(view).mask for view in held_out}
+    blank = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
+    if blank:
+        warnings.warn(
+            f"{len(blank)} of {len(held_out)} held-out photographs are masked all over and not judged by: "
+            f"{', '.join(photographs.names[view] for view in blank[:8])}{', …' if len(blank) > 8 else ''}",
+            SceneWarning,
+            stacklevel=2,
+        )
+    return [view for view in held_out if view not in blank]
+
+
 def begin(
     scene: Scene,
     photographs: Photographs,
@@ -187,6 +216,13 @@ def begin(
             f"points reach {dense.coverage[0]:.0%} of the pictures' cells: {dense.swept:,} were added from plane "
             f"sweeps and {dense.filled:,} between them, which reach {dense.coverage[1]:.0%}"
         )
+        if not dense.swept:
+            warnings.warn(
+                f"plane sweeps found no surface, and points reach {dense.coverage[0]:.0%} of the pictures alone; what "
+                "they leave bare stays empty: smaller dense.spacing, dense.samples or dense.alike may find more",
+                SceneWarning,
+                stacklevel=2,
+            )
     adam = RowAdam(parameters_from(begun.gaussians, config.optimize.sh_degree, device))
     return State(adam=adam, step=0, seconds=0.0, facts=facts)
 
@@ -202,8 +238,9 @@ def optimise(
 ) -> list[Row]:
     """All steps that are left; the rows of the log. Whatever stops the run between two steps leaves a checkpoint."""
     screen, steps = console(config.quiet), config.optimize.steps
-    log = Log(work, done=optimizer.step, events=False)
-    rows: list[Row] = [{name: float(cell) for name, cell in row.items()} for row in read_log(work / LOG_FILE)]
+    with advised(ANEW):
+        log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
+        rows = rows_of(work / LOG_FILE)
     seen = seen_pixels(optimizer.photographs, held_out, optimizer.training)
     begun, saved = time.monotonic() - state.seconds, time.monotonic()
 
@@ -236,6 +273,18 @@ def optimise(
             save()
         raise
     return rows
+
+
+def rows_of(path: Path) -> list[Row]:
+    """The log.
+
+    Raises:
+        InputError: a cell that is no number.
+    """
+    try:
+        return [{name: float(cell) for name, cell in row.items()} for row in read_log(path)]
+    except ValueError as error:
+        raise InputError(f"{path}: damaged: {error}") from error
 
 
 def write_results(

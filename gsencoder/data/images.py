@@ -70,6 +70,16 @@ def _decode(path: Path, picture: "Image") -> "Image":
     return picture
 
 
+def check_picture(path: Path) -> None:
+    """Decodes a picture to its end.
+
+    Raises:
+        InputError: missing, of another format, too large, or damaged; the file is named.
+    """
+    with _open(path) as picture:
+        _decode(path, picture)
+
+
 def _load_npy(path: Path) -> np.ndarray:
     """Maps a .npy file, so that its header is checked before its values are read."""
     try:

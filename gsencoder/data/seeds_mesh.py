@@ -173,6 +173,11 @@ def _parts(path: Path) -> list[Any]:
 def _lattices(mesh: Any, vertices: np.ndarray, voxel: float, path: str | Path) -> Iterator[tuple[np.ndarray, ...]]:
     """Samples of the triangles, some thousand triangles at a time: positions, normals, colours."""
     faces = np.asarray(mesh.faces, np.int64)
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
+        raise InputError(
+            f"{path}: its triangles name vertices from {faces.min()} to {faces.max()}, and it has {len(vertices)}; "
+            "the file is damaged"
+        )
     corners = vertices[faces]
     # The longest edge becomes the first, so that slivers take few samples.
     edges = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2)

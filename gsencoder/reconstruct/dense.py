@@ -36,6 +36,7 @@ FILLED_SPACING = 2.0
 """Interpolated seeds stand on a grid so much coarser: they are where little is to be seen."""
 SEEN_THROUGH = 1
 """So many views may see through a point that no view finds."""
+SMALLEST_SPACING = 0.1
 CELL = 1 / 40
 """Side of the cells in which coverage is counted, as a share of the picture's longer side."""
 
@@ -61,8 +62,16 @@ class DenseConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.enough <= 1:
             raise InputError(f"enough: expected a share from 0 to 1, got {self.enough}")
-        if not 0 < self.spacing < math.inf:
-            raise InputError(f"spacing: expected a positive number of pixels, got {self.spacing}")
+        if not SMALLEST_SPACING <= self.spacing < math.inf:
+            raise InputError(f"spacing: expected {SMALLEST_SPACING} pixels or more, got {self.spacing}")
+        if self.samples < 1:
+            raise InputError(f"samples: expected at least 1 pixel, got {self.samples}")
+        if not -1 <= self.alike < 1:
+            raise InputError(f"alike: expected a correlation from −1 to below 1, got {self.alike}")
+        if not 0 < self.agree < 0.5:
+            raise InputError(f"agree: expected a share between 0 and 0.5, got {self.agree}")
+        if not 0 <= self.color <= 1:
+            raise InputError(f"color: expected a number from 0 to 1, got {self.color}")
         if self.size < 32:
             raise InputError(f"size: expected at least 32 pixels, got {self.size}")
         if self.sources < 2:

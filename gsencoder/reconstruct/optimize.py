@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
@@ -20,9 +20,13 @@ from gsencoder.reconstruct.parameters import (
 from gsencoder.reconstruct.photographs import Photographs, Shot
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.render.quality import WINDOW as SSIM_WINDOW
 from gsencoder.render.quality import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Gaussians
+
+LARGEST_RATE = 10.0
+"""Adam's steps are about as large as the rate, and an e-fold of a scale is 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,12 +59,23 @@ class OptimizeConfig:
             raise InputError(f"steps: expected 0 or more, got {self.steps}")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
-        if len(self.shrinks) != len(self.shares) or not self.shrinks or min(self.shrinks) < 1:
+        if len(self.shrinks) != len(self.shares) or not self.shrinks:
             raise InputError(f"shrinks and shares: expected as many of each, got {self.shrinks} and {self.shares}")
-        if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1, abs_tol=1e-6):
+        if min(self.shrinks) < 1:
+            raise InputError(f"shrinks: expected whole numbers from 1, got {self.shrinks}")
+        if not min(self.shares) >= 0 or not math.isclose(sum(self.shares), 1, abs_tol=1e-6):
             raise InputError(f"shares: expected numbers that add up to 1, got {self.shares}")
         if not 0 <= self.ssim_weight <= 1:
             raise InputError(f"ssim_weight: expected a number from 0 to 1, got {self.ssim_weight}")
+        if not 0 < self.means_final <= 1:
+            raise InputError(f"means_final: expected a share above 0, up to 1, got {self.means_final}")
+        if not 0 <= self.seed < 2**63:
+            raise InputError(f"seed: expected 0 or more, got {self.seed}")
+        limits = {"sh_every": 1.0, "depth_weight": 100.0}
+        limits |= dict.fromkeys((field.name for field in fields(self) if field.name.endswith("_rate")), LARGEST_RATE)
+        for name, limit in limits.items():
+            if not 0 <= getattr(self, name) <= limit:
+                raise InputError(f"{name}: expected a number from 0 to {limit:g}, got {getattr(self, name)}")
 
     def shrink_at(self, step: int) -> int:
         """How many times smaller the photographs of a step are."""
@@ -111,12 +126,21 @@ class Optimizer:
         prune: what is taken out, and when.
         raster: accuracy of rendering.
         step: steps that are done.
+
+        Raises:
+            InputError: a photograph that is too small, or nothing in view of any.
         """
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
         self.adam, self.step, self.whole = adam, step, True
         self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
+        self._check_sizes()
+        if not any(len(self._rows(view, photographs.shot(view, 2))) for view in self.training):
+            raise InputError(
+                f"reconstruct: none of {len(self.raw['means'])} Gaussians is in view of any of {len(self.training)} "
+                "photographs; are the splat and the poses of one world, and is raster.near small enough?"
+            )
         self.extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0)) or 1.0
 
     @property
@@ -159,11 +183,29 @@ class Optimizer:
         """A view over black, the rows that may show in it, and these rows as leaves that gradients go to."""
         pose, center = camera_of(self.photographs.cameras, view, self.device)
         K, size = shot.K.to(self.device), (shot.width, shot.height)
-        rows = rows_in_view(self.raw, pose, K, *size, near=self.raster.near, eps2d=self.raster.eps2d)
+        rows = self._rows(view, shot)
         seen = {name: value[rows].requires_grad_() for name, value in self.raw.items()}
         shape = (seen["means"], seen["quats"], seen["log_scales"].exp(), seen["logit_opacities"].sigmoid())
         raster = rasterize(*shape, seen_colors(seen, degree, center), pose, K, *size, config=self.raster)
         return raster, rows, seen
+
+    def _rows(self, view: int, shot: Shot) -> Int64[Tensor, " n"]:
+        pose, _ = camera_of(self.photographs.cameras, view, self.device)
+        knobs = {"near": self.raster.near, "eps2d": self.raster.eps2d}
+        return rows_in_view(self.raw, pose, shot.K.to(self.device), shot.width, shot.height, **knobs)
+
+    def _check_sizes(self) -> None:
+        smallest = SSIM_WINDOW * max(self.config.shrinks)
+        for view in self.training:
+            width, height = (
+                int(sides[view]) for sides in (self.photographs.cameras.widths, self.photographs.cameras.heights)
+            )
+            if min(width, height) < smallest:
+                raise InputError(
+                    f"reconstruct: photograph {self.photographs.names[view]!r} has {width}×{height} pixels, "
+                    f"and {smallest} are needed at least: {SSIM_WINDOW} for SSIM, optimize.shrinks="
+                    f"{list(self.config.shrinks)} times; make image_scale larger or shrinks smaller"
+                )
 
     def prune(self) -> None:
         """Takes out what does not contribute."""
@@ -203,7 +245,7 @@ def losses_of(raster: Raster, shot: Shot, config: OptimizeConfig) -> dict[str, F
     else:
         share = torch.ones((), device=rgb.device)
     losses["l1"] = (1 - config.ssim_weight) * (rgb - image).abs().mean() / share
-    if config.ssim_weight and min(shot.width, shot.height) >= 11:
+    if config.ssim_weight:
         losses["ssim"] = config.ssim_weight * (1 - ssim(rgb, image)) / share
     if config.depth_weight and shot.depth is not None:
         depth = shot.depth.to(rgb.device)

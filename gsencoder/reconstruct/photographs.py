@@ -1,6 +1,7 @@
 """The photographs that a reconstruction is fitted to, kept in memory and made smaller on demand."""
 
 from dataclasses import dataclass
+from hashlib import sha1
 
 import numpy as np
 import torch
@@ -64,6 +65,17 @@ class Photographs:
 
     def __len__(self) -> int:
         return len(self._images)
+
+    def digest(self) -> str:
+        """What tells these photographs, masks, depths and poses from others."""
+        found = sha1()
+        arrays = [getattr(self.cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights")]
+        for part in (*self._images, *self._masks, *self._depths):
+            arrays.append(np.empty(0) if part is None else part.numpy())
+        for name, array in zip((*"ptwh", *3 * self.names), arrays, strict=True):
+            found.update(f"{name}{array.shape}{array.dtype}".encode())
+            found.update(np.ascontiguousarray(array).data)
+        return found.hexdigest()[:16]
 
     def shot(self, view: int, shrink: int = 1) -> Shot:
         """A view; each of its pixels stands for `shrink` × `shrink` of the photograph's.

@@ -55,6 +55,9 @@ def rows_to_keep(
         views: photographs that count, at any size.
         config: see there.
         raster: accuracy of rendering.
+
+    Raises:
+        InputError: nothing would be left.
     """
     means = raw["means"]
     opacities = raw["logit_opacities"].sigmoid()
@@ -72,7 +75,13 @@ def rows_to_keep(
         (sums,) = torch.autograd.grad(seen.rgb[..., 0].sum(), ones)
         most[rows] = torch.maximum(most[rows], pixels * sums[:, 0])
         widest[rows] = torch.maximum(widest[rows], seen.radii / max(shot.width, shot.height))
-    good = (opacities >= config.opacity) & (most >= config.contribution)
+    bad = {"opacity": opacities < config.opacity, "contribution": most < config.contribution}
     if config.screen:
-        good &= widest <= config.screen
-    return good.nonzero().squeeze(1)
+        bad["screen"] = widest > config.screen
+    kept = (~torch.stack([*bad.values()]).any(dim=0)).nonzero().squeeze(1)
+    if not len(kept):
+        why = ", ".join(
+            f"{int(rows.sum())} by prune.{name}={getattr(config, name):g}" for name, rows in bad.items() if rows.any()
+        )
+        raise InputError(f"reconstruct: pruning would leave none of {len(means)} Gaussians ({why}); change these")
+    return kept

@@ -4,15 +4,20 @@ import json
 import math
 import os
 import shutil
+import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.data.atomic import atomic_file
+from gsencoder.data.images import check_picture
 from gsencoder.data.undistort import load_pycolmap
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".webp")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")
+OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".nef", ".arw", ".mp4", ".mov", ".avi")
+"""Pictures and films that pycolmap does not read; that they are left out is said."""
+MOST_PIXELS, MOST_FEATURES = 100_000, 1_000_000
 PLACED_FILE = "placed.json"
 MOST_EXHAUSTIVE = 150
 """Up to so many photographs all pairs are compared."""
@@ -34,8 +39,11 @@ class SfmConfig:
     camera: str = field(default="SIMPLE_RADIAL", metadata={"help": "COLMAP's camera model"})
 
     def __post_init__(self) -> None:
-        if self.size < 64 or self.features < 64:
-            raise InputError(f"size and features: expected at least 64, got {self.size} and {self.features}")
+        if not (64 <= self.size <= MOST_PIXELS and 64 <= self.features <= MOST_FEATURES):
+            raise InputError(
+                f"size and features: expected at least 64, and at most {MOST_PIXELS} pixels and {MOST_FEATURES} "
+                f"features, got {self.size} and {self.features}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,13 +66,17 @@ class Placed:
 
 
 def photographs_in(folder: Path) -> list[str]:
-    """Names of the pictures directly in a folder, sorted."""
-    return sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.suffix.lower() in SUFFIXES)
+    """Names of the pictures directly in a folder, sorted; hidden files are none."""
+    return _names_with(folder, SUFFIXES)
+
+
+def _names_with(folder: Path, suffixes: tuple[str, ...]) -> list[str]:
+    entries = (entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    return sorted(entry.name for entry in entries if entry.suffix.lower() in suffixes)
 
 
 def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed:
-    """Finds poses and intrinsics, or takes those that an earlier call left in `work` for the same photographs: with
-    several threads a second search need not find the same.
+    """Finds poses and intrinsics. Every photograph is decoded before.
 
     Args:
         folder: of the photographs.
@@ -72,17 +84,21 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
         config: see there.
 
     Raises:
-        InputError: fewer than three photographs, no two that fit together, or pycolmap refuses.
+        InputError: fewer than three photographs, one that cannot be decoded or has a name that is no UTF-8, no two
+            that fit together, or pycolmap refuses.
+
+    Warns:
+        SceneWarning: files that look like photographs or films, and cannot be used.
     """
     names = photographs_in(folder)
     if len(names) < 3:
         raise InputError(f"{folder}: expected at least 3 photographs ({', '.join(SUFFIXES)}), found {len(names)}")
-    asked = {"photographs": [_stamp(folder / name) for name in names], "settings": asdict(config)}
-    earlier = _placed_before(work, asked)
-    if earlier is not None:
-        return earlier
+    _check(folder, names)
     pycolmap = load_pycolmap()
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    models = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
+    if config.camera not in models:
+        raise InputError(f"sfm.camera: expected one of {', '.join(models)}, got {config.camera!r}")
     database, attempts, model = work / "database.db", work / "attempts", work / "sparse" / "0"
     for stale in (work / PLACED_FILE, database, attempts, model):
         shutil.rmtree(stale, ignore_errors=True)
@@ -115,23 +131,49 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
         "error": float(best.compute_mean_reprojection_error()),
     }
     with atomic_file(work / PLACED_FILE) as stream:
-        stream.write(json.dumps({"asked": asked, "found": found}).encode())
+        stream.write(json.dumps({"asked": _asked(folder, names, config), "found": found}).encode())
     return _placed(model, found)
 
 
-def _stamp(path: Path) -> list[str | int]:
-    """What tells a file from another of its name."""
-    status = path.stat()
-    return [path.name, status.st_size, status.st_mtime_ns]
+def placed_before(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed | None:
+    """What an earlier call left in `work`, if it came to its end for the same photographs and settings; with several
+    threads a second search need not find the same.
 
-
-def _placed_before(work: Path, asked: dict[str, Any]) -> Placed | None:
-    """What an earlier call found, if it was asked the same and came to its end."""
+    Args:
+        folder: of the photographs.
+        work: that the call was given.
+        config: that it was given.
+    """
+    model = work / "sparse" / "0"
     try:
         record = json.loads((work / PLACED_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        same = model.is_dir() and record["asked"] == _asked(folder, photographs_in(folder), config)
+        return _placed(model, record["found"]) if same else None
+    except (OSError, ValueError, KeyError, TypeError):
         return None
-    return _placed(work / "sparse" / "0", record["found"]) if record["asked"] == asked else None
+
+
+def _asked(folder: Path, names: list[str], config: SfmConfig) -> dict[str, Any]:
+    """What tells the photographs from others of their names, and the settings."""
+    states = [(folder / name).stat() for name in names]
+    stamps = [[name, state.st_size, state.st_mtime_ns] for name, state in zip(names, states, strict=True)]
+    return {"photographs": stamps, "settings": asdict(config)}
+
+
+def _check(folder: Path, names: list[str]) -> None:
+    """What pycolmap would pass over in silence, or stumble over."""
+    others = _names_with(folder, OTHER_SUFFIXES)
+    if others:
+        warnings.warn(
+            f"{folder}: {len(others)} files are in formats that cannot be placed and are not used: "
+            f"{', '.join(others[:8])}{', …' if len(others) > 8 else ''}; expected {', '.join(SUFFIXES)}",
+            SceneWarning,
+            stacklevel=3,
+        )
+    for name in names:
+        if not name.isprintable():
+            raise InputError(f"{folder}: {name!r} has bytes that are no text; give the photograph another name")
+        check_picture(folder / name)
 
 
 def _placed(model: Path, found: dict[str, Any]) -> Placed:

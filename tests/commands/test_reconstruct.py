@@ -1,6 +1,7 @@
 """`reconstruct`, as a user runs it: RGB-D, points, a splat to refine, photographs alone, and what goes wrong."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -127,24 +128,40 @@ def test_photographs_alone_are_placed_or_refused_in_words(
     assert not (tmp_path / "out").exists()
 
 
-def test_photographs_alone_are_placed_once_and_become_a_splat(
-    tmp_path: Path, shared: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture(scope="module")
+def ten(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten photographs that belong together, and one that shows nothing."""
     from PIL import Image
 
-    folder, out = tmp_path / "photographs", tmp_path / "out"
+    folder = tmp_path_factory.mktemp("ten") / "photographs"
     folder.mkdir()
     for path in sorted((shared / "scenes" / "plush" / "images").iterdir())[:10]:
         shutil.copy(path, folder)
     Image.new("RGB", (720, 540), (90, 90, 90)).save(folder / "grey.jpg")
-    words = ["reconstruct", str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25"]
+    return folder
+
+
+def test_photographs_alone_are_placed_once_and_become_a_splat(
+    tmp_path: Path, ten: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = shutil.copytree(ten, tmp_path / "photographs"), tmp_path / "out"
+    words = [str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25"]
     with monkeypatch.context() as patched:
         patched.setattr(reconstruct.Optimizer, "advance", _interrupt)
-        assert cli.main(words) == 130
-    with monkeypatch.context() as patched:
-        patched.setattr("gsencoder.reconstruct.sfm.load_pycolmap", never)
-        capsys.readouterr()
-        assert cli.main(words) == 0
+        assert cli.main(["reconstruct", *words]) == 130
+    work = out.with_name("out.reconstruction")
+    placed = (work / "placed.json").read_bytes()
+    monkeypatch.setattr("gsencoder.reconstruct.sfm.load_pycolmap", never)
+    # Places of another placement would put old Gaussians into a new world.
+    for damaged in (b"", b"[]", b"{}", b'{"asked": 1}', placed[:-9], placed.replace(b"found", b"lost"), b"\xff\xfe"):
+        (work / "placed.json").write_bytes(damaged)
+        assert "where its photographs were placed is gone" in refusal(capsys, *words)
+    (work / "placed.json").write_bytes(placed)
+    os.utime(folder / "grey.jpg", ns=(1, 1))
+    assert "belongs to other photographs" in refusal(capsys, *words)
+    shutil.copystat(ten / "grey.jpg", folder / "grey.jpg")
+    capsys.readouterr()
+    assert cli.main(["reconstruct", *words]) == 0
     assert "could not be placed and are not used: grey.jpg" in capsys.readouterr().err
     results = summary_of(out)["results"]
     assert results["missing"] == ["grey.jpg"]
@@ -154,6 +171,79 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(
     assert "in another; give a scene with the poses" in refusal(
         capsys, str(folder), f"out={tmp_path / 'refined'}", f"splat={out / 'splat.ply'}"
     )
+
+
+def test_photographs_that_cannot_be_placed_are_told_before_any_is(
+    ten: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [str(tmp_path), f"out={tmp_path / 'out'}"]
+    monkeypatch.setattr("gsencoder.reconstruct.sfm._find_features", never)
+    for path in sorted(ten.iterdir())[:4]:
+        shutil.copy(path, tmp_path)
+    assert "sfm.camera: expected one of DIVISION" in refusal(capsys, *words, "sfm.camera=NOPE")
+    assert "sfm: size and features: expected" in refusal(capsys, *words, "sfm.size=99999999999")
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes((tmp_path / "20240212_003919.jpg").read_bytes()[:5000])
+    assert "bad.jpg: cannot be decoded" in refusal(capsys, *words)
+    bad.write_bytes(b"")
+    assert "bad.jpg: not a readable picture" in refusal(capsys, *words)
+    bad.unlink()
+    bad.symlink_to("nowhere.jpg")
+    assert "bad.jpg: no such file" in refusal(capsys, *words)
+    bad.unlink()
+    shutil.copy(tmp_path / "20240212_003919.jpg", os.fsencode(tmp_path) + b"/caf\xe9.jpg")
+    assert "has bytes that are no text" in refusal(capsys, *words)
+
+
+def test_films_beside_photographs_are_named(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in sorted((room / "images").iterdir())[:3]:
+        shutil.copy(path, tmp_path)
+    (tmp_path / "film.MP4").write_bytes(b"")
+    (tmp_path / ".hidden.jpg").write_bytes(b"")
+    assert cli.main(["reconstruct", str(tmp_path), f"out={tmp_path / 'out'}", "quiet=true"]) == 2
+    assert "1 files are in formats that cannot be placed and are not used: film.MP4" in capsys.readouterr().err
+
+
+def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, out = shutil.copytree(room, tmp_path / "scene"), tmp_path / "out"
+    words = [str(scene), f"out={out}", *QUICK]
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", _interrupt)
+        assert cli.main(["reconstruct", *words]) == 130
+    log = out.with_name("out.reconstruction") / "log.csv"
+    text = log.read_text()
+    log.write_text(text.replace(".", "x"))
+    told = refusal(capsys, *words)
+    assert "log.csv: damaged: could not convert" in told
+    assert told.endswith("give resume=false to begin anew")
+    log.write_text(text)
+    first, second = sorted((scene / "images").iterdir())[:2]
+    shutil.copy(second, first)
+    assert "was made with photographs=" in refusal(capsys, *words)
+    assert cli.main(["reconstruct", *words, "resume=false"]) == 0
+
+
+def test_a_held_out_photograph_that_is_masked_all_over_is_named_and_not_judged_by(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    scene, out = shutil.copytree(room, tmp_path / "scene"), tmp_path / "out"
+    record = json.loads((scene / "transforms.json").read_text())
+    (scene / "masks").mkdir()
+    for number, frame in enumerate(record["frames"]):
+        Image.new("L", (120, 90), 255 if number else 0).save(scene / "masks" / f"{number}.png")
+        frame["mask_path"] = f"masks/{number}.png"
+    (scene / "transforms.json").write_text(json.dumps(record))
+    assert cli.main(["reconstruct", str(scene), f"out={out}", *QUICK]) == 0
+    assert "1 of 2 held-out photographs are masked all over and not judged by" in capsys.readouterr().err
+    results = summary_of(out)["results"]
+    assert results["held_out"] == 1
+    assert results["psnr"] > 5
 
 
 def _interrupt(*_: object) -> None:

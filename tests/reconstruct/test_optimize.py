@@ -211,6 +211,16 @@ def test_a_scene_without_photographs_is_refused() -> None:
         {"shares": (1.0,)},
         {"shrinks": (2, 1), "shares": (0.7, 0.7)},
         {"ssim_weight": 1.5},
+        {"shares": (0.5, float("nan"))},
+        {"means_final": -0.01},
+        {"means_final": 0.0},
+        {"means_rate": float("inf")},
+        {"colors_rate": 1e38},
+        {"scales_rate": -1.0},
+        {"quats_rate": float("nan")},
+        {"depth_weight": -1.0},
+        {"sh_every": float("inf")},
+        {"seed": -1},
     ],
 )
 def test_settings_that_mean_nothing_are_refused(changes: dict[str, object]) -> None:
@@ -218,8 +228,28 @@ def test_settings_that_mean_nothing_are_refused(changes: dict[str, object]) -> N
         OptimizeConfig(**changes)
 
 
+def test_a_photograph_that_gets_too_small_is_named() -> None:
+    with pytest.raises(InputError, match=r"'view_0.png' has 96×72 pixels, and 77 are needed at least.*shrinks=\[7\]"):
+        optimizer(replace(QUICK, shrinks=(7,), shares=(1.0,)))
+
+
+def test_a_splat_that_no_photograph_shows_is_refused_before_the_first_step() -> None:
+    start = seeds()
+    start.means[:, 2] *= -1
+    with pytest.raises(InputError, match=r"none of \d+ Gaussians is in view of any of 3 photographs"):
+        optimizer(start=start)
+
+
+@pytest.mark.parametrize("name", ["opacity", "contribution"])
+def test_pruning_that_leaves_nothing_stops_and_says_which_rule_took_how_many(name: str) -> None:
+    one = optimizer(prune=PruneConfig(at=(0.05,), **{name: 1e9}))
+    one.advance()
+    with pytest.raises(InputError, match=rf"none of (\d+) Gaussians \(.*\1 by prune.{name}=1e\+09.*\); change"):
+        one.advance()
+
+
 def test_the_stages_follow_the_shares() -> None:
-    config = OptimizeConfig(steps=100)
+    config = OptimizeConfig(steps=100, shrinks=(4, 2, 1), shares=(0.15, 0.35, 0.5))
     assert [config.shrink_at(step) for step in (0, 14, 15, 49, 50, 99)] == [4, 4, 2, 2, 1, 1]
     assert [config.degree_at(step) for step in (0, 19, 20, 40, 99)] == [0, 0, 1, 2, 2]
     assert config.rates_at(100, 2.0)["means"] == pytest.approx(0.01 * config.rates_at(0, 2.0)["means"])

@@ -55,6 +55,16 @@ def test_gaussians_stand_on_a_mesh(tmp_path: Path) -> None:
     np.testing.assert_allclose(means[:, 2], DEPTH + TILT * means[:, 0], atol=1e-3)
 
 
+def test_a_mesh_whose_triangles_have_no_corners_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "wall.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 3\n1 0 3\n0 1 3\n3 0 1 9\n"
+    )
+    with pytest.raises(InputError, match=r"wall.ply: its triangles name vertices from 0 to 9, and it has 3"):
+        begun(scene(), SeedConfig(source="mesh", mesh=str(path), voxel=0.1))
+
+
 def test_points_without_colours_are_grey_and_it_is_said_once() -> None:
     points = wall_points()
     bare = scene(views=wall_views(), sfm_points=points)
