@@ -537,7 +537,8 @@ class TestSeed:
             {"source": "mesh"},
             {"min_cos": 1.0},
         ):
-            with pytest.raises(InputError, match="seeds: "):
+            (name,) = options
+            with pytest.raises(InputError, match=name):
                 SeedConfig(**options)
 
     @pytest.mark.shared
