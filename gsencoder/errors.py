@@ -4,7 +4,7 @@ Every message is one line that says what was wrong, where, what was expected, an
 prints it and leaves with exit code 2; anything else that escapes is a defect of ours and keeps its traceback.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 
@@ -14,6 +14,11 @@ class InputError(ValueError):
 
 class SceneWarning(UserWarning):
     """Something in the input was left out or estimated; the message counts it and says how."""
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """The first of many names, for a message."""
+    return ", ".join(names[:most]) + (", …" if len(names) > most else "")
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from gsencoder.config import CommonConfig, settings
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.splats import READABLE, save_splat
-from gsencoder.errors import InputError, SceneWarning, advised
+from gsencoder.errors import InputError, SceneWarning, advised, listed
 from gsencoder.infer.pictures import contact_sheet
 from gsencoder.models.device import Device, choose_device
 from gsencoder.models.heap import keep_heap
@@ -154,7 +154,7 @@ def open_scene(given: Path, work: Path, config: ReconstructConfig, summary: Summ
         if placed.missing:
             warnings.warn(
                 f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "
-                f"and are not used: {', '.join(placed.missing[:8])}{', …' if len(placed.missing) > 8 else ''}",
+                f"and are not used: {listed(placed.missing)}",
                 SceneWarning,
                 stacklevel=2,
             )
@@ -191,7 +191,7 @@ def judged(photographs: Photographs, held_out: Sequence[int]) -> list[int]:
     if blank:
         warnings.warn(
             f"{len(blank)} of {len(held_out)} held-out photographs are masked all over and not judged by: "
-            f"{', '.join(photographs.names[view] for view in blank[:8])}{', …' if len(blank) > 8 else ''}",
+            f"{listed([photographs.names[view] for view in blank])}",
             SceneWarning,
             stacklevel=2,
         )

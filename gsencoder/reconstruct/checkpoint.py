@@ -24,7 +24,7 @@ class State:
         adam: parameters and moments.
         step: steps that are done.
         seconds: that they took.
-        facts: how it began, as JSON values: number and source of the seeds, photographs that have no place.
+        facts: how it began, as JSON values: number and source of the seeds, and what was added to points.
     """
 
     adam: RowAdam

@@ -21,9 +21,11 @@ from gsencoder.reconstruct.stereo import (
     DepthMap,
     agreeing,
     depth_range,
+    finds,
     in_image,
     look_up,
     neighbours_of,
+    sees_through,
     sweep,
     to_grid,
     window_mean,
@@ -189,9 +191,8 @@ def carve(
     through, there = (torch.zeros(len(points), dtype=torch.int64) for _ in range(2))
     for view, depth in agreed.items():
         z, measured = look_up(places, depth, shots[view], poses[view])
-        known = measured > 0
-        through += known & (z < (1 - 2 * tolerance) * measured)
-        there += known & ((z - measured).abs() <= tolerance * measured)
+        through += sees_through(z, measured, tolerance)
+        there += finds(z, measured, tolerance)
     kept = (through <= there.clamp(min=SEEN_THROUGH)).numpy()
     return points[kept], colors[kept]
 
@@ -318,7 +319,7 @@ def _gaps(
             ].T
             votes += inside & ((there - tints).abs().mean(dim=-1) <= config.color)
             z, measured = look_up(where, agreed[other], shots[other], poses[other])
-            against |= (measured > 0) & (z < (1 - 2 * config.agree) * measured)
+            against |= sees_through(z, measured, config.agree)
         chosen = torch.zeros_like(candidates)
         chosen[candidates] = (votes >= 2) & ~against
         kept[view] = torch.where(chosen, depth, 0)

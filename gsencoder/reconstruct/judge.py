@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.photographs import Photographs
-from gsencoder.reconstruct.stereo import look_up, world_points
+from gsencoder.reconstruct.stereo import finds, look_up, world_points
 from gsencoder.render.quality import inner, psnr, ssim
 
 SAME_DEPTH = 0.02
@@ -48,22 +48,25 @@ def seen_pixels(
         views: to be judged.
         training: the photographs that a splat is fitted to.
     """
-    shots = {view: photographs.shot(view) for view in (*views, *training)}
-    poses = {view: torch.from_numpy(photographs.cameras.cam_from_world[view].copy()) for view in shots}
-    found = {}
+    depths, points, shown = {}, {}, {}
     for view in views:
-        depth = shots[view].depth
-        if depth is None:
-            continue
-        points, seen = world_points(depth, shots[view], poses[view])[depth > 0], depth > 0
-        shown = torch.zeros(len(points), dtype=torch.bool)
-        for other in training:
-            there = shots[other].depth
-            if there is not None:
-                z, measured = look_up(points, there, shots[other], poses[other])
-                shown |= (measured > 0) & ((z - measured).abs() <= SAME_DEPTH * measured)
-        found[view] = seen.masked_scatter(seen, shown)
-    return found
+        shot = photographs.shot(view)
+        if shot.depth is not None:
+            depths[view] = shot.depth
+            points[view] = world_points(shot.depth, shot, _pose(photographs, view))[shot.depth > 0]
+            shown[view] = torch.zeros(len(points[view]), dtype=torch.bool)
+    # One fitted photograph after the other, so that not all of them are held at once.
+    for other in training if points else ():
+        shot = photographs.shot(other)
+        for view, places in points.items():
+            if shot.depth is not None:
+                z, measured = look_up(places, shot.depth, shot, _pose(photographs, other))
+                shown[view] |= finds(z, measured, SAME_DEPTH)
+    return {view: (depth > 0).masked_scatter(depth > 0, shown[view]) for view, depth in depths.items()}
+
+
+def _pose(photographs: Photographs, view: int) -> Float[Tensor, "4 4"]:
+    return torch.from_numpy(photographs.cameras.cam_from_world[view].copy())
 
 
 @torch.no_grad()

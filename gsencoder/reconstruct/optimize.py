@@ -136,7 +136,8 @@ class Optimizer:
         self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
         self._check_sizes()
-        if not any(len(self._rows(view, photographs.shot(view, 2))) for view in self.training):
+        poses = {view: camera_of(photographs.cameras, view, self.device)[0] for view in self.training}
+        if not any(len(self._rows(pose, photographs.shot(view, 2))) for view, pose in poses.items()):
             raise InputError(
                 f"reconstruct: none of {len(self.raw['means'])} Gaussians is in view of any of {len(self.training)} "
                 "photographs; are the splat and the poses of one world, and is raster.near small enough?"
@@ -183,14 +184,13 @@ class Optimizer:
         """A view over black, the rows that may show in it, and these rows as leaves that gradients go to."""
         pose, center = camera_of(self.photographs.cameras, view, self.device)
         K, size = shot.K.to(self.device), (shot.width, shot.height)
-        rows = self._rows(view, shot)
+        rows = self._rows(pose, shot)
         seen = {name: value[rows].requires_grad_() for name, value in self.raw.items()}
         shape = (seen["means"], seen["quats"], seen["log_scales"].exp(), seen["logit_opacities"].sigmoid())
         raster = rasterize(*shape, seen_colors(seen, degree, center), pose, K, *size, config=self.raster)
         return raster, rows, seen
 
-    def _rows(self, view: int, shot: Shot) -> Int64[Tensor, " n"]:
-        pose, _ = camera_of(self.photographs.cameras, view, self.device)
+    def _rows(self, pose: Float[Tensor, "4 4"], shot: Shot) -> Int64[Tensor, " n"]:
         knobs = {"near": self.raster.near, "eps2d": self.raster.eps2d}
         return rows_in_view(self.raw, pose, shot.K.to(self.device), shot.width, shot.height, **knobs)
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from gsencoder.data.atomic import atomic_file
 from gsencoder.data.images import check_picture
 from gsencoder.data.undistort import load_pycolmap
-from gsencoder.errors import InputError, SceneWarning
+from gsencoder.errors import InputError, SceneWarning, listed
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")
 OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".nef", ".arw", ".mp4", ".mov", ".avi")
@@ -94,11 +94,13 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
     if len(names) < 3:
         raise InputError(f"{folder}: expected at least 3 photographs ({', '.join(SUFFIXES)}), found {len(names)}")
     _check(folder, names)
+    # Before they are looked at: a photograph that changes meanwhile is not the one that was placed.
+    asked = _asked(folder, names, config)
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
-    models = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
-    if config.camera not in models:
-        raise InputError(f"sfm.camera: expected one of {', '.join(models)}, got {config.camera!r}")
+    known = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
+    if config.camera not in known:
+        raise InputError(f"sfm.camera: expected one of {', '.join(known)}, got {config.camera!r}")
     database, attempts, model = work / "database.db", work / "attempts", work / "sparse" / "0"
     for stale in (work / PLACED_FILE, database, attempts, model):
         shutil.rmtree(stale, ignore_errors=True)
@@ -131,7 +133,7 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
         "error": float(best.compute_mean_reprojection_error()),
     }
     with atomic_file(work / PLACED_FILE) as stream:
-        stream.write(json.dumps({"asked": _asked(folder, names, config), "found": found}).encode())
+        stream.write(json.dumps({"asked": asked, "found": found}).encode())
     return _placed(model, found)
 
 
@@ -166,13 +168,16 @@ def _check(folder: Path, names: list[str]) -> None:
     if others:
         warnings.warn(
             f"{folder}: {len(others)} files are in formats that cannot be placed and are not used: "
-            f"{', '.join(others[:8])}{', …' if len(others) > 8 else ''}; expected {', '.join(SUFFIXES)}",
+            f"{listed(others)}; expected {', '.join(SUFFIXES)}",
             SceneWarning,
             stacklevel=3,
         )
     for name in names:
-        if not name.isprintable():
-            raise InputError(f"{folder}: {name!r} has bytes that are no text; give the photograph another name")
+        try:
+            name.encode()
+        except UnicodeEncodeError:
+            told = f"{folder}: {name!r} has bytes that are no text; give the photograph another name"
+            raise InputError(told) from None
         check_picture(folder / name)
 
 

@@ -225,6 +225,16 @@ def look_up(
     return camera[:, 2], torch.where(inside, sample_nearest(depth, grid), 0)
 
 
+def finds(z: Float[Tensor, " n"], measured: Float[Tensor, " n"], tolerance: float) -> Bool[Tensor, " n"]:
+    """Whether a view of which `look_up` told finds a surface where each point is, within a share of its depth."""
+    return (measured > 0) & ((z - measured).abs() <= tolerance * measured)
+
+
+def sees_through(z: Float[Tensor, " n"], measured: Float[Tensor, " n"], tolerance: float) -> Bool[Tensor, " n"]:
+    """Whether it finds one behind each point, further than twice that."""
+    return (measured > 0) & (z < (1 - 2 * tolerance) * measured)
+
+
 def agreeing(
     depth: Float[Tensor, "h w"],
     shot: Shot,
@@ -245,7 +255,7 @@ def agreeing(
     votes = torch.zeros(len(points), dtype=torch.int64)
     for found, other, other_pose in others:
         z, measured = look_up(points, found.depth, other, other_pose)
-        votes += (measured > 0) & ((z - measured).abs() <= tolerance * measured)
+        votes += finds(z, measured, tolerance)
     return torch.where(depth.reshape(-1) > 0, votes, 0).reshape(depth.shape)
 
 
