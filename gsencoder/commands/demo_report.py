@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsencoder.evenly import evenly
 from gsencoder.fusion.fuse import Fusion
 from gsencoder.infer.pictures import PcaColors, color_bar, depth_picture, fit_pca_colors, pca_picture
 from gsencoder.infer.relevancy_views import relevancy_pictures
@@ -94,7 +95,7 @@ def write_report(path: Path, scene: Scene, asked: Sequence[Asked], summary: Summ
             **{f"{one.title} found": f"{one.found_count} of {len(one.words)}" for one in asked},
         }
     )
-    shown = [round(place) for place in np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views)))]
+    shown = evenly(len(views), SHOWN_VIEWS).tolist()
     _views(report, gaussians, views, asked, shown)
     for one in asked:
         _answers(report, scene, one)

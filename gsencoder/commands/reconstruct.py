@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from gsencoder.config import CommonConfig, settings
@@ -17,6 +16,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.splats import READABLE, save_splat
 from gsencoder.errors import InputError, SceneWarning, advised, listed
+from gsencoder.evenly import evenly
 from gsencoder.infer.pictures import contact_sheet
 from gsencoder.models.device import Device, choose_device
 from gsencoder.models.heap import keep_heap
@@ -300,11 +300,7 @@ def write_results(
     gaussians = optimizer.gaussians()
     save_splat(folder / PLY_FILE, gaussians, origin=scene.origin if scene.origin.any() else None)
     shutil.copy(work / LOG_FILE, folder / LOG_FILE)
-    shown = (
-        [held_out[i] for i in np.unique(np.linspace(0, len(held_out) - 1, SHOWN_VIEWS).round().astype(int))]
-        if held_out
-        else []
-    )
+    shown = [held_out[place] for place in evenly(len(held_out), SHOWN_VIEWS)]
     if shown:
         from PIL import Image
 

@@ -27,6 +27,7 @@ from gsencoder.data.splats import load_splat
 from gsencoder.data.transforms_json import TRANSFORMS, read_transforms
 from gsencoder.data.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.errors import InputError, SceneWarning
+from gsencoder.evenly import evenly
 from gsencoder.types import Cameras, Scene, Views
 
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
@@ -253,9 +254,8 @@ def make_views(
     chosen = posed.images
     if not chosen:
         raise InputError(f"{posed.source}: no view")
-    if 0 < max_views < len(chosen):
-        rows = np.round(np.linspace(0, len(chosen) - 1, max_views)).astype(int)
-        chosen = tuple(chosen[row] for row in rows)
+    if max_views:
+        chosen = tuple(chosen[row] for row in evenly(len(chosen), max_views))
     centers = np.array([inverse_rigid(image.cam_from_world)[:3, 3] for image in chosen])
     origin = choose_origin(centers)
     pinholes: dict[CameraModel, Pinhole] = {}

@@ -17,6 +17,7 @@ from gsencoder.data.seeds_flat import flat_gaussians
 from gsencoder.data.seeds_mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
 from gsencoder.data.seeds_points import seed_from_points, typical_spacing
 from gsencoder.errors import InputError, SceneWarning
+from gsencoder.evenly import evenly
 from gsencoder.types import Gaussians, Scene, Views
 
 __all__ = ["SeedConfig", "seed", "seed_from_depth", "seed_from_mesh", "seed_from_points", "seed_from_tsdf"]
@@ -177,7 +178,7 @@ def _voxel_in_units(scene: Scene, config: SeedConfig, estimate: Callable[[], flo
 def _depth_voxel(views: Views) -> float:
     if not len(views) or views.depths is None or views.images is None:
         raise InputError("seeds: the scene has no posed views with depth and images; use source=points or source=mesh")
-    some = np.unique(np.linspace(0, len(views) - 1, min(len(views), SAMPLED_VIEWS)).astype(int))
+    some = evenly(len(views), SAMPLED_VIEWS)
     depths = [depth[depth > 0] for depth in (read_rgbd(views, int(view))[0] for view in some)]
     values = np.concatenate(depths)
     if not values.size:

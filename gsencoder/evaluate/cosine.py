@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsencoder.errors import InputError
+from gsencoder.evenly import evenly
 from gsencoder.types import GaussianFeatures
 
 SAMPLE = 20_000
@@ -50,8 +51,8 @@ def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, samp
     rows = np.flatnonzero(reference.seen)
     if not len(rows):
         raise InputError("field_error: the reference saw no Gaussian")
-    if 0 < sample < len(rows):
-        rows = rows[np.linspace(0, len(rows) - 1, sample).round().astype(np.int64)]
+    if sample:
+        rows = rows[evenly(len(rows), sample)]
     both = rows[features.seen[rows]]
     centred = raw = 0.0
     for start in range(0, len(both), CHUNK):

@@ -16,6 +16,7 @@ from jaxtyping import Float32
 
 from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
+from gsencoder.evenly import evenly
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.lift import Clock, Sums, map_rows, view_matrix
 from gsencoder.fusion.partial import PartialFusion
@@ -161,8 +162,7 @@ def fuse(
 
 
 def _choose(available: int, wanted: int) -> tuple[int, ...]:
-    count = min(wanted or available, available)
-    return tuple(int(view) for view in np.unique(np.linspace(0, available - 1, count).round().astype(int)))
+    return tuple(int(view) for view in evenly(available, wanted or available))
 
 
 def _identity(gaussians: Gaussians, views: Views) -> dict[str, str]:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.errors import InputError
+from gsencoder.evenly import evenly
 from gsencoder.fusion.basis import Moments, encode, fit_basis, table_basis
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import map_rows
@@ -72,7 +73,7 @@ def dataset_space(
 
 
 def _look(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:
-    for view in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int)):
+    for view in evenly(len(views), count):
         rows = map_rows(teacher.feature_map(views, int(view)))
         rows = rows[np.isfinite(rows[:, 0])]
         moments.add(rows[:: max(1, len(rows) // MOST_CELLS)])
