@@ -5,17 +5,18 @@ import shutil
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from gsencoder.commands.reconstruct_scene import ANEW, open_scene
 from gsencoder.config import CommonConfig, settings
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.splats import READABLE, save_splat
-from gsencoder.errors import InputError, SceneWarning, advised, listed
+from gsencoder.errors import InputError, SceneWarning, advised
 from gsencoder.evenly import evenly
 from gsencoder.infer.pictures import contact_sheet
 from gsencoder.models.device import Device, choose_device
@@ -24,22 +25,21 @@ from gsencoder.outputs import close_work_folder, open_work_folder, output_folder
 from gsencoder.progress import Progress, console
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.dense import DenseConfig
-from gsencoder.reconstruct.judge import Score, score, seen_pixels
+from gsencoder.reconstruct.judge import Score, judged, score, seen_pixels, split
+from gsencoder.reconstruct.leash import leash_of
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.sfm import SfmConfig, photographs_in, place_photographs, placed_before
+from gsencoder.reconstruct.sfm import SfmConfig
 from gsencoder.reconstruct.start import start_of
-from gsencoder.render.quality import inner
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.summary import Summary
 from gsencoder.train.log import LOG_FILE, Log, read_log
 from gsencoder.types import Scene
 
 PLY_FILE, PICTURES_FILE = "splat.ply", "held_out.png"
-ANEW = "give resume=false to begin anew"
 SHOWN_VIEWS = 4
 Row = dict[str, int | float]
 """One line of the log, without the step: seconds, gaussians, and what a Score holds."""
@@ -93,7 +93,7 @@ def run(config: ReconstructConfig, summary: Summary) -> None:
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         refuse_to_replace_inputs(work, settings(config))
         open_work_folder(work, anew=not config.resume)
-        scene = open_scene(given, work, config, summary)
+        scene = open_scene(given, work, config.splat, config.data, config.sfm, summary)
         assert scene.views is not None
         with summary.step("read"):
             photographs = Photographs(scene.views, track=track)
@@ -110,7 +110,14 @@ def run(config: ReconstructConfig, summary: Summary) -> None:
             save_state(checkpoint, state, identity)
         summary.results.update(state.facts)
         optimizer = Optimizer(
-            state.adam, photographs, training, optimize, prune=config.prune, raster=config.raster, step=state.step
+            state.adam,
+            photographs,
+            training,
+            optimize,
+            prune=config.prune,
+            raster=config.raster,
+            leash=state.leash,
+            step=state.step,
         )
         with summary.step("optimise"):
             rows = optimise(optimizer, state, held_out, config, work, identity, track)
@@ -118,84 +125,6 @@ def run(config: ReconstructConfig, summary: Summary) -> None:
     close_work_folder(work)
     told = f"; {_told(rows[-1])} on {len(held_out)} held-out photographs" if rows else ""
     console(config.quiet).print(f"{out / PLY_FILE}: {summary.results['gaussians']:,} Gaussians{told}")
-
-
-def open_scene(given: Path, work: Path, config: ReconstructConfig, summary: Summary) -> Scene:
-    """The scene; a folder that holds photographs and nothing else is placed first.
-
-    Raises:
-        InputError: no photographs, or none could be placed.
-    """
-    pictures = next(
-        (folder for folder in (given, given / "images") if folder.is_dir() and photographs_in(folder)), None
-    )
-    try:
-        (path,) = find_scenes([given])
-    except InputError:
-        if pictures is None:
-            raise
-        path = None
-    if path is None and pictures is not None:
-        if config.splat:
-            raise InputError(
-                f"{given}: splat={config.splat} lies in a world of its own, and photographs without poses are placed "
-                "in another; give a scene with the poses that belong to the splat"
-            )
-        placed = placed_before(pictures, work, config.sfm)
-        if placed is None and os.path.lexists(work / CHECKPOINT_FILE):
-            raise InputError(
-                f"{work}: a run was cut off here, and where its photographs were placed is gone, or belongs to other "
-                "photographs or settings; put these back, or give resume=false to begin anew"
-            )
-        if placed is None:
-            with summary.step("place"):
-                placed = place_photographs(pictures, work, config.sfm)
-        summary.results.update(placed=len(placed.placed), missing=list(placed.missing), sfm_error=placed.error)
-        if placed.missing:
-            warnings.warn(
-                f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "
-                f"and are not used: {listed(placed.missing)}",
-                SceneWarning,
-                stacklevel=2,
-            )
-        with advised(ANEW):
-            return load_scene(work, options=replace(config.data, images=str(pictures)))
-    assert path is not None
-    scene = load_scene(path, splat=config.splat or None, options=config.data)
-    if scene.views is None:
-        raise InputError(f"{given}: a splat without photographs; there is nothing to fit it to")
-    return scene
-
-
-def split(count: int, every: int) -> tuple[list[int], list[int]]:
-    """Views to fit, and every so manyth that is kept to judge by.
-
-    Raises:
-        InputError: too few.
-    """
-    held_out = [view for view in range(count) if every and view % every == 0]
-    training = [view for view in range(count) if view not in held_out]
-    if len(training) < 2:
-        raise InputError(f"reconstruct: expected at least 2 photographs to fit, got {len(training)} of {count}")
-    return training, held_out
-
-
-def judged(photographs: Photographs, held_out: Sequence[int]) -> list[int]:
-    """Those of which a mask leaves something to judge by.
-
-    Warns:
-        SceneWarning: the others are named.
-    """
-    masks = {view: photographs.shot(view).mask for view in held_out}
-    blank = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
-    if blank:
-        warnings.warn(
-            f"{len(blank)} of {len(held_out)} held-out photographs are masked all over and not judged by: "
-            f"{listed([photographs.names[view] for view in blank])}",
-            SceneWarning,
-            stacklevel=2,
-        )
-    return [view for view in held_out if view not in blank]
 
 
 def begin(
@@ -224,7 +153,8 @@ def begin(
                 stacklevel=2,
             )
     adam = RowAdam(parameters_from(begun.gaussians, config.optimize.sh_degree, device))
-    return State(adam=adam, step=0, seconds=0.0, facts=facts)
+    leash = leash_of(adam.parameters, config.optimize.leash) if begun.measured and config.optimize.leash else None
+    return State(adam=adam, leash=leash, step=0, seconds=0.0, facts=facts)
 
 
 def optimise(
@@ -254,7 +184,13 @@ def optimise(
         )
 
     def save() -> None:
-        now = State(adam=optimizer.adam, step=optimizer.step, seconds=time.monotonic() - begun, facts=state.facts)
+        now = State(
+            adam=optimizer.adam,
+            leash=optimizer.leash,
+            step=optimizer.step,
+            seconds=time.monotonic() - begun,
+            facts=state.facts,
+        )
         save_state(work / CHECKPOINT_FILE, now, identity)
 
     if held_out and not rows and not optimizer.step:

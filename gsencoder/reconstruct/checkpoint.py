@@ -10,10 +10,12 @@ import torch
 
 from gsencoder.data.archive import first_difference, open_archive, write_archive
 from gsencoder.errors import InputError, advised
+from gsencoder.reconstruct.leash import Leash
 from gsencoder.reconstruct.parameters import shapes_of
 from gsencoder.reconstruct.row_adam import RowAdam
 
 CHECKPOINT_FILE = "reconstruction.safetensors"
+LEASH_SHAPES: dict[str, tuple[int | str, ...]] = {"means": ("N", 3), "reach": ("N",)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,12 +24,14 @@ class State:
 
     Attributes:
         adam: parameters and moments.
+        leash: what holds positions back, if anything does.
         step: steps that are done.
         seconds: that they took.
         facts: how it began, as JSON values: number and source of the seeds, and what was added to points.
     """
 
     adam: RowAdam
+    leash: Leash | None
     step: int
     seconds: float
     facts: Mapping[str, Any]
@@ -49,6 +53,8 @@ def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
         for kind, table in state.adam.tables().items()
         for name, value in table.items()
     }
+    if state.leash is not None:
+        arrays |= {f"leash.{name}": getattr(state.leash, name).cpu().numpy() for name in LEASH_SHAPES}
     header = {
         "step": state.step,
         "adam_steps": state.adam.steps,
@@ -89,4 +95,8 @@ def load_state(
             }
             for kind in RowAdam.KINDS
         }
-    return State(adam=RowAdam.restored(tables, adam_steps), step=step, seconds=seconds, facts=facts)
+        leash = None
+        if "leash.means" in file:
+            stood = {name: file.array(f"leash.{name}", "float32", shape) for name, shape in LEASH_SHAPES.items()}
+            leash = Leash(**{name: torch.from_numpy(value.copy()).to(device) for name, value in stood.items()})
+    return State(adam=RowAdam.restored(tables, adam_steps), leash=leash, step=step, seconds=seconds, facts=facts)

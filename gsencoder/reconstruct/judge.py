@@ -1,5 +1,6 @@
 """How well a splat shows photographs that it was not fitted to: the whole picture, and what could be known of it."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsencoder.errors import InputError, SceneWarning, listed
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.stereo import finds, look_up, world_points
@@ -33,6 +35,37 @@ class Score(NamedTuple):
     seen_psnr: float | None = None
     seen_ssim: float | None = None
     seen: float | None = None
+
+
+def split(count: int, every: int) -> tuple[list[int], list[int]]:
+    """Views to fit, and every so manyth that is kept to judge by.
+
+    Raises:
+        InputError: too few.
+    """
+    held_out = [view for view in range(count) if every and view % every == 0]
+    training = [view for view in range(count) if view not in held_out]
+    if len(training) < 2:
+        raise InputError(f"reconstruct: expected at least 2 photographs to fit, got {len(training)} of {count}")
+    return training, held_out
+
+
+def judged(photographs: Photographs, held_out: Sequence[int]) -> list[int]:
+    """Those of which a mask leaves something to judge by.
+
+    Warns:
+        SceneWarning: the others are named.
+    """
+    masks = {view: photographs.shot(view).mask for view in held_out}
+    blank = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
+    if blank:
+        warnings.warn(
+            f"{len(blank)} of {len(held_out)} held-out photographs are masked all over and not judged by: "
+            f"{listed([photographs.names[view] for view in blank])}",
+            SceneWarning,
+            stacklevel=2,
+        )
+    return [view for view in held_out if view not in blank]
 
 
 def seen_pixels(

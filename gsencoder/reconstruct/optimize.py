@@ -10,6 +10,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsencoder.errors import InputError
+from gsencoder.reconstruct.leash import Leash
 from gsencoder.reconstruct.parameters import (
     Parameters,
     camera_of,
@@ -48,6 +49,13 @@ class OptimizeConfig:
     )
     means_rate: float = field(default=3e-4, metadata={"help": "learning rate of positions, times the scene's size"})
     means_final: float = field(default=0.01, metadata={"help": "share of that rate which is left at the end"})
+    leash: float = field(
+        default=0.4,
+        metadata={
+            "help": "Gaussians that begin on a measured surface (depth, mesh, tsdf) stay within about so many of their "
+            "first standard deviations of there; 0 = they go where they like"
+        },
+    )
     scales_rate: float = field(default=2e-2, metadata={"help": "learning rate of the logarithms of scales"})
     quats_rate: float = field(default=1e-3, metadata={"help": "learning rate of rotations"})
     opacities_rate: float = field(default=5e-2, metadata={"help": "learning rate of the logits of opacities"})
@@ -71,7 +79,7 @@ class OptimizeConfig:
             raise InputError(f"means_final: expected a share above 0, up to 1, got {self.means_final}")
         if not 0 <= self.seed < 2**63:
             raise InputError(f"seed: expected 0 or more, got {self.seed}")
-        limits = {"sh_every": 1.0, "depth_weight": 100.0}
+        limits = {"sh_every": 1.0, "depth_weight": 100.0, "leash": 1e6}
         limits |= dict.fromkeys((field.name for field in fields(self) if field.name.endswith("_rate")), LARGEST_RATE)
         for name, limit in limits.items():
             if not 0 <= getattr(self, name) <= limit:
@@ -103,6 +111,7 @@ class Optimizer:
 
     Attributes:
         adam: holds the parameters, and their moments.
+        leash: what holds positions back, if anything does.
         step: steps that are done.
         whole: whether the state is one between two steps.
     """
@@ -116,6 +125,7 @@ class Optimizer:
         *,
         prune: PruneConfig,
         raster: RasterConfig = RasterConfig(),
+        leash: Leash | None = None,
         step: int = 0,
     ) -> None:
         """Args:
@@ -125,6 +135,7 @@ class Optimizer:
         config: see there.
         prune: what is taken out, and when.
         raster: accuracy of rendering.
+        leash: what holds positions back; None = nothing.
         step: steps that are done.
 
         Raises:
@@ -132,7 +143,7 @@ class Optimizer:
         """
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
-        self.adam, self.step, self.whole = adam, step, True
+        self.adam, self.leash, self.step, self.whole = adam, leash, step, True
         self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
         self._check_sizes()
@@ -142,7 +153,9 @@ class Optimizer:
                 f"reconstruct: none of {len(self.raw['means'])} Gaussians is in view of any of {len(self.training)} "
                 "photographs; are the splat and the poses of one world, and is raster.near small enough?"
             )
-        self.extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0)) or 1.0
+        # Nine cameras in ten: one that is astray must not make everybody's steps too large.
+        away = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+        self.extent = 1.1 * float(np.quantile(away, 0.9)) or 1.0
 
     @property
     def raw(self) -> Parameters:
@@ -171,7 +184,10 @@ class Optimizer:
             grads = {name: value.grad for name, value in seen.items() if value.grad is not None}
             self._check(view, losses, grads)
             self.whole = False
-            self.adam.step(rows, grads, self.config.rates_at(self.step, self.extent))
+            rates = self.config.rates_at(self.step, self.extent)
+            self.adam.step(rows, grads, rates)
+            if self.leash is not None:
+                self.leash.pull(self.raw["means"], rows, rates["means"])
             terms = {name: float(value.detach()) for name, value in losses.items()}
         self.whole = False
         self.step += 1
@@ -210,7 +226,10 @@ class Optimizer:
     def prune(self) -> None:
         """Takes out what does not contribute."""
         views = [(view, self.photographs.shot(view, 2)) for view in self.training]
-        self.adam.keep(rows_to_keep(self.raw, self.photographs.cameras, views, self.pruning, self.raster))
+        rows = rows_to_keep(self.raw, self.photographs.cameras, views, self.pruning, self.raster)
+        self.adam.keep(rows)
+        if self.leash is not None:
+            self.leash = self.leash.keep(rows)
 
     def _check(self, view: int, losses: Mapping[str, Tensor], grads: Mapping[str, Tensor]) -> None:
         named = {f"the loss {name}": value for name, value in losses.items()}

@@ -11,6 +11,8 @@ from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.tracking import Track, untracked
 from gsencoder.types import Gaussians, Scene, Views
 
+MEASURED = ("depth", "mesh", "tsdf")
+"""Sources whose points lie on surfaces; those of photographs alone are estimates, and a splat has moved already."""
 DENSE_SPACING = 4.0
 """Seeds of dense points are at most so many median spacings apart: strays among them must not become great blobs."""
 
@@ -28,6 +30,11 @@ class Start:
     gaussians: Gaussians
     source: str
     dense: Dense | None = None
+
+    @property
+    def measured(self) -> bool:
+        """Whether the Gaussians stand on surfaces that something measured."""
+        return self.source in MEASURED
 
 
 class _Chosen(Sequence[Any]):

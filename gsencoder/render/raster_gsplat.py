@@ -10,6 +10,9 @@ from gsencoder.errors import InputError
 if TYPE_CHECKING:
     from gsencoder.render.rasterize import RasterConfig
 
+STOP_TRANSMITTANCE = 1e-4
+"""Compiled into gsplat's kernels."""
+
 
 def rasterize_gsplat(
     means: Float[Tensor, "N 3"],
@@ -23,11 +26,16 @@ def rasterize_gsplat(
     height: int,
     config: "RasterConfig",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The fields of a Raster. gsplat ends rays at a transmittance of 1e-4 of its own.
+    """The fields of a Raster.
 
     Raises:
-        InputError: gsplat is not installed.
+        InputError: gsplat is not installed, or a transmittance that it cannot be told.
     """
+    if config.stop_transmittance != STOP_TRANSMITTANCE:
+        raise InputError(
+            f"stop_transmittance: gsplat ends rays at {STOP_TRANSMITTANCE:g} and cannot be told otherwise, "
+            f"got {config.stop_transmittance:g}; leave it, or use device=cpu"
+        )
     try:
         from gsplat import rasterization  # type: ignore[import-not-found]
     except ImportError as error:

@@ -16,6 +16,7 @@ from gsencoder.data.splats import load_splat
 from gsencoder.data.synthetic import make_room
 from gsencoder.data.synthetic_write import write_room
 from gsencoder.errors import InputError
+from gsencoder.reconstruct.judge import split
 
 QUICK = ("quiet=true", "optimize.steps=12", "holdout=4", "seeds.voxel=0.08", "optimize.sh_degree=1")
 
@@ -278,7 +279,7 @@ def test_a_bare_splat_cannot_be_fitted_to_anything(
 
 
 def test_every_eighth_photograph_is_kept() -> None:
-    assert reconstruct.split(10, 4) == ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
-    assert reconstruct.split(3, 0) == ([0, 1, 2], [])
+    assert split(10, 4) == ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
+    assert split(3, 0) == ([0, 1, 2], [])
     with pytest.raises(InputError, match="at least 2 photographs"):
-        reconstruct.split(2, 2)
+        split(2, 2)

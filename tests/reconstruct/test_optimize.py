@@ -19,7 +19,7 @@ from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render.rasterize import RasterConfig
-from gsencoder.types import Gaussians
+from gsencoder.types import Gaussians, Views
 
 QUICK = OptimizeConfig(steps=40, sh_degree=1, shrinks=(2, 1), shares=(0.5, 0.5))
 NEVER = PruneConfig(at=())
@@ -88,7 +88,7 @@ def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None
         whole.advance()
     for _ in range(8):
         cut.advance()
-    state = State(adam=cut.adam, step=cut.step, seconds=1.5, facts={"seeds": 7})
+    state = State(adam=cut.adam, leash=None, step=cut.step, seconds=1.5, facts={"seeds": 7})
     save_state(tmp_path / "state", state, {"run": 1})
     asked = {"steps": QUICK.steps, "sh_degree": QUICK.sh_degree}
     found = load_state(tmp_path / "state", {"run": 1}, **asked)
@@ -253,3 +253,21 @@ def test_the_stages_follow_the_shares() -> None:
     assert [config.shrink_at(step) for step in (0, 14, 15, 49, 50, 99)] == [4, 4, 2, 2, 1, 1]
     assert [config.degree_at(step) for step in (0, 19, 20, 40, 99)] == [0, 0, 1, 2, 2]
     assert config.rates_at(100, 2.0)["means"] == pytest.approx(0.01 * config.rates_at(0, 2.0)["means"])
+
+
+def test_a_camera_that_is_astray_does_not_make_steps_larger() -> None:
+    views = wall_views(depth=True)
+    poses = np.concatenate([views.cameras.cam_from_world] * 5)
+    cameras = views.cameras.select([0, 1, 2, 3] * 5)
+    astray = poses.copy()
+    astray[2, :3, 3] += 1e5
+    extents = []
+    for some in (poses, astray):
+        photographs = Photographs(replace(views, cameras=replace(cameras, cam_from_world=some), **_five_times(views)))
+        extents.append(Optimizer(adam_of(seeds(), QUICK), photographs, range(20), QUICK, prune=NEVER).extent)
+    assert extents[1] < 2 * extents[0]
+
+
+def _five_times(views: Views) -> dict[str, object]:
+    lists = {name: list(getattr(views, name) or ()) * 5 for name in ("images", "depths")}
+    return {"names": tuple(f"{i}.png" for i in range(20)), **lists}

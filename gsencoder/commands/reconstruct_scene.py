@@ -1,0 +1,70 @@
+"""What `gsencoder reconstruct` begins with: a scene with poses, or photographs that are given some."""
+
+import os
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.errors import InputError, SceneWarning, advised, listed
+from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
+from gsencoder.reconstruct.sfm import SfmConfig, photographs_in, place_photographs, placed_before
+from gsencoder.summary import Summary
+from gsencoder.types import Scene
+
+ANEW = "give resume=false to begin anew"
+
+
+def open_scene(given: Path, work: Path, splat: str, data: SceneConfig, sfm: SfmConfig, summary: Summary) -> Scene:
+    """The scene; a folder that holds photographs and nothing else is placed first.
+
+    Args:
+        given: a scene, or photographs.
+        work: folder for what placing finds; what an earlier run found there is taken up.
+        splat: Gaussians to refine, or empty.
+        data: how the scene is read.
+        sfm: how photographs are placed.
+        summary: is told of those that have a place, and of the others.
+
+    Raises:
+        InputError: no photographs, or none could be placed.
+    """
+    pictures = next(
+        (folder for folder in (given, given / "images") if folder.is_dir() and photographs_in(folder)), None
+    )
+    try:
+        (path,) = find_scenes([given])
+    except InputError:
+        if pictures is None:
+            raise
+        path = None
+    if path is None and pictures is not None:
+        if splat:
+            raise InputError(
+                f"{given}: splat={splat} lies in a world of its own, and photographs without poses are placed "
+                "in another; give a scene with the poses that belong to the splat"
+            )
+        placed = placed_before(pictures, work, sfm)
+        if placed is None and os.path.lexists(work / CHECKPOINT_FILE):
+            raise InputError(
+                f"{work}: a run was cut off here, and where its photographs were placed is gone, or belongs to other "
+                "photographs or settings; put these back, or give resume=false to begin anew"
+            )
+        if placed is None:
+            with summary.step("place"):
+                placed = place_photographs(pictures, work, sfm)
+        summary.results.update(placed=len(placed.placed), missing=list(placed.missing), sfm_error=placed.error)
+        if placed.missing:
+            warnings.warn(
+                f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "
+                f"and are not used: {listed(placed.missing)}",
+                SceneWarning,
+                stacklevel=2,
+            )
+        with advised(ANEW):
+            return load_scene(work, options=replace(data, images=str(pictures)))
+    assert path is not None
+    scene = load_scene(path, splat=splat or None, options=data)
+    if scene.views is None:
+        raise InputError(f"{given}: a splat without photographs; there is nothing to fit it to")
+    return scene

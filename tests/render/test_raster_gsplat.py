@@ -1,0 +1,75 @@
+"""What gsplat is asked, and what becomes of its answer; a stand-in answers with the plain twin, in gsplat's shapes."""
+
+import sys
+from types import ModuleType
+
+import pytest
+import torch
+from splats import front_camera, random_gaussians
+from torch import Tensor
+
+from gsencoder.errors import InputError
+from gsencoder.render.raster_gsplat import rasterize_gsplat
+from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
+
+
+def stand_in(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float,
+    eps2d: float,
+    packed: bool,
+    render_mode: str,
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    assert (viewmats.shape, Ks.shape, packed, render_mode) == ((1, 4, 4), (1, 3, 3), False, "RGB+D")
+    config = RasterConfig(near=near_plane, eps2d=eps2d, backend="reference")
+    found = rasterize(means, quats, scales, opacities, colors, viewmats[0], Ks[0], width, height, config=config)
+    rendered = torch.cat((found.rgb, found.depth.unsqueeze(-1)), dim=-1)
+    radii = found.radii.ceil().int()
+    told = {"radii": torch.stack((radii, radii // 2), dim=-1)[None], "means2d": found.means2d[None]}
+    return rendered[None], found.alpha[None, ..., None], told
+
+
+def asked(config: RasterConfig) -> tuple[Raster, Raster]:
+    """A view through gsplat's stand-in, and the plain one."""
+    g, camera = random_gaussians(80), front_camera()
+    torch.manual_seed(0)
+    inputs = [*map(torch.from_numpy, (g.means, g.quats, g.scales, g.opacities)), torch.rand(len(g), 3)]
+    view = (torch.from_numpy(camera.cam_from_world[0]), torch.from_numpy(camera.Ks[0]), 61, 43)
+    return Raster(*rasterize_gsplat(*inputs, *view, config)), rasterize(*inputs, *view, config=config)
+
+
+@pytest.fixture
+def gsplat(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("gsplat")
+    module.rasterization = stand_in  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "gsplat", module)
+
+
+@pytest.mark.usefixtures("gsplat")
+@pytest.mark.parametrize("eps2d", [0.1, 0.3])
+def test_the_knobs_reach_gsplat_and_its_answer_is_a_view(eps2d: float) -> None:
+    found, expected = asked(RasterConfig(eps2d=eps2d, near=0.3))
+    for name in ("rgb", "alpha", "depth", "means2d"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found.radii, expected.radii.ceil())
+
+
+@pytest.mark.usefixtures("gsplat")
+def test_a_transmittance_that_gsplat_cannot_be_told_is_refused() -> None:
+    with pytest.raises(InputError, match="gsplat ends rays at 0.0001 and cannot be told otherwise, got 0.001"):
+        asked(RasterConfig(stop_transmittance=1e-3))
+
+
+def test_without_gsplat_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(InputError, match=r"pip install 'gsencoder\[gpu\]'"):
+        asked(RasterConfig())
