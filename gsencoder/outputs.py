@@ -13,14 +13,9 @@ from hashlib import sha1
 from pathlib import Path
 from typing import Any
 
-from gsencoder.data.atomic import atomic_file
+from gsencoder.data.atomic import atomic_file, is_full_disk, locked
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.summary import SUMMARY_NAME, Summary, json_bytes
-
-try:
-    import fcntl
-except ImportError:  # A system without it never removes what a killed run left behind.
-    fcntl = None  # type: ignore[assignment]
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 
@@ -76,15 +71,14 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
     _check_target(path, target, overwrite)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        if _remove_stale(target):
-            raise InputError(f"{path}: another run is writing this folder now; wait for it or give another out=")
-        partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
-        partial.mkdir()
+        partial, lock = _begin(target)
+    except BlockingIOError:
+        told = f"{path}: another run is writing this folder now; wait for it or give another out="
+        raise InputError(told) from None
     except FileExistsError as error:
         raise InputError(f"{path}: {error.filename} is a file, so no folder can be made in it") from error
     except OSError as error:
         raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
-    lock = _lock(partial)
     try:
         yield partial
         if summary is not None:
@@ -93,7 +87,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         _check_target(path, target, overwrite)
         _take_place(partial, target)
     except Exception as error:
-        message = _refusal(error, partial, path)
+        message = _refusal(error, partial, target, path)
         if message is None:
             raise
         raise InputError(message) from error
@@ -102,6 +96,25 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         shutil.rmtree(partial, ignore_errors=True)
         if lock is not None:
             os.close(lock)
+
+
+def _begin(target: Path) -> tuple[Path, int | None]:
+    """The hidden folder, and its lock. Runs that begin in one moment do so one after the other: a folder that has been
+    made and not yet locked would be taken for one that a killed run left.
+
+    Raises:
+        BlockingIOError: a living run is writing `target`.
+    """
+    turn = locked(target.parent, wait=True)
+    try:
+        if _remove_stale(target):
+            raise BlockingIOError
+        partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
+        partial.mkdir()
+        return partial, locked(partial)
+    finally:
+        if turn is not None:
+            os.close(turn)
 
 
 def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
@@ -113,6 +126,8 @@ def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
         raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
     if not target.is_dir():
         raise InputError(f"{path}: is a file, and the results are a folder; give another out=")
+    if os.path.ismount(target):
+        raise InputError(f"{path}: is a mount point, which cannot be exchanged for the results; give a folder in it")
     with suppress(OSError):
         if not any(target.iterdir()):
             return
@@ -171,56 +186,10 @@ def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
             yield from _texts(item, key)
 
 
-WORK_MARK = "unfinished.txt"
-
-
-def open_work_folder(path: Path, *, anew: bool) -> None:
-    """Makes the folder in which a run that may be cut off keeps its state, or takes up the one that a run has left.
-
-    Args:
-        path: the folder. One that no run has made is never touched.
-        anew: forget what an earlier run left in it.
-
-    Raises:
-        InputError: it holds something else, or cannot be made.
-    """
-    try:
-        if path.is_dir() and any(path.iterdir()) and not (path / WORK_MARK).is_file():
-            raise InputError(
-                f"{path}: this run would keep its state here, and the folder holds something else (no {WORK_MARK}); "
-                "give another out="
-            )
-        if anew:
-            shutil.rmtree(path, ignore_errors=True)
-        path.mkdir(parents=True, exist_ok=True)
-        write_bytes(path / WORK_MARK, b"The state of a run that is not finished, which removes this folder.\n")
-    except OSError as error:
-        raise InputError(f"{path}: cannot keep the state of this run here: {error.strerror or error}") from error
-
-
-def close_work_folder(path: Path) -> None:
-    """Removes the folder of a run that is finished."""
-    if (path / WORK_MARK).is_file():
-        shutil.rmtree(path, ignore_errors=True)
-
-
 def _short(name: str) -> str:
     """The name, or a digest of it where the temporary name would grow longer than file systems allow."""
     raw = os.fsencode(name)
     return name if len(raw) <= 200 else sha1(raw).hexdigest()
-
-
-def _lock(folder: Path) -> int | None:
-    """Marks a folder as being written: held until the descriptor closes, which the system does for a killed run."""
-    if fcntl is None:
-        return None
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        return None
-    return descriptor
 
 
 def _remove_stale(target: Path) -> bool:
@@ -228,21 +197,19 @@ def _remove_stale(target: Path) -> bool:
 
     Where folders cannot be locked (some network file systems) nothing is removed and nobody is seen.
     """
-    if fcntl is None:
-        return False
     pattern = re.compile(re.escape(f".{_short(target.name)}.partial-") + "[0-9a-f]{8}")
     for entry in list(os.scandir(target.parent)):
         if not pattern.fullmatch(entry.name) or not entry.is_dir(follow_symlinks=False):
             continue
-        with suppress(OSError):
-            descriptor = os.open(entry.path, os.O_RDONLY)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(entry.path, ignore_errors=True)
-            except BlockingIOError:
-                return True
-            finally:
-                os.close(descriptor)
+        try:
+            descriptor = locked(entry.path)
+        except BlockingIOError:
+            return True
+        except OSError:
+            continue
+        if descriptor is not None:
+            shutil.rmtree(entry.path, ignore_errors=True)
+            os.close(descriptor)
     return False
 
 
@@ -293,29 +260,20 @@ def _exchange(first: Path, second: Path) -> bool:
     return bool(renameat2(AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(second), RENAME_EXCHANGE) == 0)
 
 
-def is_full_disk(error: BaseException) -> bool:
-    """Whether an error, of the system or of a library that wrote, means that the disk or the quota is full."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return True
-    # numpy says "4096 requested and 100 written", and safetensors puts the system's words in its own error.
-    short = (
-        isinstance(error, OSError) and error.errno is None and re.search(r"\d+ requested and \d+ written", str(error))
-    )
-    return bool(short) or os.strerror(errno.ENOSPC) in str(error)
-
-
-def _refusal(error: Exception, partial: Path, path: str | Path) -> str | None:
+def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) -> str | None:
     """What to tell the user if it was the system that refused to write, or None."""
     if isinstance(error, InputError) and str(partial) not in str(error):
         # What lies elsewhere, such as the state of a run that can go on, was not given up.
         return str(error)
     if (isinstance(error, OSError) and error.errno == errno.EFBIG) or os.strerror(errno.EFBIG) in str(error):
-        return f"{path}: a file would grow larger than this system or shell allows (ulimit -f); nothing was kept"
+        return f"{path}: a file would grow larger than this system or shell allows (ulimit -f): no result was written"
     if is_full_disk(error):
-        return f"{path}: no space left on the device; nothing was kept"
+        return f"{path}: no space left on the device: no result was written"
     if isinstance(error, InputError):
         return str(error).replace(str(partial), str(path))
     named = str(getattr(error, "filename", None) or "")
     if isinstance(error, OSError) and named.startswith(str(partial)):
         return f"{named.replace(str(partial), str(path))}: cannot write: {error.strerror or error}"
+    if isinstance(error, OSError) and named == str(target):
+        return f"{path}: cannot be replaced by the results: {error.strerror or error}"
     return None

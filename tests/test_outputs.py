@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +21,6 @@ import pytest
 from gsencoder import outputs
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.outputs import (
-    WORK_MARK,
-    close_work_folder,
-    open_work_folder,
     output_folder,
     refuse_existing,
     refuse_to_replace_inputs,
@@ -194,14 +192,14 @@ def test_a_kill_leaves_no_output_folder_and_the_next_run_cleans_up(tmp_path: Pat
     ],
 )
 def test_a_full_disk_is_one_line_that_names_the_folder(tmp_path: Path, error: Exception) -> None:
-    with pytest.raises(InputError, match=r"out: no space left on the device; nothing was kept$") as caught:
+    with pytest.raises(InputError, match=r"out: no space left on the device: no result was written$") as caught:
         write_and_raise(tmp_path / "out", error)
     assert ".partial" not in str(caught.value)
     assert names(tmp_path) == []
 
 
 def test_a_file_beyond_the_shells_limit_is_one_line_that_names_the_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"out: a file would grow larger than .* \(ulimit -f\); nothing was kept"):
+    with pytest.raises(InputError, match=r"out: a file would grow larger than .* \(ulimit -f\): no result was written"):
         write_and_raise(tmp_path / "out", OSError(errno.EFBIG, "File too large"))
     assert names(tmp_path) == []
 
@@ -268,7 +266,7 @@ def test_inputs_inside_the_folder_to_replace_are_protected(tmp_path: Path) -> No
 )
 def test_a_disk_that_is_full_elsewhere_is_not_said_to_be_full_here(tmp_path: Path, words: str, told: str) -> None:
     with (
-        pytest.raises(InputError, match=rf"out: .*{told}.*; nothing was kept$"),
+        pytest.raises(InputError, match=rf"out: .*{told}.*: no result was written$"),
         output_folder(tmp_path / "out") as own,
     ):
         raise InputError(f"{own}/a.ply: cannot be written: {words}")
@@ -276,27 +274,56 @@ def test_a_disk_that_is_full_elsewhere_is_not_said_to_be_full_here(tmp_path: Pat
         write_and_raise(tmp_path / "out", InputError(f"/elsewhere/b: cannot be written: {words}"))
 
 
-def test_the_folder_of_a_run_is_its_own(tmp_path: Path) -> None:
-    work = tmp_path / "run.training"
-    open_work_folder(work, anew=False)
-    (work / "state").touch()
-    open_work_folder(work, anew=False)
-    assert (work / "state").is_file()
-    open_work_folder(work, anew=True)
-    assert [entry.name for entry in work.iterdir()] == [WORK_MARK]
-    close_work_folder(work)
-    assert not work.exists()
+def test_a_mount_point_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "volume").mkdir()
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path).name == "volume")
+    with (
+        pytest.raises(InputError, match="volume: is a mount point.*give a folder in it"),
+        output_folder(tmp_path / "volume"),
+    ):
+        raise AssertionError("the block must not begin")
+    fill(tmp_path / "volume" / "out", "x")
 
 
-@pytest.mark.parametrize("anew", [True, False])
-def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path, *, anew: bool) -> None:
-    (tmp_path / "notes.txt").touch()
-    with pytest.raises(InputError, match="holds something else"):
-        open_work_folder(tmp_path, anew=anew)
-    close_work_folder(tmp_path)
-    assert (tmp_path / "notes.txt").is_file()
-    with pytest.raises(InputError, match="cannot keep the state of this run here"):
-        open_work_folder(tmp_path / "notes.txt", anew=anew)
+def test_an_output_that_the_system_does_not_let_go_is_named_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(tmp_path / "out", "old")
+
+    def refused(source: str | Path, *_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted", str(source))
+
+    monkeypatch.setattr("gsencoder.outputs._exchange", lambda *_: False)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "rename", refused)
+        with pytest.raises(InputError, match="out: cannot be replaced by the results: Operation not permitted"):
+            fill(tmp_path / "out", "new", overwrite=True)
+    assert (tmp_path / "out" / "deep" / "data.txt").read_text() == "old"
+    assert names(tmp_path) == ["out"]
+
+
+def test_of_runs_that_begin_in_one_moment_one_gets_the_folder(tmp_path: Path) -> None:
+    """The outcome of each is its own, or that another is writing; none removes what another has just made."""
+    for turn in range(20):
+        begun, outcomes = threading.Barrier(4), []
+
+        def run(out: Path = tmp_path / str(turn), begun: threading.Barrier = begun, told: list[str] = outcomes) -> None:
+            begun.wait()
+            try:
+                with output_folder(out) as folder:
+                    (folder / "summary.json").write_text("{}")
+                    time.sleep(0.01)
+                told.append("ok")
+            except InputError as error:
+                text = str(error)
+                told.append("refused" if "another run" in text or "an earlier run" in text else text)
+
+        threads = [threading.Thread(target=run) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(outcomes) == ["ok", "refused", "refused", "refused"]
 
 
 def test_single_files_are_replaced_only_if_allowed(tmp_path: Path) -> None:

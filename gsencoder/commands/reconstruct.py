@@ -21,11 +21,11 @@ from gsencoder.evenly import evenly
 from gsencoder.infer.pictures import contact_sheet
 from gsencoder.models.device import Device, choose_device
 from gsencoder.models.heap import keep_heap
-from gsencoder.outputs import close_work_folder, open_work_folder, output_folder, refuse_to_replace_inputs
+from gsencoder.outputs import output_folder, refuse_to_replace_inputs
 from gsencoder.progress import Progress, console
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.dense import DenseConfig
-from gsencoder.reconstruct.judge import Score, judged, score, seen_pixels, split
+from gsencoder.reconstruct.judge import FEWEST, Score, score, seen_pixels, split, unmasked
 from gsencoder.reconstruct.leash import leash_of
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
@@ -38,11 +38,12 @@ from gsencoder.render.rasterize import RasterConfig
 from gsencoder.summary import Summary
 from gsencoder.train.log import LOG_FILE, Log, read_log
 from gsencoder.types import Scene
+from gsencoder.work_folder import WorkFolder
 
 PLY_FILE, PICTURES_FILE = "splat.ply", "held_out.png"
 SHOWN_VIEWS = 4
 Row = dict[str, int | float]
-"""One line of the log, without the step: seconds, gaussians, and what a Score holds."""
+"""One line of the log: step, seconds, gaussians, and what a Score holds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,24 +91,25 @@ def run(config: ReconstructConfig, summary: Summary) -> None:
     real = Path(os.path.realpath(out))
     work = real.with_name(f"{real.name}.reconstruction")
     track = Progress(quiet=config.quiet)
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-        refuse_to_replace_inputs(work, settings(config))
-        open_work_folder(work, anew=not config.resume)
-        scene = open_scene(given, work, config.splat, config.data, config.sfm, summary)
+    with WorkFolder(work) as kept, output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+        refuse_to_replace_inputs(kept.path, settings(config))
+        kept.take(anew=not config.resume)
+        scene = open_scene(given, kept.path, config.splat, config.data, config.sfm, summary)
         assert scene.views is not None
         with summary.step("read"):
             photographs = Photographs(scene.views, track=track)
         training, held_out = split(len(photographs), config.holdout)
-        held_out = judged(photographs, held_out)
+        training = unmasked(photographs, training, "photographs to fit", least=FEWEST)
+        held_out = unmasked(photographs, held_out, "held-out photographs")
         identity = {"scene": str(given.resolve()), "photographs": photographs.digest(), **_identity(config)}
-        optimize, checkpoint = config.optimize, work / CHECKPOINT_FILE
-        if os.path.lexists(checkpoint):
+        optimize, checkpoint = config.optimize, kept.path / CHECKPOINT_FILE
+        begun = os.path.lexists(checkpoint)
+        if begun:
             shape = {"steps": optimize.steps, "sh_degree": optimize.sh_degree}
             state = load_state(checkpoint, identity, **shape, device=device)
         else:
             with summary.step("seeds"):
                 state = begin(scene, photographs, training, config, track, device)
-            save_state(checkpoint, state, identity)
         summary.results.update(state.facts)
         optimizer = Optimizer(
             state.adam,
@@ -119,10 +121,11 @@ def run(config: ReconstructConfig, summary: Summary) -> None:
             leash=state.leash,
             step=state.step,
         )
+        if not begun:
+            save_state(checkpoint, state, identity)
         with summary.step("optimise"):
-            rows = optimise(optimizer, state, held_out, config, work, identity, track)
-        write_results(folder, scene, optimizer, held_out, rows, work, summary)
-    close_work_folder(work)
+            rows = optimise(optimizer, state, held_out, config, kept.path, identity, track)
+        write_results(folder, scene, optimizer, held_out, rows, kept.path, summary)
     told = f"; {_told(rows[-1])} on {len(held_out)} held-out photographs" if rows else ""
     console(config.quiet).print(f"{out / PLY_FILE}: {summary.results['gaussians']:,} Gaussians{told}")
 
@@ -172,13 +175,18 @@ def optimise(
         log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
         rows = rows_of(work / LOG_FILE)
     seen = seen_pixels(optimizer.photographs, held_out, optimizer.training)
-    begun, saved = time.monotonic() - state.seconds, time.monotonic()
+    begun, saved_at, saved = time.monotonic() - state.seconds, time.monotonic(), optimizer.step
 
     def judge() -> None:
+        every = config.validate_every
+        due = optimizer.step in (0, steps) or (every and optimizer.step % every == 0)
+        # A run that is taken up may stand where one was due and cut off, or where one is in the log.
+        if not held_out or not due or (rows and rows[-1]["step"] == optimizer.step):
+            return
         found = {name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None}
         row: Row = {"seconds": time.monotonic() - begun, "gaussians": len(optimizer.raw["means"]), **found}
         log.add(optimizer.step, row)
-        rows.append(row)
+        rows.append({"step": optimizer.step, **row})
         screen.print(
             f"step {optimizer.step} of {steps}: {_told(row)}, {row['gaussians']:,} Gaussians, {row['seconds']:.0f} s"
         )
@@ -193,21 +201,18 @@ def optimise(
         )
         save_state(work / CHECKPOINT_FILE, now, identity)
 
-    if held_out and not rows and not optimizer.step:
-        judge()
     try:
+        judge()
         for _ in track(range(optimizer.step, steps), "optimising"):
             optimizer.advance()
-            due = optimizer.step == steps or (config.validate_every and optimizer.step % config.validate_every == 0)
-            if held_out and due:
-                judge()
-            if time.monotonic() - saved >= config.checkpoint_every:
+            judge()
+            if time.monotonic() - saved_at >= config.checkpoint_every:
                 save()
-                saved = time.monotonic()
-    except BaseException:
-        if optimizer.whole and optimizer.step:
+                saved_at, saved = time.monotonic(), optimizer.step
+    finally:
+        # Also at the end: what is left to do, writing the results, may be cut off as well.
+        if optimizer.whole and optimizer.step > saved:
             save()
-        raise
     return rows
 
 

@@ -5,10 +5,10 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scenes import SceneConfig, find_scenes, is_scene, load_scene
 from gsencoder.errors import InputError, SceneWarning, advised, listed
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
-from gsencoder.reconstruct.sfm import SfmConfig, photographs_in, place_photographs, placed_before
+from gsencoder.reconstruct.sfm import PLACED_FILE, SfmConfig, photographs_in, place_photographs, placed_before
 from gsencoder.summary import Summary
 from gsencoder.types import Scene
 
@@ -32,13 +32,12 @@ def open_scene(given: Path, work: Path, splat: str, data: SceneConfig, sfm: SfmC
     pictures = next(
         (folder for folder in (given, given / "images") if folder.is_dir() and photographs_in(folder)), None
     )
-    try:
-        (path,) = find_scenes([given])
-    except InputError:
-        if pictures is None:
-            raise
-        path = None
-    if path is None and pictures is not None:
+    # Photographs that lie beside the scenes of others, or the results of a run, are what was asked for.
+    scenes = [] if pictures is not None and not is_scene(given) else find_scenes([given])
+    if len(scenes) > 1:
+        names = listed([scene.name for scene in scenes])
+        raise InputError(f"{given}: holds {len(scenes)} scenes ({names}); give one of them")
+    if pictures is not None and not scenes:
         if splat:
             raise InputError(
                 f"{given}: splat={splat} lies in a world of its own, and photographs without poses are placed "
@@ -47,8 +46,8 @@ def open_scene(given: Path, work: Path, splat: str, data: SceneConfig, sfm: SfmC
         placed = placed_before(pictures, work, sfm)
         if placed is None and os.path.lexists(work / CHECKPOINT_FILE):
             raise InputError(
-                f"{work}: a run was cut off here, and where its photographs were placed is gone, or belongs to other "
-                "photographs or settings; put these back, or give resume=false to begin anew"
+                f"{work}: a run was cut off here, and where its photographs were placed ({PLACED_FILE}, sparse/0) is "
+                "gone, or belongs to other photographs or settings; put these back, or give resume=false to begin anew"
             )
         if placed is None:
             with summary.step("place"):
@@ -63,8 +62,7 @@ def open_scene(given: Path, work: Path, splat: str, data: SceneConfig, sfm: SfmC
             )
         with advised(ANEW):
             return load_scene(work, options=replace(data, images=str(pictures)))
-    assert path is not None
-    scene = load_scene(path, splat=splat or None, options=data)
+    scene = load_scene(scenes[0], splat=splat or None, options=data)
     if scene.views is None:
         raise InputError(f"{given}: a splat without photographs; there is nothing to fit it to")
     return scene

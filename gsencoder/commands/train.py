@@ -36,7 +36,7 @@ from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
-from gsencoder.outputs import close_work_folder, lies_in, open_work_folder, output_folder, refuse_to_replace_inputs
+from gsencoder.outputs import lies_in, output_folder, refuse_to_replace_inputs
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
 from gsencoder.train.distributed import Place, joined, together
@@ -48,6 +48,7 @@ from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe
 from gsencoder.train.trainer import Trainer, TrainerConfig, Validated
 from gsencoder.types import Scene
+from gsencoder.work_folder import WorkFolder
 
 SHOWN_SCENES = 3
 """Held-out scenes of which a view is drawn at every validation."""
@@ -105,7 +106,7 @@ def run(config: TrainConfig, summary: Summary) -> None:
             raise InputError(f"prepared={kept}: lies in the folder of {name}, {taken}; give another folder")
     training, held_out = split(find_scenes(config.paths), config.holdout)
     words = text_table_of(config.teacher)
-    with joined(config.device) as (place, device), ExitStack() as results:
+    with WorkFolder(work) as state, joined(config.device) as (place, device), ExitStack() as results:
         track = Progress(quiet=config.quiet or not place.first)
         folder = None
         with together():
@@ -121,14 +122,13 @@ def run(config: TrainConfig, summary: Summary) -> None:
         with together():
             if place.first:
                 refuse_to_replace_inputs(work, settings(config))
-                open_work_folder(work, anew=not config.resume)
-        trainer, outputs = make_trainer(dataset, training, held_out, config, work, place, device)
+                state.take(anew=not config.resume)
+        trainer, outputs = make_trainer(dataset, training, held_out, config, state.path, place, device)
         with summary.step("train"):
             done = trainer.run(track)
         if folder is None:
             return
         write_results(folder, trainer, outputs, words, config, summary)
-    close_work_folder(work)
     scores = summary.results["validation"]
     told = ", ".join(f"{name} {value:.3f}" for name, value in scores.items()) or "not validated"
     console(config.quiet).print(f"{out}: {done.step} steps in {done.seconds / 60:.1f} minutes; {told}")

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.data.atomic import is_full_disk
 from gsencoder.errors import InputError, about
 
 VERSION = 1
@@ -128,6 +129,8 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
     except (OSError, SafetensorError) as error:
+        if is_full_disk(error):
+            raise InputError(f"{path}: no space left on the device; make room and give the command again") from error
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
     finally:
         temporary.unlink(missing_ok=True)

@@ -1,6 +1,8 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and what else it takes to share a disk with other runs."""
 
+import errno
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -8,6 +10,51 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsencoder.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # A system without it never sees that another run is at work.
+    fcntl = None  # type: ignore[assignment]
+
+
+def locked(folder: str | Path, *, wait: bool = False) -> int | None:
+    """An open descriptor with a lock on a folder, which the system gives back when it closes, and for a killed run too;
+    None where folders cannot be locked (some network file systems).
+
+    Args:
+        folder: an existing one.
+        wait: until another run gives its lock back.
+
+    Raises:
+        BlockingIOError: another run has it.
+        OSError: there is no such folder, or it may not be opened.
+    """
+    if fcntl is None:
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        os.close(descriptor)
+        raise
+    except OSError:
+        os.close(descriptor)
+        return None
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def is_full_disk(error: BaseException) -> bool:
+    """Whether an error, of the system or of a library that wrote, means that the disk or the quota is full."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return True
+    # numpy says "4096 requested and 100 written", and safetensors puts the system's words in its own error.
+    short = (
+        isinstance(error, OSError) and error.errno is None and re.search(r"\d+ requested and \d+ written", str(error))
+    )
+    return bool(short) or os.strerror(errno.ENOSPC) in str(error)
 
 
 @contextmanager

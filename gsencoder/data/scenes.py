@@ -167,7 +167,7 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
         try:
             if not given.exists():
                 raise InputError(f"{given}: no such file or folder")
-            inside = [given] if _is_scene(given) else sorted(entry for entry in given.iterdir() if _is_listed(entry))
+            inside = [given] if is_scene(given) else sorted(entry for entry in given.iterdir() if _is_listed(entry))
         except (OSError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
@@ -182,8 +182,8 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
     return tuple(found.values())
 
 
-def _is_scene(path: Path) -> bool:
-    """Whether `load_scene` would find something to read; files are left to it."""
+def is_scene(path: Path) -> bool:
+    """Whether `load_scene` would find something to read in a folder, and not below it; files are left to it."""
     if path.is_file():
         return True
     return (
@@ -195,7 +195,7 @@ def _is_scene(path: Path) -> bool:
 
 
 def _is_listed(entry: Path) -> bool:
-    return entry.is_dir() and not entry.name.startswith(".") and _is_scene(entry)
+    return entry.is_dir() and not entry.name.startswith(".") and is_scene(entry)
 
 
 def _read_views(root: Path, options: SceneConfig) -> tuple[PosedImages | None, Path]:

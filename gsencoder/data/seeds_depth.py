@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from gsencoder.data.surface_grid import SurfaceGrid, SurfaceSamples
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, about
 from gsencoder.types import Cameras, Views
 
 LINEAR = 3.0
@@ -97,7 +97,8 @@ def depth_samples(
             empty.append(name)
             continue
         points, normals = _to_world(pixels, views.cameras, view)
-        grid.add(points, normals, image[pixels.use])
+        with about(f"view {name!r}"):
+            grid.add(points, normals, image[pixels.use])
     return grid.samples(), empty
 
 

@@ -74,7 +74,7 @@ class SurfaceGrid:
             reach = self.voxel * (1 << (AXIS_BITS - 1))
             raise InputError(
                 f"seeds: a sample lies further than {reach:.6g} units ({1 << (AXIS_BITS - 1)} voxels) from the "
-                "cameras; remove the far samples (`max_depth`) or take a larger voxel"
+                "cameras' middle; look at the pose, remove far samples (max_depth) or take a larger voxel"
             )
         # The offset of the sample's own plane from the voxel's centre is at most √3/2 voxels: layers −3 … 3.
         offset = np.einsum("ij,ij->i", points / np.float32(self.voxel) - cells - np.float32(0.5), normals)

@@ -11,6 +11,9 @@ between 0.7 and 1.3 at which the whole pinhole picture is covered by the distort
 """
 
 import math
+import signal
+import sys
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,12 +121,19 @@ def load_pycolmap() -> Any:
 
     Its wheel for Linux (4.2.1) exports zlib's functions and depends on the system's libz. If it is what loads libz,
     libz calls into it, and the next zlib stream of anyone (a PNG written by Pillow, zlib.compress) aborts the process.
-    Loading libz first, through Python's own module, keeps the two apart.
+    Loading libz first, through Python's own module, keeps the two apart. It also puts handlers of its own over those of
+    signals, which end the process with a page of addresses and none of the cleaning up; ours are put back.
     """
     import zlib  # noqa: F401
 
+    first = "pycolmap" not in sys.modules
     import pycolmap
 
+    if first and threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP", "SIGINT"):
+            handler = signal.getsignal(getattr(signal, name)) if hasattr(signal, name) else None
+            if handler is not None:
+                signal.signal(getattr(signal, name), handler)
     return pycolmap
 
 

@@ -15,6 +15,8 @@ from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.stereo import finds, look_up, world_points
 from gsencoder.render.quality import inner, psnr, ssim
 
+FEWEST = 2
+"""Photographs that a splat can be fitted to."""
 SAME_DEPTH = 0.02
 """Relative difference of measured depths up to which two photographs show the same surface."""
 
@@ -45,27 +47,36 @@ def split(count: int, every: int) -> tuple[list[int], list[int]]:
     """
     held_out = [view for view in range(count) if every and view % every == 0]
     training = [view for view in range(count) if view not in held_out]
-    if len(training) < 2:
-        raise InputError(f"reconstruct: expected at least 2 photographs to fit, got {len(training)} of {count}")
+    if len(training) < FEWEST:
+        raise InputError(f"reconstruct: expected at least {FEWEST} photographs to fit, got {len(training)} of {count}")
     return training, held_out
 
 
-def judged(photographs: Photographs, held_out: Sequence[int]) -> list[int]:
-    """Those of which a mask leaves something to judge by.
+def unmasked(photographs: Photographs, views: Sequence[int], what: str, *, least: int = 0) -> list[int]:
+    """The views of which a mask leaves a window of pixels.
+
+    Args:
+        photographs: of all views.
+        views: some of them.
+        what: they are called in messages.
+        least: so many must be left.
+
+    Raises:
+        InputError: fewer are.
 
     Warns:
-        SceneWarning: the others are named.
+        SceneWarning: some are not left; they are named.
     """
-    masks = {view: photographs.shot(view).mask for view in held_out}
+    masks = {view: photographs.mask(view) for view in views}
     blank = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
-    if blank:
-        warnings.warn(
-            f"{len(blank)} of {len(held_out)} held-out photographs are masked all over and not judged by: "
-            f"{listed([photographs.names[view] for view in blank])}",
-            SceneWarning,
-            stacklevel=2,
-        )
-    return [view for view in held_out if view not in blank]
+    if not blank:
+        return list(views)
+    told = f"{len(blank)} of {len(views)} {what} are masked all over"
+    names = listed([photographs.names[view] for view in blank])
+    if len(views) - len(blank) < least:
+        raise InputError(f"reconstruct: {told}: {names}; look at their masks, or at their alpha channels")
+    warnings.warn(f"{told} and not used: {names}", SceneWarning, stacklevel=2)
+    return [view for view in views if view not in blank]
 
 
 def seen_pixels(

@@ -7,6 +7,9 @@ from torch import Tensor
 
 from gsencoder.reconstruct.parameters import Parameters
 
+SHORTEST = 1e-30
+"""World units; what no float can tell from nothing would make 0 / 0 of a rate that is 0."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Leash:
@@ -36,4 +39,4 @@ class Leash:
 
 def leash_of(raw: Parameters, length: float) -> Leash:
     """A leash from where the Gaussians are now, `length` times their largest standard deviation long."""
-    return Leash(means=raw["means"].clone(), reach=length * raw["log_scales"].amax(dim=1).exp())
+    return Leash(means=raw["means"].clone(), reach=(length * raw["log_scales"].amax(dim=1).exp()).clamp(min=SHORTEST))

@@ -225,7 +225,7 @@ class Optimizer:
 
     def prune(self) -> None:
         """Takes out what does not contribute."""
-        views = [(view, self.photographs.shot(view, 2)) for view in self.training]
+        views = ((view, self.photographs.shot(view, 2)) for view in self.training)
         rows = rows_to_keep(self.raw, self.photographs.cameras, views, self.pruning, self.raster)
         self.adam.keep(rows)
         if self.leash is not None:

@@ -77,6 +77,10 @@ class Photographs:
             found.update(np.ascontiguousarray(array).data)
         return found.hexdigest()[:16]
 
+    def mask(self, view: int) -> Bool[Tensor, "H W"] | None:
+        """Pixels of a photograph that count; None where all do."""
+        return self._masks[view]
+
     def shot(self, view: int, shrink: int = 1) -> Shot:
         """A view; each of its pixels stands for `shrink` × `shrink` of the photograph's.
 

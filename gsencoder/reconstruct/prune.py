@@ -1,6 +1,6 @@
 """What is taken out of a splat while it is fitted; nothing is ever added (SplatDistill, section 3.1)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import torch
@@ -42,7 +42,7 @@ class PruneConfig:
 
 
 def rows_to_keep(
-    raw: Parameters, cameras: Cameras, views: Sequence[tuple[int, Shot]], config: PruneConfig, raster: RasterConfig
+    raw: Parameters, cameras: Cameras, views: Iterable[tuple[int, Shot]], config: PruneConfig, raster: RasterConfig
 ) -> Int64[Tensor, " n"]:
     """Rows that are opaque enough, of sane size on every screen, and seen somewhere.
 
@@ -52,7 +52,7 @@ def rows_to_keep(
     Args:
         raw: parameters.
         cameras: of all views.
-        views: photographs that count, at any size.
+        views: photographs that count, at any size, gone through once.
         config: see there.
         raster: accuracy of rendering.
 

@@ -5,6 +5,7 @@ import math
 import os
 import shutil
 import warnings
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +20,8 @@ OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".
 """Pictures and films that pycolmap does not read; that they are left out is said."""
 MOST_PIXELS, MOST_FEATURES = 100_000, 1_000_000
 PLACED_FILE = "placed.json"
+BYTES_A_FEATURE, USUAL_FEATURES = 160, 8192
+"""In the database: descriptor and place. Photographs seldom have more, whatever is allowed."""
 MOST_EXHAUSTIVE = 150
 """Up to so many photographs all pairs are compared."""
 
@@ -102,9 +105,10 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
     if config.camera not in known:
         raise InputError(f"sfm.camera: expected one of {', '.join(known)}, got {config.camera!r}")
     database, attempts, model = work / "database.db", work / "attempts", work / "sparse" / "0"
-    for stale in (work / PLACED_FILE, database, attempts, model):
+    for stale in (work / PLACED_FILE, database, attempts, model.parent):
         shutil.rmtree(stale, ignore_errors=True)
         stale.unlink(missing_ok=True)
+    _check_room(work, len(names), config)
     attempts.mkdir()
     try:
         _find_features(pycolmap, database, folder, names, config)
@@ -115,11 +119,11 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
         raise InputError(f"{folder}: pycolmap cannot place these photographs: {said}") from error
     if not models:
         raise InputError(
-            f"{folder}: none of {len(names)} photographs could be placed: no two show enough of the same; take more, "
-            "with larger overlap, of a scene that holds still and has texture"
+            f"{folder}: none of {len(names)} photographs could be placed: no two show enough of the same from places "
+            "that lie apart; take more, with larger overlap, of a scene that holds still and has texture"
         )
     best: Any = max(models.values(), key=lambda each: (each.num_reg_images(), each.num_points3D()))
-    whole = model.with_name(f".{model.name}.{os.getpid()}")
+    whole = model.with_name("unfinished")
     whole.mkdir(parents=True)
     best.write(whole)
     os.replace(whole, model)
@@ -150,9 +154,11 @@ def placed_before(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> 
     try:
         record = json.loads((work / PLACED_FILE).read_text(encoding="utf-8"))
         same = model.is_dir() and record["asked"] == _asked(folder, photographs_in(folder), config)
-        return _placed(model, record["found"]) if same else None
-    except (OSError, ValueError, KeyError, TypeError):
+        found = _placed(model, record["found"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
+    sound = isinstance(found.points, int) and isinstance(found.error, float)
+    return found if same and sound and all(isinstance(name, str) for name in found.placed + found.missing) else None
 
 
 def _asked(folder: Path, names: list[str], config: SfmConfig) -> dict[str, Any]:
@@ -160,6 +166,16 @@ def _asked(folder: Path, names: list[str], config: SfmConfig) -> dict[str, Any]:
     states = [(folder / name).stat() for name in names]
     stamps = [[name, state.st_size, state.st_mtime_ns] for name, state in zip(names, states, strict=True)]
     return {"photographs": stamps, "settings": asdict(config)}
+
+
+def _check_room(work: Path, count: int, config: SfmConfig) -> None:
+    """pycolmap ends the whole process where the disk fills under its database."""
+    needed, free = count * min(config.features, USUAL_FEATURES) * BYTES_A_FEATURE, shutil.disk_usage(work).free
+    if free < needed:
+        raise InputError(
+            f"{work}: placing {count} photographs may take {needed / 2**20:.0f} MiB, and {free / 2**20:.0f} are free "
+            "on this disk; make room, or give a smaller sfm.features"
+        )
 
 
 def _check(folder: Path, names: list[str]) -> None:
@@ -181,7 +197,9 @@ def _check(folder: Path, names: list[str]) -> None:
         check_picture(folder / name)
 
 
-def _placed(model: Path, found: dict[str, Any]) -> Placed:
+def _placed(model: Path, found: Mapping[str, Any]) -> Placed:
+    if not isinstance(found["placed"], list) or not isinstance(found["missing"], list):
+        raise TypeError("expected lists of names")
     return Placed(
         model=model,
         placed=tuple(found["placed"]),

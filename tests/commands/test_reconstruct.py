@@ -4,53 +4,17 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
 from gsencoder import cli
 from gsencoder.commands import reconstruct
 from gsencoder.data.splats import load_splat
-from gsencoder.data.synthetic import make_room
-from gsencoder.data.synthetic_write import write_room
 from gsencoder.errors import InputError
 from gsencoder.reconstruct.judge import split
-
-QUICK = ("quiet=true", "optimize.steps=12", "holdout=4", "seeds.voxel=0.08", "optimize.sh_degree=1")
-
-
-def summary_of(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return found
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line that a refused command prints."""
-    capsys.readouterr()
-    assert cli.main(["reconstruct", *arguments]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
-    assert len(lines) == 1
-    return lines[0]
-
-
-def never(*_: object, **__: object) -> None:
-    raise AssertionError("was called again")
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("rooms") / "room"
-    write_room(make_room(0, objects=4, views=6, width=120, height=90), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def built(room: Path) -> Path:
-    out = room.parent / "built"
-    assert cli.main(["reconstruct", str(room), f"out={out}", *QUICK]) == 0
-    return out
 
 
 def test_a_room_becomes_a_splat_with_a_log_and_pictures(built: Path) -> None:
@@ -79,7 +43,7 @@ def test_a_splat_is_refined(room: Path, built: Path, tmp_path: Path) -> None:
     assert results["psnr"] > summary_of(built)["results"]["psnr"]
 
 
-def test_a_run_that_is_interrupted_goes_on_to_the_same_splat(
+def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(
     room: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
@@ -129,26 +93,13 @@ def test_photographs_alone_are_placed_or_refused_in_words(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.fixture(scope="module")
-def ten(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten photographs that belong together, and one that shows nothing."""
-    from PIL import Image
-
-    folder = tmp_path_factory.mktemp("ten") / "photographs"
-    folder.mkdir()
-    for path in sorted((shared / "scenes" / "plush" / "images").iterdir())[:10]:
-        shutil.copy(path, folder)
-    Image.new("RGB", (720, 540), (90, 90, 90)).save(folder / "grey.jpg")
-    return folder
-
-
 def test_photographs_alone_are_placed_once_and_become_a_splat(
     tmp_path: Path, ten: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, out = shutil.copytree(ten, tmp_path / "photographs"), tmp_path / "out"
     words = [str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25"]
     with monkeypatch.context() as patched:
-        patched.setattr(reconstruct.Optimizer, "advance", _interrupt)
+        patched.setattr(reconstruct.Optimizer, "advance", interrupt)
         assert cli.main(["reconstruct", *words]) == 130
     work = out.with_name("out.reconstruction")
     placed = (work / "placed.json").read_bytes()
@@ -156,7 +107,7 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(
     # Places of another placement would put old Gaussians into a new world.
     for damaged in (b"", b"[]", b"{}", b'{"asked": 1}', placed[:-9], placed.replace(b"found", b"lost"), b"\xff\xfe"):
         (work / "placed.json").write_bytes(damaged)
-        assert "where its photographs were placed is gone" in refusal(capsys, *words)
+        assert "where its photographs were placed (placed.json, sparse/0) is gone" in refusal(capsys, *words)
     (work / "placed.json").write_bytes(placed)
     os.utime(folder / "grey.jpg", ns=(1, 1))
     assert "belongs to other photographs" in refusal(capsys, *words)
@@ -213,7 +164,7 @@ def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(
     scene, out = shutil.copytree(room, tmp_path / "scene"), tmp_path / "out"
     words = [str(scene), f"out={out}", *QUICK]
     with monkeypatch.context() as patched:
-        patched.setattr(reconstruct.Optimizer, "advance", _interrupt)
+        patched.setattr(reconstruct.Optimizer, "advance", interrupt)
         assert cli.main(["reconstruct", *words]) == 130
     log = out.with_name("out.reconstruction") / "log.csv"
     text = log.read_text()
@@ -241,14 +192,10 @@ def test_a_held_out_photograph_that_is_masked_all_over_is_named_and_not_judged_b
         frame["mask_path"] = f"masks/{number}.png"
     (scene / "transforms.json").write_text(json.dumps(record))
     assert cli.main(["reconstruct", str(scene), f"out={out}", *QUICK]) == 0
-    assert "1 of 2 held-out photographs are masked all over and not judged by" in capsys.readouterr().err
+    assert "1 of 2 held-out photographs are masked all over and not used" in capsys.readouterr().err
     results = summary_of(out)["results"]
     assert results["held_out"] == 1
     assert results["psnr"] > 5
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(

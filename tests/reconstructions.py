@@ -1,0 +1,33 @@
+"""Short reconstructions, as a user runs them, and what they say when they refuse."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsencoder import cli
+
+QUICK = ("quiet=true", "optimize.steps=12", "holdout=4", "seeds.voxel=0.08", "optimize.sh_degree=1")
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return found
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line that a refused command prints."""
+    capsys.readouterr()
+    assert cli.main(["reconstruct", *arguments]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def never(*_: object, **__: object) -> None:
+    raise AssertionError("was called again")
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
