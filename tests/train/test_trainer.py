@@ -363,7 +363,10 @@ def test_two_processes_follow_the_losses_of_one(dataset: Prepared, tmp_path: Pat
     subprocess.run([sys.executable, "-W", "ignore", str(alone)], check=True, timeout=300)
     launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    subprocess.run([*launcher, str(pair)], check=True, timeout=300, env=environment, capture_output=True)
+    done = subprocess.run(
+        [*launcher, str(pair)], check=False, timeout=300, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
     # AdamW does not see the scale of a gradient, and clipping hides it: the norm is what tells.
     for column in ("loss", "field", "render", "contrast", "gradient"):
         two, one = (losses(tmp_path / name, column) for name in ("two", "one"))
