@@ -51,7 +51,7 @@ class DenseConfig:
         default=0.95,
         metadata={"help": "seeds are added where points reach less than this share of the pictures' cells; 0 = never"},
     )
-    spacing: float = field(default=3.0, metadata={"help": "distance of seeds in pixels of a typical photograph"})
+    spacing: float = field(default=6.0, metadata={"help": "distance of seeds in pixels of a typical photograph"})
     samples: int = field(default=3, metadata={"help": "pixels that must agree on a seed, from all photographs"})
     size: int = field(default=200, metadata={"help": "longer side in pixels of the pictures that are compared"})
     sources: int = field(default=4, metadata={"help": "other photographs that each is compared with"})

@@ -10,7 +10,7 @@ from gsencoder.reconstruct.dense import DenseConfig, carve, coverage, densify, i
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.stereo import DepthMap, agreeing, neighbours_of, sweep, world_points
 
-SMALL = DenseConfig(size=96, sources=3, samples=1)
+SMALL = DenseConfig(spacing=3.0, size=96, sources=3, samples=1)
 
 
 def pose(view: int, count: int = 4) -> torch.Tensor:
