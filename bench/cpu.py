@@ -21,11 +21,12 @@ from torch.nn import functional
 
 from gsencoder.commands.train import TrainConfig
 from gsencoder.compose import compose
+from gsencoder.models.cells import cells_of
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.neighbors import NeighborConv, neighbor_table
 from gsencoder.models.plan import join_plans
-from gsencoder.models.serialize import cells_of, morton_codes
+from gsencoder.models.serialize import morton_codes
 from gsencoder.train.losses import LossConfig, match_loss
 
 

@@ -40,6 +40,8 @@ TORCH_FREE = [
     "gsencoder.fusion.basis",
     "gsencoder.fusion.partial",
     "gsencoder.fusion.store",
+    "gsencoder.models.curves",
+    "gsencoder.infer.chunks",
     "gsencoder.infer.text",
     "gsencoder.infer.localize",
     "gsencoder.infer.boxes_ply",

@@ -10,9 +10,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.errors import InputError
+from gsencoder.models.curves import Curves
 from gsencoder.models.embed import CHANNELS, Attribute, channels_of, embed
 from gsencoder.models.neighbors import NeighborConv
-from gsencoder.models.plan import CloudPlan, Curves, Plan, join_plans, plan_cloud
+from gsencoder.models.plan import CloudPlan, Plan, join_plans, plan_cloud
 from gsencoder.models.point_transformer import PointTransformer, TransformerConfig
 from gsencoder.types import Gaussians
 
@@ -103,7 +104,7 @@ def encoder_inputs(
         config: of the encoder.
         voxel: edge of the finest grid in the cloud's own units (`config.voxel` is in metres).
         device: where the tensors are to be.
-        whole: of the scene that the cloud is a part of (`plan.curves_of`); None = it is all of it.
+        whole: of the scene that the cloud is a part of (`curves.curves_of`); None = it is all of it.
 
     Raises:
         InputError: the cloud spreads over too many cells.

@@ -12,8 +12,10 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
+from gsencoder.models.cells import cells_of
+from gsencoder.models.curves import Curves
 from gsencoder.models.neighbors import neighbor_table
-from gsencoder.models.serialize import Order, bits_of, cells_of, encode_morton, morton_codes
+from gsencoder.models.serialize import Order, bits_of, encode_morton, morton_codes
 
 ORDERS: tuple[Order, ...] = ("z", "z-trans", "hilbert", "hilbert-trans")
 
@@ -82,28 +84,14 @@ class CloudLevel(NamedTuple):
     Attributes:
         neighbors, parents, children: as in `Level`.
         orders: for each order the tokens along the curve.
-        ranks: for each order the places of these tokens along the curve of the whole scene; None where this is all.
-        whole: tokens of the whole scene.
+        patches: for each order the patches of the whole scene that these tokens are in; None where this is all of it.
     """
 
     neighbors: Int32[Tensor, "T 27"]
     orders: Int64[Tensor, "O T"]
     parents: Int64[Tensor, " parents"]
     children: Int64[Tensor, "M 8"]
-    ranks: Int64[Tensor, "O T"] | None = None
-    whole: int = 0
-
-
-class Curves(NamedTuple):
-    """A whole scene along its curves, for plans of parts of it.
-
-    Attributes:
-        corner: from where cells are counted, world units.
-        codes: for each level the sorted codes of all tokens, in each order.
-    """
-
-    corner: Float[Tensor, "3"]
-    codes: tuple[Int64[Tensor, "O _T"], ...]
+    patches: Int64[Tensor, "O T"] | None = None
 
 
 class CloudPlan(NamedTuple):
@@ -130,13 +118,14 @@ def plan_cloud(
         voxel: edge of the finest grid, world units; each level below doubles it.
         levels: how many there are.
         orders: the curves that attention follows, in turn.
-        whole: of the scene that the cloud is a part of, with the same voxel, levels and orders; None = it is all of it.
-            Patches are then cut where those of the whole are, so that tokens meet the same others.
+        whole: of the scene that the cloud is a part of, with the same voxel, levels, orders and patch as here and in
+            `join_plans`; None = it is all of it. Patches are then cut where those of the whole are, so that tokens meet
+            the same others.
 
     Raises:
         InputError: positions that are not finite, or spread over too many cells.
     """
-    cells = cells_of(means, voxel, whole.corner if whole is not None else None)
+    cells = cells_of(means, voxel, torch.from_numpy(whole.corner) if whole is not None else None)
     codes, members = torch.sort(morton_codes(cells), stable=True)
     _, token_of_member, counts = torch.unique_consecutive(codes, return_inverse=True, return_counts=True)
     token_of = torch.empty_like(members)
@@ -149,22 +138,13 @@ def plan_cloud(
     for level in range(levels):
         parents, children, first = _pool(morton) if level + 1 < levels else _no_pool(morton)
         codes, sorted_rows = torch.sort(along, dim=1)
-        ranks = torch.searchsorted(whole.codes[level], codes) if whole is not None else None
-        of = whole.codes[level].shape[1] if whole is not None else 0
-        found.append(CloudLevel(neighbor_table(cells), sorted_rows, parents, children, ranks, of))
+        patches = None
+        if whole is not None:
+            starts = torch.from_numpy(whole.starts[level]).to(codes.device)
+            patches = torch.searchsorted(starts, codes, right=True) - 1
+        found.append(CloudLevel(neighbor_table(cells), sorted_rows, parents, children, patches))
         cells, morton, along = cells[first] >> 1, morton[first] >> 3, along[:, first] >> 3
     return CloudPlan(token_of, members, counts, tuple(found))
-
-
-def curves_of(means: Float[Tensor, "N 3"], voxel: float, *, levels: int, orders: Sequence[Order] = ORDERS) -> Curves:
-    """A scene along its curves; see `plan_cloud`, whose settings these are."""
-    cells = cells_of(means, voxel)
-    morton = torch.unique(morton_codes(cells))
-    along = torch.stack([encode_morton(morton, order, bits_of(cells)) for order in orders])
-    codes = [torch.sort(along, dim=1).values]
-    for _ in range(levels - 1):
-        codes.append(torch.stack([torch.unique_consecutive(row >> 3) for row in codes[-1]]))
-    return Curves(means.amin(dim=0), tuple(codes))
 
 
 def _pool(morton: Int64[Tensor, " T"]) -> tuple[Int64[Tensor, " T"], Int64[Tensor, "M 8"], Int64[Tensor, " M"]]:
@@ -255,19 +235,16 @@ def _join_levels(parts: Sequence[CloudLevel], patch: int, size: Callable[[int], 
 def _lengths(parts: Sequence[CloudLevel], patch: int) -> list[Int64[Tensor, " patches"]]:
     """How many tokens each patch has, for each order; for all orders at once where none of the clouds is a part."""
     found = []
-    for order in range(len(parts[0].orders) if any(part.ranks is not None for part in parts) else 1):
+    for order in range(len(parts[0].orders) if any(part.patches is not None for part in parts) else 1):
         lengths = []
         for part in parts:
             count = part.orders.shape[1]
-            if part.ranks is None:
+            if part.patches is None:
                 patches = -(-count // patch)
                 bounds = torch.arange(patches + 1, device=part.orders.device) * count // max(patches, 1)
                 lengths.append(bounds.diff())
             else:
-                # Patch k of the whole has the ranks from ⌊k·whole/patches⌋ on.
-                patches = -(-part.whole // patch)
-                number = ((part.ranks[order] + 1) * patches - 1) // part.whole
-                lengths.append(torch.unique_consecutive(number, return_counts=True)[1])
+                lengths.append(torch.unique_consecutive(part.patches[order], return_counts=True)[1])
         found.append(torch.cat(lengths))
     return found
 

@@ -2,14 +2,16 @@
 
 A code is an int64 whose sorted order visits cells so that neighbours in the order are neighbours in space. Codes are
 hierarchical: `code >> 3` is the code of the cell twice as large, so one set of codes serves every level of pooling.
+
+Everything here is written in operators that numpy's arrays and torch's tensors share: plans are made of tensors, and a
+runtime without torch needs the same curves.
 """
 
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
-import torch
+import numpy as np
 from jaxtyping import Int64
-from torch import Tensor
 
 from gsencoder.errors import InputError
 
@@ -28,49 +30,34 @@ ALIGN = 64
 through six levels."""
 
 
-def cells_of(points: Tensor, voxel: float, corner: Tensor | None = None) -> Int64[Tensor, "N 3"]:
-    """Grid cells of points [N, 3] in world units, counted on each axis from just below the lowest occupied one.
-
-    The grid is anchored at the world's zero and counted from a multiple of ALIGN cells, so that a part of a scene is
-    cut and pooled as the whole is. With the corner of the whole it is also ordered alike.
+def check_extent(extent: float, voxel: float) -> None:
+    """Refuses points that spread over more cells than a code can number.
 
     Args:
-        points: world units.
+        extent: cells along the longest axis.
         voxel: edge of a cell, world units.
-        corner: from where cells are counted, [3], world units; None = the lowest of the points.
 
     Raises:
-        InputError: points that are not finite, or that spread over 2²⁰ cells or more on an axis.
+        InputError: 2²⁰ cells or more.
     """
-    if not len(points):
-        return torch.zeros(0, 3, dtype=torch.int64, device=points.device)
-    if not torch.isfinite(points).all():
-        bad = int((~torch.isfinite(points).all(dim=1)).sum())
-        raise InputError(f"grid: {bad} of {len(points)} positions are not finite")
-    scaled = torch.floor(points.double() / voxel)
-    low, high = scaled.aminmax(dim=0)
-    if corner is not None:
-        low = torch.minimum(low, torch.floor(corner.to(scaled) / voxel))
-    extent = (high - low + 1).max().item()
     if not extent < LARGEST_EXTENT:
         raise InputError(
             f"grid: the points spread over {extent:.3g} cells of {voxel:.3g} units on an axis; the limit is 2²⁰; "
             "check the unit (data.metres_per_unit), and remove stray Gaussians (`gsencoder repair`)"
         )
-    return (scaled - torch.floor(low / ALIGN) * ALIGN).long()
 
 
-def bits_of(cells: Int64[Tensor, "N 3"]) -> int:
+def bits_of(cells: Int64[Any, "N 3"]) -> int:
     """Bits that the largest coordinate needs, at least 1."""
     return max(1, int(cells.max()).bit_length()) if len(cells) else 1
 
 
-def encode_cells(cells: Int64[Tensor, "N 3"], order: Order, bits: int) -> Int64[Tensor, " N"]:
+def encode_cells(cells: Int64[Any, "N 3"], order: Order, bits: int) -> Int64[Any, " N"]:
     """Codes of cells (each coordinate from 0 to 2^bits − 1) along a curve; the "-trans" ones swap x and y first."""
     return encode_morton(morton_codes(cells), order, bits)
 
 
-def encode_morton(morton: Int64[Tensor, " N"], order: Order, bits: int) -> Int64[Tensor, " N"]:
+def encode_morton(morton: Int64[Any, " N"], order: Order, bits: int) -> Int64[Any, " N"]:
     """`encode_cells` for cells that are given by their Morton codes."""
     if order.endswith("-trans"):
         y = (morton & (_EVERY_THIRD << 1)) << 1
@@ -78,7 +65,7 @@ def encode_morton(morton: Int64[Tensor, " N"], order: Order, bits: int) -> Int64
     return _hilbert_from_morton(morton, bits) if order.startswith("hilbert") else morton
 
 
-def morton_codes(cells: Int64[Tensor, "N 3"]) -> Int64[Tensor, " N"]:
+def morton_codes(cells: Int64[Any, "N 3"]) -> Int64[Any, " N"]:
     """Z-order: the bits of x, y and z interleaved, x highest, for coordinates below 2²¹."""
     spread = cells & (2**21 - 1)
     # Each step moves the upper half of every group of bits away, until two zeros stand between any two bits.
@@ -93,7 +80,7 @@ def morton_codes(cells: Int64[Tensor, "N 3"]) -> Int64[Tensor, " N"]:
     return (spread[:, 0] << 2) | (spread[:, 1] << 1) | spread[:, 2]
 
 
-def _hilbert_from_morton(morton: Int64[Tensor, " N"], bits: int) -> Int64[Tensor, " N"]:
+def _hilbert_from_morton(morton: Int64[Any, " N"], bits: int) -> Int64[Any, " N"]:
     """Positions along Hilbert's curve, which only ever steps to a face neighbour.
 
     Hamilton 2006, "Compact Hilbert indices": the curve within a cell is one of 24 orientations, and a table gives,
@@ -101,12 +88,14 @@ def _hilbert_from_morton(morton: Int64[Tensor, " N"], bits: int) -> Int64[Tensor
     `bits` says how far to look and changes nothing else: cells that are counted from one corner are always ordered
     alike.
     """
-    table = _hilbert_table().to(morton.device)
-    code, state = torch.zeros_like(morton), torch.zeros_like(morton)
+    table = _hilbert_table()
+    if hasattr(morton, "new_tensor"):
+        table = morton.new_tensor(table)
     levels = bits + bits % 2
-    state += _start_of(levels)
+    code = morton & 0
+    state = code + _start_of(levels)
     for level in range(levels - 2, -1, -2):
-        found = table.index_select(0, (state << 6) | ((morton >> (3 * level)) & 63))
+        found = table.take((state << 6) | ((morton >> (3 * level)) & 63))
         code = (code << 6) | (found & 63)
         state = found >> 6
     return code
@@ -122,7 +111,7 @@ def _start_of(levels: int) -> int:
 
 
 @cache
-def _hilbert_table() -> Int64[Tensor, " 1536"]:
+def _hilbert_table() -> Int64[np.ndarray, " 1536"]:
     """For orientation·64 + two octants: the inner orientation·64 + two digits of the code."""
     rows = []
     for state in range(24):
@@ -131,7 +120,7 @@ def _hilbert_table() -> Int64[Tensor, " 1536"]:
             for second in range(8):
                 below, innermost = _hilbert_step(inside, second)
                 rows.append((innermost << 6) | (digit << 3) | below)
-    return torch.tensor(rows)
+    return np.array(rows, np.int64)
 
 
 def _hilbert_step(state: int, octant: int) -> tuple[int, int]:

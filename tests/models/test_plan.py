@@ -6,7 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.models.plan import ORDERS, Level, Plan, curves_of, join_plans, plan_cloud
+from gsencoder.models.curves import curves_of
+from gsencoder.models.plan import ORDERS, Level, Plan, join_plans, plan_cloud
 
 VOXEL = 0.1
 
@@ -100,7 +101,7 @@ def test_tokens_of_a_part_share_a_patch_exactly_where_they_do_in_the_whole(
     part = torch.nonzero(points[:, 0] > 0.7).flatten()
     if not len(part):
         return
-    curves = curves_of(points, VOXEL, levels=levels)
+    curves = curves_of(points.numpy(), VOXEL, levels=levels, orders=ORDERS, patch=patch)
     whole = join_plans([plan_cloud(points, VOXEL, levels=levels)], patch)
     plan = join_plans([plan_cloud(points[part], VOXEL, levels=levels, whole=curves)], patch)
     theirs, ours = whole.token_of[part], plan.token_of
@@ -118,7 +119,7 @@ def test_tokens_of_a_part_share_a_patch_exactly_where_they_do_in_the_whole(
 
 def test_the_whole_as_a_part_of_itself_has_the_plan_that_it_has() -> None:
     points = cloud(500)
-    curves = curves_of(points, VOXEL, levels=3)
+    curves = curves_of(points.numpy(), VOXEL, levels=3, orders=ORDERS, patch=48)
     plain = join_plans([plan_cloud(points, VOXEL, levels=3)], 48)
     again = join_plans([plan_cloud(points, VOXEL, levels=3, whole=curves)], 48)
     for one, other in zip(plain.levels, again.levels, strict=True):

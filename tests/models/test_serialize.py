@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.errors import InputError
+from gsencoder.models.cells import cells_of
 from gsencoder.models.serialize import (
     ALIGN,
     LARGEST_EXTENT,
     bits_of,
-    cells_of,
     encode_cells,
     morton_codes,
 )
@@ -118,3 +118,11 @@ def test_positions_that_are_not_finite_are_counted_and_refused(bad: float) -> No
 def test_no_points_have_no_cells() -> None:
     assert cells_of(torch.zeros(0, 3), 0.1).shape == (0, 3)
     assert bits_of(torch.zeros(0, 3, dtype=torch.int64)) == 1
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_arrays_and_tensors_have_the_same_codes(order: str) -> None:
+    cells = np.random.default_rng(0).integers(0, LARGEST_EXTENT, (500, 3))
+    codes = encode_cells(cells, order, 20)
+    assert isinstance(codes, np.ndarray)
+    np.testing.assert_array_equal(encode_cells(torch.from_numpy(cells), order, 20).numpy(), codes)
