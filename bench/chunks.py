@@ -19,8 +19,8 @@ from gsencoder.evaluate.boxes import accuracy
 from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.naming import naming_scores
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.chunks import cut
-from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.infer.chunks import EncodeConfig, cut
+from gsencoder.infer.encode import encode
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.weights import load_weights
 

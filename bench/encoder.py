@@ -26,7 +26,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsencoder.commands.train import TrainConfig
 from gsencoder.compose import compose
-from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import encode
 from gsencoder.models.device import autocast_dtype
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.heap import keep_heap

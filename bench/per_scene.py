@@ -29,9 +29,9 @@ from gsencoder.evaluate.sources import encoded
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.labels import LabelsTeacher
+from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.models.heap import keep_heap
-from gsencoder.models.weights import load_weights
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import FeatureMap, GaussianFeatures, Scene
 
@@ -118,7 +118,7 @@ def main() -> None:
     chosen = parser.parse_args()
     keep_heap()
     words = load_text_table(find_file(chosen.words, "words"))
-    encoder, outputs, _ = load_weights(chosen.weights)
+    encoder = TorchEncoder(chosen.weights)
     table: dict[str, list[tuple[SceneNames, list[Hit], float]]] = {}
     for path in chosen.scenes:
         scene, teacher = labelled(path, words)
@@ -129,7 +129,7 @@ def main() -> None:
             start = time.perf_counter()
             features = optimise(scene, teacher, truth, chosen.stride, rounds)
             found[f"optimised, {rounds} rounds"] = (features, time.perf_counter() - start)
-        features, spent = encoded(encoder, outputs)(scene)
+        features, spent = encoded(encoder)(scene)
         found["encoded"] = (features, sum(spent.values()))
         for name, (features, seconds) in found.items():
             table.setdefault(name, []).append((*quality(scene, truth, features, teacher, words), seconds))

@@ -5,13 +5,14 @@ from pathlib import Path
 import pytest
 
 from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeds import with_gaussians
 from gsencoder.data.text_table import load_text_table
 from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.naming import evaluate_naming, naming_scores
 from gsencoder.evaluate.sources import encoded, opened
-from gsencoder.fusion.complete import with_gaussians
 from gsencoder.fusion.store import WORDS_FILE
-from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import TorchEncoder
 from gsencoder.models.weights import SHIPPED, load_weights
 
 FOLDER = SHIPPED / "house_cpu"
@@ -28,17 +29,17 @@ def test_they_take_less_than_ten_megabytes_and_say_how_they_were_made() -> None:
 
 @pytest.mark.parametrize("number", [40, 45])
 def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, number: int) -> None:
-    encoder, outputs, _ = load_weights("house_cpu")
+    encoder = TorchEncoder("house_cpu")
     words = load_text_table(FOLDER / WORDS_FILE)
     path = shared / "scenes" / "house" / f"train_{number:03d}"
     accuracies, features = [], []
     for chunk in (0, 80_000):
         config = EncodeConfig(chunk=chunk)
-        named = evaluate_naming(opened([path]), encoded(encoder, outputs, config), words)
+        named = evaluate_naming(opened([path]), encoded(encoder, config), words)
         accuracies.append(naming_scores(named)["accuracy"])
         scene = with_gaussians(load_scene(path))
         assert scene.gaussians is not None
-        features.append(encode(scene.gaussians, encoder, outputs, config))
+        features.append(encoder.encode(scene.gaussians, config))
     assert accuracies[0] >= 0.7
     assert accuracies[1] >= accuracies[0] - 0.01
     whole, parts = features

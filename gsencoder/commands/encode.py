@@ -5,18 +5,15 @@ from pathlib import Path
 
 from gsencoder.config import CommonConfig, settings
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
-from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.seeds import SeedConfig, with_gaussians
 from gsencoder.data.spacing import unit_of
 from gsencoder.data.splats import READABLE
-from gsencoder.data.text_table import load_text_table, save_text_table
+from gsencoder.data.text_table import save_text_table
 from gsencoder.errors import about
-from gsencoder.fusion.complete import with_gaussians
 from gsencoder.fusion.store import WORDS_FILE, save_features
-from gsencoder.infer.encode import EncodeConfig, encode
-from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encoders import Encoder, load_encoder
 from gsencoder.models.heap import keep_heap
-from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.weights import find_weights, load_weights
 from gsencoder.outputs import output_folder
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
@@ -33,7 +30,7 @@ class EncodeCommandConfig(CommonConfig):
     )
     weights: str = field(
         default="house_cpu",
-        metadata={"help": "what `train` wrote: its folder or file, or a name that comes with gsencoder"},
+        metadata={"help": "what `train` or `export` wrote, or a name that comes with gsencoder"},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -47,10 +44,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     paths = find_scenes(config.paths)
     check_names(paths)
     with summary.step("weights"):
-        file = find_weights(config.weights)
-        encoder, outputs, _ = load_weights(file)
-        words_file = file.with_name(WORDS_FILE)
-        words = load_text_table(words_file) if words_file.is_file() else None
+        encoder = load_encoder(config.weights, config.encode.device)
     screen = console(config.quiet)
     for path in paths:
         one = summary if len(paths) == 1 else Summary(summary.command, summary.settings)
@@ -64,30 +58,24 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
             out = out / scene.name
         with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
             with about(scene.name):
-                _encode_into(folder, scene, encoder, outputs, config, one)
-            if words is not None:
-                save_text_table(folder / WORDS_FILE, words)
+                _encode_into(folder, scene, encoder, config, one)
+            if encoder.words is not None:
+                save_text_table(folder / WORDS_FILE, encoder.words)
         screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
 
 
 def _encode_into(
     folder: Path,
     scene: Scene,
-    encoder: GaussianEncoder,
-    outputs: OutputSpace,
+    encoder: Encoder,
     config: EncodeCommandConfig,
     summary: Summary,
 ) -> None:
     assert scene.gaussians is not None
-    unit = unit_of(scene, encoder.config.voxel)
+    unit = unit_of(scene, encoder.voxel)
     with summary.step("encode"):
-        features = encode(
-            scene.gaussians,
-            encoder,
-            outputs,
-            config.encode,
-            metres_per_unit=unit,
-            track=Progress(quiet=config.quiet),
+        features = encoder.encode(
+            scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
         )
     with summary.step("write"):
         save_features(folder, scene, features, {"encode": settings(config.encode), "weights": config.weights})

@@ -25,10 +25,10 @@ from gsencoder.evaluate.tables import csv_text
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.infer.encode import EncodeConfig
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encoders import load_encoder
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.models.heap import keep_heap
-from gsencoder.models.weights import load_weights
 from gsencoder.outputs import output_folder, write_bytes
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
@@ -67,8 +67,7 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
         )
     if config.weights:
         keep_heap()
-        encoder, outputs, _ = load_weights(config.weights)
-        source = encoded(encoder, outputs, config.encode)
+        source = encoded(load_encoder(config.weights, config.encode.device), config.encode)
     else:
         source = fused(config.teacher, words, config.fusion)
     out = config.out or Path("outputs") / "evaluate" / config.protocol.name

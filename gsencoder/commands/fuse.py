@@ -8,10 +8,10 @@ import numpy as np
 
 from gsencoder.config import CommonConfig, settings
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
-from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.seeds import SeedConfig, with_gaussians
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
-from gsencoder.fusion.complete import check_orbits, with_gaussians, with_views
+from gsencoder.fusion.complete import check_orbits, with_views
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.store import WORDS_FILE, save_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of

@@ -19,7 +19,8 @@ from gsencoder.data.splats import READABLE, save_splat
 from gsencoder.errors import InputError, SceneWarning, advised
 from gsencoder.evenly import evenly
 from gsencoder.infer.pictures import contact_sheet
-from gsencoder.models.device import Device, choose_device
+from gsencoder.models.choices import Device
+from gsencoder.models.device import choose_device
 from gsencoder.models.heap import keep_heap
 from gsencoder.outputs import output_folder, refuse_to_replace_inputs
 from gsencoder.progress import Progress, console

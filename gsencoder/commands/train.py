@@ -19,19 +19,19 @@ from gsencoder.data.augment import AugmentConfig
 from gsencoder.data.batch import SamplingConfig
 from gsencoder.data.model_files import find_file
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
-from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.seeds import SeedConfig, with_gaussians
 from gsencoder.data.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.data.text_table import TextTable, save_text_table
 from gsencoder.errors import InputError, about
 from gsencoder.evaluate.validation import validate_encoder
-from gsencoder.fusion.complete import check_orbits, with_gaussians, with_views
+from gsencoder.fusion.complete import check_orbits, with_views
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.infer.encode import EncodeConfig
-from gsencoder.models.device import Device
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.models.choices import Device
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.heap import keep_heap
 from gsencoder.models.output_space import OutputSpace

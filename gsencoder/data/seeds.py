@@ -7,7 +7,7 @@ that the photographs show. Such a splat renders well enough for features to be l
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -194,3 +194,12 @@ def _mesh_voxel(scene: Scene, path: str) -> float:
         middle = (lower + upper) / 2 - scene.origin
         return float(np.median(np.linalg.norm(scene.views.cameras.centers - middle, axis=1))) / TYPICAL_DEPTH_IN_VOXELS
     return float(np.linalg.norm(upper - lower)) / EXTENT_IN_VOXELS
+
+
+def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig()) -> Scene:
+    """The scene, with seeds where it has no splat.
+
+    Raises:
+        InputError: there is nothing to seed from.
+    """
+    return scene if scene.gaussians is not None else replace(scene, gaussians=seed(scene, config))

@@ -5,15 +5,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.seeds import SeedConfig
+from gsencoder.data.seeds import SeedConfig, with_gaussians
 from gsencoder.data.spacing import unit_of
 from gsencoder.data.text_table import TextTable
-from gsencoder.fusion.complete import with_gaussians
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
-from gsencoder.infer.encode import EncodeConfig, encode
-from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encoders import Encoder
 from gsencoder.tracking import Track, untracked
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -31,14 +29,13 @@ def fused(teacher: TeacherConfig, words: TextTable | None, config: FuseConfig = 
     return source
 
 
-def encoded(encoder: GaussianEncoder, outputs: OutputSpace, config: EncodeConfig = EncodeConfig()) -> Source:
+def encoded(encoder: Encoder, config: EncodeConfig = EncodeConfig()) -> Source:
     """Features that an encoder predicts."""
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         assert scene.gaussians is not None
         start = time.perf_counter()
-        unit = unit_of(scene, encoder.config.voxel)
-        features = encode(scene.gaussians, encoder, outputs, config, metres_per_unit=unit)
+        features = encoder.encode(scene.gaussians, config, metres_per_unit=unit_of(scene, encoder.voxel))
         return features, {"encode": time.perf_counter() - start}
 
     return source

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.errors import about
-from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import encode
 from gsencoder.infer.pictures import contact_sheet, fit_pca_colors, pca_picture
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace

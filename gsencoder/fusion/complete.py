@@ -1,9 +1,8 @@
-"""What a scene needs before its views can be fused: Gaussians where it has none, cameras where it has none."""
+"""What a splat alone needs before its views can be fused: cameras around it."""
 
 from dataclasses import replace
 
 from gsencoder.data.orbits import orbit_cameras
-from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.errors import InputError
 from gsencoder.render import BlendConfig
 from gsencoder.render.rgb import RenderedImages
@@ -20,15 +19,6 @@ def check_orbits(count: int) -> None:
     """
     if not 1 <= count <= MOST_ORBITS:
         raise InputError(f"orbits: expected 1 to {MOST_ORBITS} cameras, got {count}")
-
-
-def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig()) -> Scene:
-    """The scene, with seeds where it has no splat.
-
-    Raises:
-        InputError: there is nothing to seed from.
-    """
-    return scene if scene.gaussians is not None else replace(scene, gaussians=seed(scene, config))
 
 
 def with_views(scene: Scene, count: int, config: BlendConfig = BlendConfig()) -> Scene:

@@ -1,9 +1,38 @@
-"""Parts of a scene that an encoder sees one at a time, each with its surroundings."""
+"""A scene of any size in parts: what an encoder sees at a time, each part with its surroundings."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float32, Int64
+
+from gsencoder.errors import InputError
+from gsencoder.models.choices import Device, Precision
+from gsencoder.models.curves import Curves
+from gsencoder.tracking import Track, untracked
+from gsencoder.types import Gaussians
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncodeConfig:
+    """How much at a time, and in what precision."""
+
+    chunk: int = field(
+        default=250_000, metadata={"help": "most Gaussians that the network sees at once, halo included; 0 = all"}
+    )
+    halo: float = field(default=0.64, metadata={"help": "metres of surroundings that a chunk sees beyond its own part"})
+    precision: Precision = field(
+        default="auto",
+        metadata={"help": "what the encoder computes in; auto = bfloat16 where the device multiplies it"},
+    )
+    device: Device = field(default="auto", metadata={"help": "where it computes"})
+
+    def __post_init__(self) -> None:
+        if self.chunk < 0:
+            raise InputError(f"chunk: expected 0 (all) or more, got {self.chunk}")
+        if not 0 <= self.halo < math.inf:
+            raise InputError(f"halo: expected 0 or more metres, got {self.halo}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -17,6 +46,46 @@ class Chunk:
 
     own: Int64[np.ndarray, " n"]
     rows: Int64[np.ndarray, " m"]
+
+
+def encode_by_chunks(
+    gaussians: Gaussians,
+    run: Callable[[Gaussians, Curves | None], Float32[np.ndarray, "n channels"]],
+    curves: Callable[[], Curves | None],
+    config: EncodeConfig,
+    *,
+    metres_per_unit: float,
+    channels: int,
+    track: Track = untracked,
+) -> Float32[np.ndarray, "N channels"]:
+    """What an encoder finds for every Gaussian, seen part by part.
+
+    Args:
+        gaussians: the splat.
+        run: what the encoder finds for a part, given the curves of the whole where it is not all.
+        curves: makes these, where there are several parts.
+        config: of the parts.
+        metres_per_unit: of the splat's world.
+        channels: columns of the result.
+        track: wraps the loop over chunks to show progress.
+
+    Raises:
+        InputError: no Gaussians, or features that are not finite.
+    """
+    if not len(gaussians):
+        raise InputError("encode: the splat has no Gaussians")
+    result = np.zeros((len(gaussians), channels), np.float32)
+    bad = 0
+    chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
+    whole = curves() if len(chunks) > 1 else None
+    for chunk in track(chunks, "encoding"):
+        part = gaussians if len(chunks) == 1 else gaussians.select(chunk.rows)
+        found = run(part, whole)[: len(chunk.own)]
+        bad += int((~np.isfinite(found).all(axis=1)).sum())
+        result[chunk.own] = found
+    if bad:
+        raise InputError(f"encode: {bad} of {len(result)} features are not finite; try precision=float32")
+    return result
 
 
 def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chunk]:

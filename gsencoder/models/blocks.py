@@ -1,11 +1,14 @@
 """The parts of the point transformer: patch attention, block, pooling and unpooling (PTv3, Wu et al. 2024, sec. 4)."""
 
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Bool, Float, Int64, Integer
 from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.models.neighbors import NeighborConv
+
+UNSEEN = -3e4
+"""Added to the score of what is masked; half precision holds it."""
 
 
 class PatchAttention(nn.Module):
@@ -33,10 +36,26 @@ class PatchAttention(nn.Module):
         qkv = (placed.float() if slow else placed).view(-1, width, 3, self.heads, channels // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
         with torch.autocast(placed.device.type, enabled=False):
-            attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
+            if torch.compiler.is_exporting():
+                attended = attend_plainly(q, k, v, attn_mask)
+            else:
+                attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
         flat = attended.transpose(1, 2).reshape(-1, channels)
         out: Tensor = self.project(flat.index_select(0, scatter))
         return out
+
+
+def attend_plainly(
+    q: Float[Tensor, "patches heads width c"],
+    k: Float[Tensor, "patches heads width c"],
+    v: Float[Tensor, "patches heads width c"],
+    attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
+) -> Float[Tensor, "patches heads width c"]:
+    """Attention in four operators, for ONNX; no row is masked altogether."""
+    scores = (q * q.shape[3] ** -0.5) @ k.transpose(2, 3)
+    if attn_mask is not None:
+        scores = scores + torch.where(attn_mask, 0.0, UNSEEN).to(scores.dtype)
+    return scores.softmax(dim=3) @ v
 
 
 class DropPath(nn.Module):
@@ -72,7 +91,7 @@ class Block(nn.Module):
     def forward(
         self,
         x: Float[Tensor, "T C"],
-        neighbors: Int32[Tensor, "T 27"],
+        neighbors: Integer[Tensor, "T 27"],
         gather: Int64[Tensor, " places"],
         scatter: Int64[Tensor, " T"],
         attn_mask: Bool[Tensor, "patches 1 1 width"] | None,

@@ -1,13 +1,9 @@
 """Where an encoder computes, and in what: float32, or bfloat16 where that is multiplied in hardware."""
 
-from typing import Literal
-
 import torch
 
 from gsencoder.errors import InputError
-
-Device = Literal["auto", "cpu", "cuda"]
-Precision = Literal["auto", "float32", "bfloat16"]
+from gsencoder.models.choices import Device, Precision
 
 
 def choose_device(name: Device, local_rank: int = 0) -> torch.device:

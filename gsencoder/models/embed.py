@@ -37,7 +37,7 @@ def embed(
     opacities: Float[Tensor, " N"],
     sh_dc: Float[Tensor, "N 3"],
     *,
-    voxel: float,
+    voxel: float | Float[Tensor, ""],
     attributes: tuple[Attribute, ...],
 ) -> Float[Tensor, "N C"]:
     """Input channels, each of order one.
@@ -53,7 +53,7 @@ def embed(
         scales: standard deviations > 0, world units.
         opacities: in [0, 1].
         sh_dc: degree-0 spherical-harmonic coefficients.
-        voxel: edge of the token grid, world units.
+        voxel: edge of the token grid, world units; a tensor where it is known only when an exported graph runs.
         attributes: which of them, in this order.
     """
     parts: list[Tensor] = []

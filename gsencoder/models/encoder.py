@@ -71,8 +71,9 @@ class GaussianEncoder(nn.Module):
             plan: of these Gaussians, in this order.
         """
         tokens = merge(attributes, opacities.clamp(min=FAINT), plan)
-        # Levels may end in tokens that stand for nothing.
-        tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
+        if not torch.compiler.is_exporting():
+            # Levels may end in tokens that stand for nothing.
+            tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
         x = functional.gelu(self.stem_norm(self.stem(tokens, plan.levels[0].neighbors)))
         x = self.transformer(x, plan)
         features = self.head(self.head_norm(x))
@@ -82,9 +83,15 @@ class GaussianEncoder(nn.Module):
 
 def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan) -> Float[Tensor, "T A"]:
     """The weighted mean (weights > 0) of each token's members, summed in the members' order, without atomics."""
+    weighted = torch.cat((attributes * weights.unsqueeze(1), weights.unsqueeze(1)), dim=1)
+    if torch.compiler.is_exporting():
+        # ONNX has no reduction of segments, and onnxruntime's scattered sums lose terms where two threads meet.
+        ends = plan.counts.cumsum(0)
+        running = functional.pad(weighted[plan.members].double().cumsum(0), (0, 0, 1, 0))
+        sums = (running[ends] - running[ends - plan.counts]).to(weighted.dtype)
+        return sums[:, :-1] / sums[:, -1:]
     if len(plan.counts) == len(attributes):
         return attributes.index_select(0, plan.members)
-    weighted = torch.cat((attributes * weights.unsqueeze(1), weights.unsqueeze(1)), dim=1)
     sums = torch.segment_reduce(weighted.index_select(0, plan.members), "sum", lengths=plan.counts)
     return sums[:, :-1] / sums[:, -1:]
 

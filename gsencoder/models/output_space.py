@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from gsencoder.data.archive import Archive
 from gsencoder.data.archived import read_space, space_parts
 from gsencoder.errors import InputError
-from gsencoder.types import FeatureBasis, FeatureSpace
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,6 +62,16 @@ class OutputSpace:
         """The inverse of `standardize`."""
         scaled = outputs * np.float32(self.unit)
         return np.asarray(scaled if self.basis is not None else scaled + self.mean, dtype=np.float32)
+
+    def features(self, restored: Float32[np.ndarray, "N channels"]) -> GaussianFeatures:
+        """Restored outputs of every Gaussian as features, all with weight 1."""
+        return GaussianFeatures(
+            features=restored,
+            weights=np.ones(len(restored), np.float32),
+            mean=self.mean,
+            space=self.space,
+            basis=self.basis,
+        )
 
 
 def write_outputs(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

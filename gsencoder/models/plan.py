@@ -6,10 +6,10 @@ whatever lies close in space lies close in memory.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64, Integer
 from torch import Tensor
 
 from gsencoder.models.cells import cells_of
@@ -25,18 +25,20 @@ class Level(NamedTuple):
 
     Attributes:
         neighbors: the 27 cells around each token; T where there is none.
-        gathers: for each order the token at every place of every patch; padding repeats a token of its patch.
+        gathers: for each order the token at every place of every patch; padding repeats a token.
         scatters: for each order the place of every token.
         attn_mask: for each order False at places that are not to be looked at; None where no patch is padded.
+            `RawEncoder` has gathers, scatters and masks as tuples, since its orders may have different numbers of
+            patches.
         width: places in a patch.
         parents: each token's token one level below (coarser); empty at the last level.
         children: each coarser token's tokens here, eight of them, the first repeated where there are fewer.
     """
 
-    neighbors: Int32[Tensor, "T 27"]
-    gathers: Int64[Tensor, "O places"]
-    scatters: Int64[Tensor, "O T"]
-    attn_mask: Bool[Tensor, "O patches 1 1 width"] | None
+    neighbors: Integer[Tensor, "T 27"]
+    gathers: Int64[Tensor, "O places"] | tuple[Int64[Tensor, " _places"], ...]
+    scatters: Int64[Tensor, "O T"] | tuple[Int64[Tensor, " T"], ...]
+    attn_mask: Bool[Tensor, "O patches 1 1 width"] | tuple[Bool[Tensor, "_patches 1 1 width"], ...] | None
     width: int
     parents: Int64[Tensor, " parents"]
     children: Int64[Tensor, "M 8"]
@@ -60,7 +62,9 @@ class Plan(NamedTuple):
     def to(self, device: str | torch.device) -> "Plan":
         """The same on another device."""
 
-        def move(value: Tensor) -> Tensor:
+        def move(value: Tensor | tuple[Tensor, ...]) -> Any:
+            if isinstance(value, tuple):
+                return tuple(map(move, value))
             return value.to(device, non_blocking=True)
 
         levels = tuple(

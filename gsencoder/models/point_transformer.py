@@ -80,6 +80,15 @@ class TransformerConfig:
         return len(self.encoder_depths)
 
     @property
+    def orders_followed(self) -> tuple[frozenset[int], ...]:
+        """For each level the orders, by number, that its blocks follow outside training."""
+        counts = [(level, depth) for level, depth in enumerate(self.encoder_depths)]
+        counts += reversed([(level, depth) for level, depth in enumerate(self.decoder_depths)])
+        levels = [level for level, depth in counts for _ in range(depth)]
+        numbers = [(level, block % len(self.orders)) for block, level in enumerate(levels)]
+        return tuple(frozenset(number for at, number in numbers if at == level) for level in range(self.levels))
+
+    @property
     def channels_out(self) -> int:
         """Channels of each token at the end."""
         return (*self.decoder_channels, *self.encoder_channels)[0]

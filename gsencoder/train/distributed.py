@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, distributed
 
 from gsencoder.errors import InputError
-from gsencoder.models.device import Device, choose_device
+from gsencoder.models.choices import Device
+from gsencoder.models.device import choose_device
 
 STOPPED_ELSEWHERE = "training: another process stopped; its own message says why"
 

@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from gsencoder.errors import InputError
-from gsencoder.models.device import Precision, autocast_dtype
+from gsencoder.models.choices import Precision
+from gsencoder.models.device import autocast_dtype
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.tracking import Track, untracked
 from gsencoder.train.checkpoint import CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint

@@ -11,8 +11,8 @@ from splats import random_gaussians
 from training_scenes import SMALL
 
 from gsencoder.errors import InputError
-from gsencoder.infer.chunks import cut
-from gsencoder.infer.encode import EncodeConfig, encode
+from gsencoder.infer.chunks import EncodeConfig, cut
+from gsencoder.infer.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.point_transformer import TransformerConfig

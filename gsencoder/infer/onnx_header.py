@@ -1,0 +1,161 @@
+"""What an exported encoder says of itself: entries of text beside the graph, which any program can read.
+
+`gsencoder` is JSON: the format's version, the grid, the curves, the feature space, and for each array its type and
+shape. `gsencoder.NAME` is the array NAME, little-endian, in base64.
+"""
+
+import base64
+import binascii
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+import numpy as np
+
+from gsencoder.data.text_table import TextTable
+from gsencoder.errors import InputError
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.serialize import ALIGN, Order
+from gsencoder.types import FeatureBasis, FeatureSpace
+
+KEY = "gsencoder"
+VERSION = 1
+FIELDS = ("means", "quats", "scales", "opacities", "sh_dc")
+"""Inputs of the graph that every cloud has."""
+SETTINGS = ("voxel", "corner", "starts")
+"""Inputs that have values of their own: the grid in metres, and those of a cloud that is no part of another."""
+OUTPUT = "features"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OnnxHeader:
+    """What a runtime must know of an exported encoder.
+
+    Attributes:
+        voxel: edge of the finest grid, metres.
+        levels: of the network.
+        orders: the curves that attention follows.
+        patch: most tokens in a patch.
+        outputs: what the features mean; the graph has restored them already.
+        words: what turns words into their space, where there is such a table.
+        precision: what the graph computes in.
+        made_by: settings and results of training and export, as JSON values.
+    """
+
+    voxel: float
+    levels: int
+    orders: tuple[Order, ...]
+    patch: int
+    outputs: OutputSpace
+    words: TextTable | None = None
+    precision: str = "float32"
+    made_by: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        known = set(get_args(Order))
+        numbers = type(self.levels) is int and type(self.patch) is int
+        if not 0 < self.voxel < math.inf or not numbers or not 1 <= self.levels <= ALIGN.bit_length() or self.patch < 1:
+            raise InputError(
+                f"expected a positive voxel, 1 to {ALIGN.bit_length()} levels and patches of 1 or more, got "
+                f"{self.voxel}, {self.levels}, {self.patch}"
+            )
+        if not self.orders or not set(self.orders) <= known:
+            raise InputError(f"expected orders among {', '.join(sorted(known))}, got {str(self.orders)[:80]}")
+
+
+def to_metadata(header: OnnxHeader) -> dict[str, str]:
+    """The entries of text that hold a header."""
+    outputs, words = header.outputs, header.words
+    arrays = {"mean": outputs.mean}
+    values: dict[str, Any] = {
+        "version": VERSION,
+        "voxel": header.voxel,
+        "levels": header.levels,
+        "orders": list(header.orders),
+        "patch": header.patch,
+        "precision": header.precision,
+        "space": _fields(outputs.space),
+        "scale": outputs.scale,
+        "made_by": dict(header.made_by),
+    }
+    if outputs.basis is not None:
+        arrays["components"] = outputs.basis.components
+        values["energy_kept"] = outputs.basis.energy_kept
+    if words is not None:
+        arrays |= {"words": words.embeddings.astype(np.float16), "words_mean": words.mean}
+        values["words"] = {"names": list(words.names), "space": _fields(words.space)}
+    values["arrays"] = {name: {"dtype": value.dtype.name, "shape": value.shape} for name, value in arrays.items()}
+    entries = {KEY: json.dumps(values, ensure_ascii=False)}
+    for name, value in arrays.items():
+        little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
+        entries[f"{KEY}.{name}"] = base64.b64encode(little.tobytes()).decode("ascii")
+    return entries
+
+
+def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
+    """The header that entries of text hold.
+
+    Raises:
+        InputError: there is none, it is of another version, or damaged.
+    """
+    if KEY not in entries:
+        raise InputError("is no encoder that `gsencoder export` wrote")
+    try:
+        values = json.loads(entries[KEY])
+        version = values["version"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"the entry {KEY!r} is damaged ({type(error).__name__})") from error
+    if version != VERSION:
+        raise InputError(
+            f"is of format version {str(version)[:20]}, and this gsencoder reads {VERSION}; export it again"
+        )
+    try:
+        arrays = {name: _array(entries, name, **each) for name, each in values["arrays"].items()}
+        space = FeatureSpace(**values["space"])
+        basis = None
+        if "components" in arrays:
+            basis = FeatureBasis(
+                mean=arrays["mean"],
+                components=arrays["components"],
+                energy_kept=values["energy_kept"],
+                space=space,
+            )
+        words = None
+        if "words" in values:
+            rows = arrays["words"].astype(np.float32)
+            words = TextTable(
+                names=tuple(values["words"]["names"]),
+                embeddings=rows / np.linalg.norm(rows, axis=1, keepdims=True),
+                space=FeatureSpace(**values["words"]["space"]),
+                mean=arrays["words_mean"],
+            )
+        return OnnxHeader(
+            voxel=values["voxel"],
+            levels=values["levels"],
+            orders=tuple(values["orders"]),
+            patch=values["patch"],
+            outputs=OutputSpace(space=space, mean=arrays["mean"], scale=values["scale"], basis=basis),
+            words=words,
+            precision=values["precision"],
+            made_by=values["made_by"],
+        )
+    except (ValueError, KeyError, TypeError, AttributeError, binascii.Error) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"its entries are damaged ({type(error).__name__}: {str(error)[:80]})") from error
+
+
+def _fields(space: FeatureSpace) -> dict[str, Any]:
+    return {name: getattr(space, name) for name in space.__dataclass_fields__}
+
+
+def _array(entries: Mapping[str, str], name: str, *, dtype: str, shape: list[int]) -> np.ndarray:
+    if dtype not in ("float32", "float16"):
+        raise InputError(f"expected {name} of float32 or float16, got {dtype[:20]!r}")
+    raw = base64.b64decode(entries[f"{KEY}.{name}"], validate=True)
+    values = np.frombuffer(raw, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)
+    if not np.isfinite(values).all():
+        raise InputError(f"{name} holds values that are not finite")
+    return values
