@@ -130,7 +130,7 @@ class OnnxEncoder:
         return np.asarray(found, np.float32)
 
 
-def rows_of(curves: Curves) -> Int64[np.ndarray, "levels*orders P"]:
+def rows_of(curves: Curves) -> Int64[np.ndarray, "rows P"]:
     """The starts of all levels and orders in one array, as the graph takes them, filled up with a code of no cell."""
     rows = [row for starts in curves.starts for row in starts]
     table = np.full((len(rows), max(map(len, rows))), np.iinfo(np.int64).max)

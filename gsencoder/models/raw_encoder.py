@@ -59,7 +59,7 @@ class RawEncoder(nn.Module):
         sh_dc: Float32[Tensor, "N 3"],
         voxel: Float64[Tensor, ""],
         corner: Float32[Tensor, "3"],
-        starts: Int64[Tensor, "levels*orders P"],
+        starts: Int64[Tensor, "rows P"],
     ) -> Float32[Tensor, "N channels"]:
         """Features of a cloud of one Gaussian or more: coordinates in the basis, or vectors of the space.
 

@@ -1,0 +1,285 @@
+"""The exported encoder against the one that it was made from, and files that are no such encoder."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import jaxtyping
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from splats import random_gaussians
+
+from gsencoder.data.splats import save_splat
+from gsencoder.data.text_table import make_text_table, save_text_table
+from gsencoder.errors import InputError
+from gsencoder.infer import export_onnx as exporting
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.encoders import Encoder, load_encoder
+from gsencoder.infer.export_onnx import TOLERANCE, check_parity, export_onnx, random_cloud
+from gsencoder.infer.onnx_header import KEY, OnnxHeader, from_metadata, to_metadata
+from gsencoder.infer.onnx_runtime import OnnxEncoder
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.weights import save_weights
+from gsencoder.types import FeatureBasis, FeatureSpace, Gaussians
+
+WORDS = ("mug", "plant", "chair")
+SHAPE = TransformerConfig(
+    encoder_depths=(1, 2, 1),
+    encoder_channels=(16, 16, 32),
+    decoder_depths=(1, 1),
+    decoder_channels=(16, 16),
+    head_channels=8,
+    patch=24,
+)
+ALONE = EncodeConfig(chunk=0, precision="float32", device="cpu")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights with a basis and words beside them, as `train` leaves them, and what they were exported to."""
+    folder = tmp_path_factory.mktemp("encoder")
+    rng = np.random.default_rng(0)
+    table = make_text_table(WORDS, np.linalg.qr(rng.normal(size=(6, 3)))[0].T, "words-6")
+    space = FeatureSpace(name="six", channels=6, teacher="labels", text_encoder="words-6", preprocessing="none")
+    mean = rng.normal(size=6).astype(np.float32)
+    basis = FeatureBasis(
+        mean=mean,
+        components=np.linalg.qr(rng.normal(size=(6, 4)))[0].T.astype(np.float32),
+        energy_kept=0.9,
+        space=space,
+    )
+    torch.manual_seed(0)
+    encoder = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), 4)
+    outputs = OutputSpace(space=space, mean=mean, scale=2.0, basis=basis)
+    save_weights(folder / "encoder.safetensors", encoder, outputs, {"steps": 3})
+    save_text_table(folder / "words.safetensors", table)
+    # Sizes that are symbols are not what the checks of shapes expect.
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        model = export_onnx(TorchEncoder(str(folder)))
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+    (folder / "encoder.onnx").write_bytes(model)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def both(folder: Path) -> tuple[TorchEncoder, OnnxEncoder]:
+    return TorchEncoder(str(folder)), OnnxEncoder(folder / "encoder.onnx", device="cpu")
+
+
+def apart(one: Encoder, other: Encoder, cloud: Gaussians, config: EncodeConfig = ALONE, unit: float = 1.0) -> float:
+    """The largest difference, as a share of the largest feature."""
+    ours, theirs = (each.encode(cloud, config, metres_per_unit=unit).features for each in (one, other))
+    return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
+
+
+def moved(cloud: Gaussians, means: np.ndarray) -> Gaussians:
+    return replace(cloud, means=np.array(np.broadcast_to(means, (len(cloud), 3)), np.float32))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 24, 25, 31, 1000, 5000])
+def test_the_exported_encoder_gives_what_torch_gives(both: tuple[TorchEncoder, OnnxEncoder], count: int) -> None:
+    cloud = random_cloud(count, 0.05, seed=count)
+    assert apart(*both, cloud) < TOLERANCE
+    assert apart(*both, cloud, unit=0.3048) < TOLERANCE
+    assert apart(*both, moved(cloud, np.array([7.0, -3.0, 0.1]))) < TOLERANCE
+    within = np.random.default_rng(0).uniform(0.05, 0.0999, (count, 3))
+    assert apart(*both, moved(cloud, within)) < TOLERANCE
+
+
+@pytest.mark.parametrize("far", [1e-30, 1e-3, 1e3])
+def test_clouds_of_all_extents_agree(both: tuple[TorchEncoder, OnnxEncoder], far: float) -> None:
+    cloud = random_cloud(500, 0.05)
+    assert apart(*both, moved(cloud, cloud.means * np.float32(far))) < TOLERANCE
+
+
+def test_borders_of_cells_are_where_torch_has_them(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+    cloud = random_cloud(3000, 0.05)
+    on_borders = np.round(cloud.means / 0.05).astype(np.float32) * np.float32(0.05)
+    assert apart(*both, moved(cloud, on_borders)) < TOLERANCE
+    assert apart(*both, moved(cloud, on_borders / np.float32(0.3048)), unit=0.3048) < TOLERANCE
+
+
+@pytest.mark.parametrize("chunk", [200, 900])
+def test_parts_are_cut_as_torch_cuts_them(both: tuple[TorchEncoder, OnnxEncoder], chunk: int) -> None:
+    cloud = random_cloud(3000, 0.05)
+    config = EncodeConfig(chunk=chunk, halo=0.2, precision="float32", device="cpu")
+    assert apart(*both, cloud, config) < TOLERANCE
+    whole, parts = (both[1].encode(cloud, each).features for each in (ALONE, config))
+    assert not np.array_equal(whole, parts)
+
+
+def test_a_rerun_gives_the_same_bits_on_any_number_of_threads(folder: Path) -> None:
+    cloud = random_cloud(4000, 0.05)
+    found = [OnnxEncoder(folder / "encoder.onnx", threads=threads).encode(cloud, ALONE).features for threads in (1, 2)]
+    for features in found:
+        again = OnnxEncoder(folder / "encoder.onnx", threads=2).encode(cloud, ALONE).features
+        np.testing.assert_array_equal(features, again)
+
+
+def test_the_graph_alone_takes_five_arrays_of_a_splat_in_metres(
+    folder: Path, both: tuple[TorchEncoder, OnnxEncoder]
+) -> None:
+    cloud = random_cloud(100, 0.05)
+    session = onnxruntime.InferenceSession(folder / "encoder.onnx")
+    names = [each.name for each in session.get_inputs()]
+    assert names == ["means", "quats", "scales", "opacities", "sh_dc"]
+    (features,) = session.run(None, dict(zip(names, exporting._raw(cloud), strict=True)))
+    np.testing.assert_array_equal(features, both[1].encode(cloud, ALONE).features)
+    model = onnx.load(folder / "encoder.onnx")
+    assert {each.domain for each in model.opset_import} == {""}
+    assert {each.domain for each in model.graph.node} == {""}
+    onnx.checker.check_model(model)
+
+
+def test_the_file_says_what_its_features_mean(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+    theirs, ours = both
+    header = ours.header
+    assert header.outputs.space == theirs.outputs.space
+    assert header.outputs.basis is not None
+    assert theirs.outputs.basis is not None
+    np.testing.assert_array_equal(header.outputs.basis.components, theirs.outputs.basis.components)
+    np.testing.assert_array_equal(header.outputs.mean, theirs.outputs.mean)
+    assert header.made_by == {"steps": 3}
+    assert ours.words is not None
+    assert theirs.words is not None
+    assert ours.words.names == WORDS
+    np.testing.assert_allclose(ours.words.encode(WORDS), theirs.words.encode(WORDS), atol=1e-3)
+    assert ours.voxel == theirs.voxel == 0.05
+
+
+def test_a_header_comes_back_as_it_was_written(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+    header = both[1].header
+    again = from_metadata(to_metadata(header))
+    assert to_metadata(again) == to_metadata(header)
+
+
+def changed(header: OnnxHeader, key: str, value: object) -> dict[str, str]:
+    entries = to_metadata(header)
+    values = json.loads(entries[KEY])
+    values[key] = value
+    return entries | {KEY: json.dumps(values)}
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda header: {}, "no encoder that `gsencoder export` wrote"),
+        (lambda header: {KEY: "{"}, "is damaged"),
+        (lambda header: {KEY: "[]"}, "is damaged"),
+        (lambda header: changed(header, "version", 2), "format version 2, and this gsencoder reads 1"),
+        (lambda header: changed(header, "levels", 0), "1 to 7 levels"),
+        (lambda header: changed(header, "levels", "3"), "1 to 7 levels"),
+        (lambda header: changed(header, "voxel", -1), "positive voxel"),
+        (lambda header: changed(header, "voxel", None), "damaged"),
+        (lambda header: changed(header, "orders", ["spiral"]), "expected orders among"),
+        (lambda header: changed(header, "space", {"name": "x"}), "damaged"),
+        (lambda header: changed(header, "space", {"name": "x", "channels": 9}), "expected"),
+        (lambda header: changed(header, "arrays", {}), "damaged"),
+        (lambda header: changed(header, "arrays", {"mean": {"dtype": "object", "shape": [6]}}), "float32 or float16"),
+        (lambda header: changed(header, "arrays", {"mean": {"dtype": "float32", "shape": [7]}}), "damaged"),
+        (lambda header: changed(header, "words", {"names": ["a"], "space": {}}), "damaged"),
+        (lambda header: to_metadata(header) | {f"{KEY}.mean": "no base64!"}, "damaged"),
+        (lambda header: to_metadata(header) | {f"{KEY}.mean": "AADAfwAAwH8AAMB/AADAfwAAwH8AAMB/"}, "not finite"),
+    ],
+)
+@pytest.mark.usefixtures("no_jaxtyping")
+def test_a_damaged_header_is_refused(
+    both: tuple[TorchEncoder, OnnxEncoder], damage: Callable[[OnnxHeader], dict[str, str]], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        from_metadata(damage(both[1].header))
+
+
+def test_files_that_are_no_encoder_are_refused(folder: Path, tmp_path: Path) -> None:
+    whole = (folder / "encoder.onnx").read_bytes()
+    for size in (0, 100, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.onnx").write_bytes(whole[:size])
+        with pytest.raises(InputError, match="cut.onnx: is no model that onnxruntime reads, or damaged"):
+            load_encoder(str(tmp_path / "cut.onnx"))
+    with pytest.raises(InputError, match="no file at"):
+        load_encoder(str(tmp_path / "none.onnx"))
+    value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Identity", ["x"], ["y"])], "g", [value], [value])
+    graph.output[0].name = "y"
+    other = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 20)], ir_version=9)
+    onnx.save(other, tmp_path / "other.onnx")
+    with pytest.raises(InputError, match="other.onnx: is no encoder that `gsencoder export` wrote"):
+        load_encoder(str(tmp_path / "other.onnx"))
+    for entry in onnx.load(folder / "encoder.onnx").metadata_props:
+        other.metadata_props.add(key=entry.key, value=entry.value)
+    onnx.save(other, tmp_path / "other.onnx")
+    with pytest.raises(InputError, match=r"expected inputs corner: tensor\(float\).*, got x: tensor\(float\)"):
+        load_encoder(str(tmp_path / "other.onnx"))
+
+
+def test_what_cannot_be_encoded_is_refused_on_both_sides_alike(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+    cloud = random_cloud(10, 0.05)
+    wide = moved(cloud, np.linspace(0, 2.0**20, 10)[:, None] * np.ones(3))
+    for encoder in both:
+        with pytest.raises(InputError, match="the splat has no Gaussians"):
+            encoder.encode(cloud.select(np.arange(0)))
+        with pytest.raises(InputError, match="the limit is 2²⁰"):
+            encoder.encode(wide)
+    with pytest.raises(InputError, match="computes in float32, not bfloat16; export another"):
+        both[1].encode(cloud, EncodeConfig(precision="bfloat16"))
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh"])
+@pytest.mark.usefixtures("no_jaxtyping")
+def test_no_cloud_holds_values_that_an_encoder_could_not_take(field: str) -> None:
+    cloud = random_gaussians(5)
+    for bad in (np.nan, np.inf):
+        values = getattr(cloud, field).copy()
+        values[2] = bad
+        with pytest.raises(InputError, match=rf"Gaussians.{field}: expected .* in row 2"):
+            replace(cloud, **{field: values})
+    with pytest.raises(InputError, match=rf"Gaussians.{field}: expected float32"):
+        replace(cloud, **{field: getattr(cloud, field).astype(np.float64)})
+
+
+def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+    model = onnx.load(folder / "encoder.onnx")
+    head = next(each for each in model.graph.initializer if each.name.endswith("head.bias"))
+    head.CopyFrom(onnx.numpy_helper.from_array(onnx.numpy_helper.to_array(head) + np.float32(0.01), head.name))
+    with pytest.raises(InputError, match="on a sheet onnxruntime and torch differ by .* no file was written"):
+        check_parity(model.SerializeToString(), both[0], [("a sheet", random_cloud(50, 0.05), 1.0)])
+
+
+def test_without_the_packages_of_an_export_it_says_which(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "onnxscript", None)
+        with pytest.raises(InputError, match=r"needs the package onnxscript: pip install 'gsencoder\[export\]'"):
+            export_onnx(both[0])
+
+
+def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_path: Path) -> None:
+    save_splat(tmp_path / "room.ply", random_cloud(500, 0.05))
+    code = (
+        "import sys\n"
+        "class NoTorch:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] == 'torch':\n"
+        "            raise ModuleNotFoundError('no torch here', name=name)\n"
+        "sys.meta_path.insert(0, NoTorch())\n"
+        "from gsencoder.cli import main\n"
+        f"splat, weights, out = {str(tmp_path / 'room.ply')!r}, {str(folder / 'encoder.onnx')!r}, {str(tmp_path)!r}\n"
+        "assert main(['encode', splat, f'weights={weights}', f'out={out}/features']) == 0\n"
+        "from gsencoder import load_splat, localize\n"
+        "from gsencoder.fusion.store import load_features\n"
+        "from gsencoder.infer.onnx_runtime import OnnxEncoder\n"
+        "scene = load_features(__import__('pathlib').Path(out) / 'features')\n"
+        "assert len(localize(scene, ['mugs'], OnnxEncoder(weights).words).boxes) > 0\n"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
