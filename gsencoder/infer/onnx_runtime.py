@@ -147,8 +147,6 @@ def _session(model: str | bytes, name: str, device: Device, threads: int) -> Any
         raise InputError(f"device: this onnxruntime has no GPU ({', '.join(available)}); give device=cpu")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
-    # The arena keeps, for each size that it has seen, what the largest cloud took.
-    options.enable_cpu_mem_arena = False
     if threads:
         options.intra_op_num_threads = threads
     providers = [CPU] if device == "cpu" or CUDA not in available else [CUDA, CPU]

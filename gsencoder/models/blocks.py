@@ -30,32 +30,42 @@ class PatchAttention(nn.Module):
     ) -> Float[Tensor, "T C"]:
         """Tokens are put into patches, attend within them, and are put back; see `plan.Level`."""
         channels = x.shape[1]
+        if torch.compiler.is_exporting():
+            return self._exported(x.index_select(0, gather), scatter, attn_mask, width)
         placed = self.qkv(x.index_select(0, gather))
         # torch's backward of attention in bfloat16 on a CPU is five times slower than in float32.
         slow = placed.device.type == "cpu" and placed.dtype == torch.bfloat16 and torch.is_grad_enabled()
         qkv = (placed.float() if slow else placed).view(-1, width, 3, self.heads, channels // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
         with torch.autocast(placed.device.type, enabled=False):
-            if torch.compiler.is_exporting():
-                attended = attend_plainly(q, k, v, attn_mask)
-            else:
-                attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
+            attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
         flat = attended.transpose(1, 2).reshape(-1, channels)
         out: Tensor = self.project(flat.index_select(0, scatter))
         return out
 
-
-def attend_plainly(
-    q: Float[Tensor, "patches heads width c"],
-    k: Float[Tensor, "patches heads width c"],
-    v: Float[Tensor, "patches heads width c"],
-    attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
-) -> Float[Tensor, "patches heads width c"]:
-    """Attention in four operators, for ONNX; no row is masked altogether."""
-    scores = (q * q.shape[3] ** -0.5) @ k.transpose(2, 3)
-    if attn_mask is not None:
-        scores = scores + torch.where(attn_mask, 0.0, UNSEEN).to(scores.dtype)
-    return scores.softmax(dim=3) @ v
+    def _exported(
+        self,
+        placed: Float[Tensor, "places C"],
+        scatter: Int64[Tensor, " T"],
+        attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
+        width: int,
+    ) -> Float[Tensor, "T C"]:
+        """The same in plain operators, for ONNX: queries, keys and values from products of their own, which need not be
+        taken apart again. No patch is masked altogether."""
+        channels = placed.shape[1]
+        rows = [slice(part * channels, (part + 1) * channels) for part in range(3)]
+        q, k, v = (
+            functional.linear(placed, self.qkv.weight[part], self.qkv.bias[part])
+            .view(-1, width, self.heads, channels // self.heads)
+            .transpose(1, 2)
+            for part in rows
+        )
+        scores = (q * q.shape[3] ** -0.5) @ k.transpose(2, 3)
+        if attn_mask is not None:
+            scores = scores + torch.where(attn_mask, 0.0, UNSEEN).to(scores.dtype)
+        attended = scores.softmax(dim=3) @ v
+        out: Tensor = self.project(attended.transpose(1, 2).reshape(-1, channels).index_select(0, scatter))
+        return out
 
 
 class DropPath(nn.Module):

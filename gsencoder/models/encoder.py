@@ -87,8 +87,9 @@ def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: 
     if torch.compiler.is_exporting():
         # ONNX has no reduction of segments, and onnxruntime's scattered sums lose terms where two threads meet.
         ends = plan.counts.cumsum(0)
-        running = functional.pad(weighted[plan.members].double().cumsum(0), (0, 0, 1, 0))
-        sums = (running[ends] - running[ends - plan.counts]).to(weighted.dtype)
+        running = functional.pad(weighted.index_select(0, plan.members).double().cumsum(0), (0, 0, 1, 0))
+        sums = running.index_select(0, ends) - running.index_select(0, ends - plan.counts)
+        sums = sums.to(weighted.dtype)
         return sums[:, :-1] / sums[:, -1:]
     if len(plan.counts) == len(attributes):
         return attributes.index_select(0, plan.members)

@@ -80,7 +80,7 @@ class NeighborConv(nn.Module):
         weight: Tensor = self.weight
         bias: Tensor = self.bias
         if torch.compiler.is_exporting():
-            return convolve_by_thirds(x, neighbors, weight) + bias
+            return convolve(x, neighbors, weight) + bias
         if torch.is_autocast_enabled(x.device.type):
             dtype = torch.get_autocast_dtype(x.device.type)
             x, weight, bias = x.to(dtype), weight.to(dtype), bias.to(dtype)
@@ -95,13 +95,15 @@ def convolve_reference(
     return padded[neighbors.long()].flatten(1) @ weight.flatten(0, 1)
 
 
-def convolve_by_thirds(
-    x: Float[Tensor, "N C"], neighbors: Integer[Tensor, "N 27"], weight: Float[Tensor, "27 C D"]
-) -> Float[Tensor, "N D"]:
-    """The twin for ONNX, which has no products into parts of a result: three gathers, of nine cells each."""
-    padded = _with_zero_row(x)
-    parts = zip(neighbors.split(9, dim=1), weight.split(9), strict=True)
-    return sum((_neighborhoods(padded, rows) @ some.flatten(0, 1) for rows, some in parts), start=x.new_zeros(()))
+@torch.library.custom_op("gsencoder::convolve", mutates_args=())
+def convolve(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
+    """The convolution as one operator, which an exported graph has in ONNX's own (`infer.onnx_operators`)."""
+    return _multiply(x, neighbors, weight.flatten(0, 1))
+
+
+@convolve.register_fake
+def _(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
+    return x.new_empty(neighbors.shape[0], weight.shape[2])
 
 
 class _Convolve(torch.autograd.Function):

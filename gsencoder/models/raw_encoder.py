@@ -7,7 +7,7 @@ known only when it comes: without searches for duplicates, segments or sizes tha
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int32, Int64, Integer
 from torch import Tensor, nn
 
 from gsencoder.models.embed import embed
@@ -37,8 +37,8 @@ class Tokens(NamedTuple):
 
     def coarser(self, first: Int64[Tensor, " M"]) -> "Tokens":
         """The level below, of which these rows are the first children."""
-        along = {order: codes[first] >> 3 for order, codes in self.along.items()}
-        return Tokens(self.cells[first] >> 1, self.morton[first] >> 3, along)
+        along = {order: codes.index_select(0, first) >> 3 for order, codes in self.along.items()}
+        return Tokens(self.cells.index_select(0, first) >> 1, self.morton.index_select(0, first) >> 3, along)
 
 
 class RawEncoder(nn.Module):
@@ -88,9 +88,9 @@ def _plan(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, config: 
     cells = (scaled - torch.floor(low / ALIGN) * ALIGN).long()
     codes, members = torch.sort(morton_codes(cells), stable=True)
     first, token_of_member = _runs(codes)
-    morton = codes[first]
+    morton = codes.index_select(0, first)
     along = {order: encode_morton(morton, order, MOST_LEVELS) for order in config.orders}
-    tokens = Tokens(cells[members[first]], morton, along)
+    tokens = Tokens(cells.index_select(0, members.index_select(0, first)), morton, along)
     levels = []
     for level in range(config.levels):
         neighbors = _neighbor_table(tokens.cells)
@@ -141,35 +141,35 @@ def _children(first: Int64[Tensor, " M"], total: int) -> Int64[Tensor, "M 8"]:
     return first[:, None] + torch.where(step < _lengths(first, total)[:, None], step, 0)
 
 
-def _neighbor_table(cells: Int64[Tensor, "T 3"]) -> Int64[Tensor, "T 27"]:
+def _neighbor_table(cells: Int64[Tensor, "T 3"]) -> Int32[Tensor, "T 27"]:
     """As `neighbors.neighbor_table`, without strides that Python has to see."""
     count = cells.shape[0]
     low, high = cells.amin(dim=0), cells.amax(dim=0)
     sizes = high - low + 3
     strides = torch.stack((sizes[1] * sizes[2], sizes[2], torch.ones_like(sizes[0])))
     keys, order = torch.sort(((cells - low + 1) * strides).sum(dim=1), stable=True)
-    own = torch.arange(count, device=cells.device)
+    own = torch.arange(count, device=cells.device, dtype=torch.int32)
     ahead = torch.tensor([[dx, dy, -1] for dx, dy in AHEAD], device=cells.device)
     wanted = keys + (ahead * strides).sum(dim=1, keepdim=True)
-    place = torch.searchsorted(keys, wanted)
+    place = torch.searchsorted(keys, wanted).int()
     padded = torch.cat((keys, keys.new_full((3,), NEVER)))
     after = []
     for _ in range(3):
         hit = _take(padded, place) == wanted
         after.append(torch.where(hit, place, count))
-        place, wanted = place + hit.long(), wanted + 1
+        place, wanted = place + hit.int(), wanted + 1
     # Cells 15 to 26, which face 11 to 0.
     facing = torch.stack(after, dim=1).view(12, -1)
     nobody = torch.full_like(facing[:, :1], count)
-    before = torch.cat((torch.full_like(facing, count), nobody), dim=1).scatter(1, facing, own.expand(12, -1))
+    before = torch.cat((torch.full_like(facing, count), nobody), dim=1).scatter(1, facing.long(), own.expand(12, -1))
     beyond = torch.where(_take(padded, own + 1) == keys + 1, own + 1, count)
     previous = torch.where(keys.roll(1) == keys - 1, own - 1, count)
     found = torch.cat((before[:, :-1].flip(0), torch.stack((previous, own, beyond)), facing))
-    rows = _take(torch.cat((order, torch.full_like(order[:1], count))), found)
-    return rows.T.index_select(0, torch.empty_like(order).scatter(0, order, own))
+    rows = _take(torch.cat((order.int(), torch.full_like(own[:1], count))), found)
+    return rows.T.index_select(0, torch.empty_like(own).scatter(0, order, own))
 
 
-def _take(values: Int64[Tensor, " n"], places: Int64[Tensor, "..."]) -> Int64[Tensor, "..."]:
+def _take(values: Integer[Tensor, " n"], places: Int32[Tensor, "..."]) -> Integer[Tensor, "..."]:
     return values.index_select(0, places.flatten()).view(places.shape)
 
 
@@ -195,7 +195,7 @@ def _patches(codes: Int64[Tensor, " T"], starts: Int64[Tensor, " P"], patch: int
     number = ((rank + 1) * ((count + patch - 1) // patch) - 1) // count
     number = torch.where(starts[:1] < 0, number, torch.searchsorted(starts, codes, right=True) - 1)
     first, run = _runs(number)
-    slots = run * patch + rank - first[run]
+    slots = run * patch + rank - first.index_select(0, run)
     places = rank.new_zeros(first.shape[0] * patch)
     used = torch.zeros_like(places, dtype=torch.bool).scatter(0, slots, torch.ones_like(rank, dtype=torch.bool))
     return Patches(

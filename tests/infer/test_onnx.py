@@ -1,6 +1,7 @@
 """The exported encoder against the one that it was made from, and files that are no such encoder."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -283,3 +284,22 @@ def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_p
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_example_answers_a_word_for_a_splat_without_torch(folder: Path, tmp_path: Path) -> None:
+    cloud = random_cloud(2000, 0.05)
+    # Half of the sheet is white and the other black, so that even an untrained encoder tells them apart.
+    left = cloud.means[:, :1] < 0
+    save_splat(tmp_path / "room.ply", replace(cloud, sh=np.where(left, 1.5, -1.5).repeat(3, 1)[:, None].astype("f4")))
+    example = Path(__file__).parents[2] / "examples" / "find_word.py"
+    text = example.read_text()
+    assert len(text.splitlines()) <= 30
+    (tmp_path / "torch.py").write_text("raise ModuleNotFoundError('no torch here')")
+    for word, code in (("mug", 0), ("unicorn", 1)):
+        words = [sys.executable, example, folder / "encoder.onnx", tmp_path / "room.ply", word]
+        done = subprocess.run(words, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
+        assert done.returncode == code, done.stderr
+        if code:
+            assert done.stderr.startswith("error: not among the 3 words of words-6: 'unicorn'")
+        else:
+            assert done.stdout.startswith("mug at [")

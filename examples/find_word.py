@@ -1,0 +1,30 @@
+"""Finds a word in a splat with an exported encoder; needs no torch.
+
+python examples/find_word.py encoder.onnx room.ply mug
+"""
+
+import sys
+
+from gsencoder import InputError, Scene, load_splat, localize
+from gsencoder.infer.onnx_runtime import OnnxEncoder
+
+
+def main(model: str, splat: str, word: str) -> None:
+    encoder = OnnxEncoder(model)
+    if encoder.words is None:
+        raise InputError(f"{model} holds no words")
+    gaussians = load_splat(splat)
+    features = encoder.encode(gaussians)  # of a splat in metres; else give metres_per_unit=
+    scene = Scene(name="scene", gaussians=gaussians, features={features.space.name: features})
+    for box in localize(scene, [word], encoder.words).boxes:
+        size = " × ".join(f"{side:.2f}" for side in box.aabb_max - box.aabb_min)
+        print(f"{word} at {box.center.round(2)}, {size}, score {box.score:.2f}")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except InputError as error:
+        sys.exit(f"error: {error}")
