@@ -16,6 +16,7 @@ import pytest
 import torch
 from splats import random_gaussians
 
+from gsencoder import cli
 from gsencoder.data.splats import save_splat
 from gsencoder.data.text_table import make_text_table, save_text_table
 from gsencoder.errors import InputError
@@ -66,10 +67,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # Sizes that are symbols are not what the checks of shapes expect.
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
-        model = export_onnx(TorchEncoder(str(folder)))
+        words = [f"weights={folder}", f"out={folder / 'encoder.onnx'}", "sizes=[1,50]", "quiet=true"]
+        assert cli.main(["export", *words]) == 0
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
-    (folder / "encoder.onnx").write_bytes(model)
     return folder
 
 
@@ -255,6 +256,41 @@ def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[TorchEn
     head.CopyFrom(onnx.numpy_helper.from_array(onnx.numpy_helper.to_array(head) + np.float32(0.01), head.name))
     with pytest.raises(InputError, match="on a sheet onnxruntime and torch differ by .* no file was written"):
         check_parity(model.SerializeToString(), both[0], [("a sheet", random_cloud(50, 0.05), 1.0)])
+
+
+def test_the_command_tells_what_it_compared(folder: Path) -> None:
+    results = json.loads((folder / "encoder.onnx.summary.json").read_text())["results"]
+    assert results["onnx"] == str(folder / "encoder.onnx")
+    assert set(results["parity"]) == {"1 random Gaussians", "50 random Gaussians"}
+    assert 0 <= max(results["parity"].values()) < TOLERANCE
+    assert (results["rank"], results["channels"], results["words"]) == (4, 6, 3)
+    assert results["bytes"] == (folder / "encoder.onnx").stat().st_size
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["out=encoder.safetensors"], "expected a file that ends in .onnx"),
+        (["out=encoder.onnx", "sizes=[0]"], "sizes: expected one or more numbers from 1"),
+        (["out=encoder.onnx", "tolerance=0"], "tolerance: expected a share between 0 and 1"),
+        (["out=encoder.onnx", "weights=nothing"], "weights: no file at nothing"),
+        (["out=taken.onnx"], "taken.onnx: exists; give another out= or overwrite=true"),
+        (["out=encoder.onnx", "none.ply"], "none.ply"),
+        ([], "out= is missing"),
+    ],
+)
+def test_the_command_refuses_before_it_begins(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken.onnx").touch()
+    assert cli.main(["export", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["taken.onnx"]
 
 
 def test_without_the_packages_of_an_export_it_says_which(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
