@@ -13,7 +13,7 @@ from gsencoder.errors import InputError
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx_header import FIELDS, OUTPUT, SETTINGS, OnnxHeader, to_metadata
-from gsencoder.infer.onnx_runtime import OnnxEncoder
+from gsencoder.infer.onnx_runtime import OnnxEncoder, inputs_of
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.raw_encoder import RawEncoder
 from gsencoder.tracking import Track, untracked
@@ -59,7 +59,7 @@ def _graph(encoder: GaussianEncoder, header: OnnxHeader) -> Any:
 
     cloud = random_cloud(300, header.voxel)
     clouds, patches = torch.export.Dim("gaussians"), torch.export.Dim("patches")
-    example = [torch.from_numpy(value) for value in _raw(cloud)]
+    example = [torch.from_numpy(value) for value in inputs_of(cloud).values()]
     voxel, corner, starts = (torch.from_numpy(value) for value in _settings(header).values())
     sizes = (*({0: clouds} for _ in FIELDS), {}, {}, {1: patches})
     with torch.no_grad(), _quiet():
@@ -102,16 +102,6 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logger.setLevel(level)
-
-
-def _raw(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
-    return (
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        np.ascontiguousarray(gaussians.sh[:, 0]),
-    )
 
 
 def random_cloud(count: int, voxel: float, seed: int = 0) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Two operators that the exporter does not know, in others of ONNX."""
+"""Operators that the exporter does not know, in others of ONNX."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ ROWS_AT_ONCE = 1024
 
 @script(default_opset=op)
 def search(keys: INT64, wanted: INT64, more: INT64) -> INT64:
-    """How many of the sorted keys are below wanted + more, by halving steps from the first power of two above N (or the
-    second, where the logarithm is near a whole number)."""
+    """How many of the sorted keys are below wanted + more, by halving steps from the first power of two above their
+    number (or the second, where the logarithm is near a whole number)."""
     size = op.Size(keys)
     halvings = op.Cast(op.Floor(op.Log(op.Cast(size, to=1)) * 1.4426950408889634 + 1e-3), to=7) + 1
     one = op.Constant(value_int=1)
@@ -44,7 +44,7 @@ def convolve(x: FLOAT, neighbors: INT32, weight: FLOAT) -> FLOAT:
     missing = op.Concat(blocks * size - rows, op.Constant(value_ints=[27]), axis=0)
     table = op.Concat(neighbors, op.Expand(op.CastLike(rows, neighbors), missing), axis=0)
     table = op.Reshape(table, op.Concat(blocks, size, op.Constant(value_ints=[27]), axis=0))
-    zeros = op.Gather(x, first) * 0.0
+    zeros = op.Expand(op.CastLike(0.0, x), op.Concat(second, op.Gather(op.Shape(x), second), axis=0))
     padded = op.Concat(x, zeros, axis=0)
     wide = op.Reshape(weight, op.Concat(op.Constant(value_ints=[-1]), op.Gather(op.Shape(weight), second + 1), axis=0))
 

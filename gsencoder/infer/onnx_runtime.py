@@ -111,14 +111,7 @@ class OnnxEncoder:
     def _run(self, part: Gaussians, whole: Curves | None, voxel: float) -> Float32[np.ndarray, "n channels"]:
         scaled = np.floor(part.means.astype(np.float64) / voxel)
         check_extent(float((scaled.max(axis=0) - scaled.min(axis=0)).max()) + 1, voxel)
-        feed: dict[str, Any] = {
-            "means": part.means,
-            "quats": part.quats,
-            "scales": part.scales,
-            "opacities": part.opacities,
-            "sh_dc": np.ascontiguousarray(part.sh[:, 0]),
-            "voxel": np.array(voxel, np.float64),
-        }
+        feed = inputs_of(part) | {"voxel": np.array(voxel, np.float64)}
         if whole is not None:
             feed |= {"corner": whole.corner, "starts": rows_of(whole)}
         try:
@@ -128,6 +121,12 @@ class OnnxEncoder:
         if found.shape != (len(part), self.header.outputs.channels):
             raise InputError(f"{self.name}: expected {self.header.outputs.channels} channels, got {found.shape}")
         return np.asarray(found, np.float32)
+
+
+def inputs_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """What the graph takes of a cloud."""
+    values = (getattr(gaussians, name) for name in FIELDS[:-1])
+    return dict(zip(FIELDS, (*values, np.ascontiguousarray(gaussians.sh[:, 0])), strict=True))
 
 
 def rows_of(curves: Curves) -> Int64[np.ndarray, "rows P"]:

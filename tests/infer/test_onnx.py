@@ -20,13 +20,13 @@ from gsencoder import cli
 from gsencoder.data.splats import save_splat
 from gsencoder.data.text_table import make_text_table, save_text_table
 from gsencoder.errors import InputError
-from gsencoder.infer import export_onnx as exporting
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.encoders import Encoder, load_encoder
 from gsencoder.infer.export_onnx import TOLERANCE, check_parity, export_onnx, random_cloud
 from gsencoder.infer.onnx_header import KEY, OnnxHeader, from_metadata, to_metadata
-from gsencoder.infer.onnx_runtime import OnnxEncoder
+from gsencoder.infer.onnx_operators import search
+from gsencoder.infer.onnx_runtime import OnnxEncoder, inputs_of
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.point_transformer import TransformerConfig
@@ -136,7 +136,7 @@ def test_the_graph_alone_takes_five_arrays_of_a_splat_in_metres(
     session = onnxruntime.InferenceSession(folder / "encoder.onnx")
     names = [each.name for each in session.get_inputs()]
     assert names == ["means", "quats", "scales", "opacities", "sh_dc"]
-    (features,) = session.run(None, dict(zip(names, exporting._raw(cloud), strict=True)))
+    (features,) = session.run(None, inputs_of(cloud))
     np.testing.assert_array_equal(features, both[1].encode(cloud, ALONE).features)
     model = onnx.load(folder / "encoder.onnx")
     assert {each.domain for each in model.opset_import} == {""}
@@ -248,6 +248,16 @@ def test_no_cloud_holds_values_that_an_encoder_could_not_take(field: str) -> Non
             replace(cloud, **{field: values})
     with pytest.raises(InputError, match=rf"Gaussians.{field}: expected float32"):
         replace(cloud, **{field: getattr(cloud, field).astype(np.float64)})
+
+
+@pytest.mark.usefixtures("no_jaxtyping")
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 9, 1023, 1024, 1025, 2**16 - 1, 2**16, 2**16 + 1])
+def test_the_search_counts_what_is_below(count: int) -> None:
+    keys = np.sort(np.random.default_rng(count).integers(0, 2**62, count))
+    wanted = np.unique(np.concatenate((keys[:50], keys[-50:] + 1, keys[:50] - 1, [0, 2**62])))
+    for more, side in ((0, "left"), (1, "right")):
+        found = search(keys, wanted, np.array(more))
+        np.testing.assert_array_equal(np.asarray(found), np.searchsorted(keys, wanted, side))
 
 
 def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[TorchEncoder, OnnxEncoder]) -> None:
