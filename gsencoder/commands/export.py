@@ -11,7 +11,7 @@ from gsencoder.data.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.errors import InputError
 from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.export_onnx import check_parity, export_onnx, random_cloud
+from gsencoder.infer.export_onnx import TOLERANCE, check_parity, export_onnx, random_cloud
 from gsencoder.infer.onnx_runtime import SUFFIX
 from gsencoder.outputs import refuse_existing, write_json
 from gsencoder.progress import Progress, console
@@ -43,7 +43,7 @@ class ExportConfig(CommonConfig):
         default=(1, 2, 31, 1000, 20000), metadata={"help": "Gaussians of the random clouds to compare on"}
     )
     tolerance: float = field(
-        default=1e-4, metadata={"help": "largest difference from torch, as a share of the largest output"}
+        default=TOLERANCE, metadata={"help": "largest difference from torch, as a share of the largest output"}
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of scenes; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)

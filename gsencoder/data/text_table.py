@@ -132,13 +132,13 @@ def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) 
     table = np.ascontiguousarray(embeddings, dtype=np.float32)
     if table.ndim != 2 or 0 in table.shape:
         raise InputError(f"text table of {encoder}: expected embeddings [names, channels], got shape {table.shape}")
-    table = _unrounded(table)
+    table = unrounded(table)
     space = FeatureSpace(name=encoder, channels=table.shape[1], text_encoder=encoder)
     mean = table.mean(axis=0, dtype=np.float64).astype(np.float32)
     return TextTable(names=tuple(names), embeddings=table, space=space, mean=mean)
 
 
-def _unrounded(table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C D"]:
+def unrounded(table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C D"]:
     """Unit vectors from rounded ones; rows far from unit length stay as they are, for TextTable to complain about."""
     norms = np.linalg.norm(table, axis=1, keepdims=True)
     rounded = np.abs(norms - 1) <= UNIT_TOLERANCE
@@ -210,7 +210,7 @@ def _read_safetensors(file: Path) -> TextTable:
             f"{file}: expected embeddings [C, D] of float32 or float16, a float32 mean [D], names and a space of text"
         )
     if arrays["embeddings"].dtype == np.float16:
-        arrays["embeddings"] = _unrounded(arrays["embeddings"].astype(np.float32))
+        arrays["embeddings"] = unrounded(arrays["embeddings"].astype(np.float32))
     try:
         return TextTable(names=tuple(names), space=space, **arrays)
     except InputError as error:

@@ -9,14 +9,14 @@ import binascii
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, get_args
 
 import numpy as np
 
-from gsencoder.data.text_table import TextTable
+from gsencoder.data.text_table import TextTable, unrounded
 from gsencoder.errors import InputError
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpace, write_outputs
 from gsencoder.models.serialize import ALIGN, Order
 from gsencoder.types import FeatureBasis, FeatureSpace
 
@@ -67,25 +67,20 @@ class OnnxHeader:
 
 def to_metadata(header: OnnxHeader) -> dict[str, str]:
     """The entries of text that hold a header."""
-    outputs, words = header.outputs, header.words
-    arrays = {"mean": outputs.mean}
-    values: dict[str, Any] = {
+    words = header.words
+    arrays, values = write_outputs(header.outputs)
+    values |= {
         "version": VERSION,
         "voxel": header.voxel,
         "levels": header.levels,
         "orders": list(header.orders),
         "patch": header.patch,
         "precision": header.precision,
-        "space": _fields(outputs.space),
-        "scale": outputs.scale,
         "made_by": dict(header.made_by),
     }
-    if outputs.basis is not None:
-        arrays["components"] = outputs.basis.components
-        values["energy_kept"] = outputs.basis.energy_kept
     if words is not None:
         arrays |= {"words": words.embeddings.astype(np.float16), "words_mean": words.mean}
-        values["words"] = {"names": list(words.names), "space": _fields(words.space)}
+        values["words"] = {"names": list(words.names), "space": asdict(words.space)}
     values["arrays"] = {name: {"dtype": value.dtype.name, "shape": value.shape} for name, value in arrays.items()}
     entries = {KEY: json.dumps(values, ensure_ascii=False)}
     for name, value in arrays.items():
@@ -124,10 +119,9 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
             )
         words = None
         if "words" in values:
-            rows = arrays["words"].astype(np.float32)
             words = TextTable(
                 names=tuple(values["words"]["names"]),
-                embeddings=rows / np.linalg.norm(rows, axis=1, keepdims=True),
+                embeddings=unrounded(arrays["words"].astype(np.float32)),
                 space=FeatureSpace(**values["words"]["space"]),
                 mean=arrays["words_mean"],
             )
@@ -145,10 +139,6 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
         if isinstance(error, InputError):
             raise
         raise InputError(f"its entries are damaged ({type(error).__name__}: {str(error)[:80]})") from error
-
-
-def _fields(space: FeatureSpace) -> dict[str, Any]:
-    return {name: getattr(space, name) for name in space.__dataclass_fields__}
 
 
 def _array(entries: Mapping[str, str], name: str, *, dtype: str, shape: list[int]) -> np.ndarray:

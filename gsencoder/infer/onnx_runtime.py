@@ -13,7 +13,7 @@ from gsencoder.infer.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.infer.onnx_header import FIELDS, OUTPUT, SETTINGS, OnnxHeader, from_metadata
 from gsencoder.models.choices import Device
 from gsencoder.models.curves import Curves, curves_of
-from gsencoder.models.serialize import check_extent
+from gsencoder.models.serialize import NEVER, check_extent
 from gsencoder.tracking import Track, untracked
 from gsencoder.types import GaussianFeatures, Gaussians
 
@@ -130,9 +130,9 @@ def inputs_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def rows_of(curves: Curves) -> Int64[np.ndarray, "rows P"]:
-    """The starts of all levels and orders in one array, as the graph takes them, filled up with a code of no cell."""
+    """The starts of all levels and orders in one array, as the graph takes them, filled up with `NEVER`."""
     rows = [row for starts in curves.starts for row in starts]
-    table = np.full((len(rows), max(map(len, rows))), np.iinfo(np.int64).max)
+    table = np.full((len(rows), max(map(len, rows))), NEVER, np.int64)
     for place, row in zip(table, rows, strict=True):
         place[: len(row)] = row
     return table

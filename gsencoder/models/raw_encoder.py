@@ -16,10 +16,7 @@ from gsencoder.models.neighbors import AHEAD
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.plan import Level, Plan
 from gsencoder.models.point_transformer import TransformerConfig
-from gsencoder.models.serialize import ALIGN, MOST_LEVELS, Order, encode_morton, morton_codes
-
-NEVER = torch.iinfo(torch.int64).max
-"""A code that no cell has."""
+from gsencoder.models.serialize import ALIGN, MOST_LEVELS, NEVER, Order, encode_morton, morton_codes
 
 
 class Tokens(NamedTuple):

@@ -30,6 +30,10 @@ ALIGN = 64
 through six levels."""
 
 
+NEVER = 2**63 - 1
+"""A code that no cell has."""
+
+
 def check_extent(extent: float, voxel: float) -> None:
     """Refuses points that spread over more cells than a code can number.
 
