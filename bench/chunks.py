@@ -16,8 +16,8 @@ from per_scene import labelled, quality
 from gsencoder.data.model_files import find_file
 from gsencoder.data.text_table import load_text_table
 from gsencoder.evaluate.boxes import accuracy
-from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.naming import naming_scores
+from gsencoder.fusion.field_error import field_error
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.chunks import EncodeConfig, cut
 from gsencoder.infer.encode import encode

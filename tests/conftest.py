@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +39,16 @@ def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+
+
+@pytest.fixture(scope="session")
+def open3d() -> Any:
+    """The package; the test is skipped where the system lacks a library that it needs."""
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        pytest.skip(f"open3d does not import here: {error}")
+    return open3d
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ import pytest
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeds import with_gaussians
 from gsencoder.data.text_table import load_text_table
-from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.naming import evaluate_naming, naming_scores
 from gsencoder.evaluate.sources import encoded, opened
+from gsencoder.fusion.field_error import field_error
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder

@@ -17,7 +17,7 @@ from gsencoder import cli
 from gsencoder.data.synthetic import make_room
 from gsencoder.data.synthetic_write import write_room
 from gsencoder.data.text_table import load_text_table, make_text_table, save_text_table
-from gsencoder.evaluate.cosine import field_error
+from gsencoder.fusion.field_error import field_error
 from gsencoder.fusion.store import load_features
 from gsencoder.models.weights import load_weights
 

@@ -11,12 +11,21 @@ from gsencoder.data.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.errors import InputError
 from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.export_onnx import TOLERANCE, check_parity, export_onnx, random_cloud
+from gsencoder.infer.export_onnx import (
+    COSINE,
+    TOLERANCE,
+    Cloud,
+    check_cosines,
+    check_parity,
+    export_onnx,
+    lower,
+    random_cloud,
+)
 from gsencoder.infer.onnx_runtime import SUFFIX
+from gsencoder.models.choices import Stored
 from gsencoder.outputs import refuse_existing, write_json
 from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary
-from gsencoder.types import Gaussians
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +34,10 @@ class ExportConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "splats or scenes to compare on, beside random clouds; may be left out", "metavar": "SPLAT"},
+        metadata={
+            "help": "splats or scenes to compare on, beside random clouds, and to calibrate int8_static on",
+            "metavar": "SPLAT",
+        },
     )
     weights: str = field(
         default="house_cpu",
@@ -39,11 +51,26 @@ class ExportConfig(CommonConfig):
             "required": True,
         },
     )
+    precision: Stored = field(
+        default="float32",
+        metadata={
+            "help": "what the graph computes in; int8_weights = stored in 8 bits, computed in float32; int8_dynamic, "
+            "int8_static = products of 8-bit integers, their ranges found for each cloud, or once from SPLATs"
+        },
+    )
     sizes: tuple[int, ...] = field(
         default=(1, 2, 31, 1000, 20000), metadata={"help": "Gaussians of the random clouds to compare on"}
     )
     tolerance: float = field(
-        default=TOLERANCE, metadata={"help": "largest difference from torch, as a share of the largest output"}
+        default=TOLERANCE,
+        metadata={"help": "largest difference of the float32 graph from torch, as a share of the largest output"},
+    )
+    cosine: float = field(
+        default=COSINE,
+        metadata={
+            "help": "smallest mean centred cosine of another precision's features to float32's, on each SPLAT, or on "
+            "each random cloud where there is none"
+        },
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of scenes; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -54,6 +81,10 @@ class ExportConfig(CommonConfig):
             raise InputError(f"sizes: expected one or more numbers from 1, got {list(self.sizes)}")
         if not 0 < self.tolerance < 1:
             raise InputError(f"tolerance: expected a share between 0 and 1, got {self.tolerance}")
+        if not -1 <= self.cosine <= 1:
+            raise InputError(f"cosine: expected -1 to 1, got {self.cosine}")
+        if self.precision == "int8_static" and not self.paths:
+            raise InputError("precision=int8_static: give splats or scenes to calibrate on, of the kind that it is for")
 
 
 def run(config: ExportConfig, summary: Summary) -> None:
@@ -62,23 +93,43 @@ def run(config: ExportConfig, summary: Summary) -> None:
     if config.out.suffix.lower() != SUFFIX:
         raise InputError(f"out: expected a file that ends in {SUFFIX}, got {config.out.name}")
     refuse_existing(config.out, config.overwrite)
+    track = Progress(quiet=config.quiet)
     with summary.step("load"):
         encoder = TorchEncoder(config.weights)
-        clouds = [(f"{size} random Gaussians", random_cloud(size, encoder.voxel), 1.0) for size in config.sizes]
-        clouds += _real(config, encoder.voxel)
+        clouds = [Cloud(f"{size} random Gaussians", random_cloud(size, encoder.voxel)) for size in config.sizes]
+        scenes = _scenes(config, encoder.voxel)
     screen = console(config.quiet)
     screen.print("translating the graph, which takes about a minute")
     with summary.step("export"):
-        model = export_onnx(encoder)
+        lowered = lower(encoder)
+        exact = model = export_onnx(encoder, lowered)
     with summary.step("compare"):
-        parity = check_parity(model, encoder, clouds, tolerance=config.tolerance, track=Progress(quiet=config.quiet))
+        parity = check_parity(exact, encoder, [*clouds, *scenes], tolerance=config.tolerance, track=track)
+    told = f"within {max(parity.values()):.1g} of torch's largest output"
+    cosines: dict[str, float] = {}
+    if config.precision != "float32":
+        with summary.step("convert"):
+            if config.precision == "float16":
+                lowered = lower(encoder, half=True)
+            model = export_onnx(encoder, lowered, config.precision, scenes=scenes, track=track)
+        with summary.step("judge"):
+            cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=track)
+        told = (
+            f"{config.precision}, {len(model) / len(exact):.2f} of float32's size, mean centred cosine to it "
+            f"{min(cosines.values()):.4f} or more"
+        )
     with summary.step("write"), atomic_file(config.out) as stream:
         stream.write(model)
+    sizes = {cloud.name: len(cloud.gaussians) for cloud in (*clouds, *scenes)}
+    compared = [sizes[name] for name in cosines or parity]
     summary.results.update(
         onnx=str(config.out),
+        precision=config.precision,
         bytes=len(model),
+        bytes_float32=len(exact),
         parity=parity,
-        gaussians={name: len(cloud) for name, cloud, _ in clouds},
+        cosines=cosines,
+        gaussians=sizes,
         channels=encoder.outputs.space.channels,
         rank=encoder.outputs.channels,
         words=0 if encoder.words is None else len(encoder.words),
@@ -86,16 +137,12 @@ def run(config: ExportConfig, summary: Summary) -> None:
     )
     write_json(f"{config.out}.summary.json", summary.to_dict())
     screen.print(
-        f"{config.out}: {len(model) / 1e6:.1f} MB; within {max(parity.values()):.1g} of torch's largest output on "
-        f"{len(parity)} clouds of {min(map(_size, clouds)):,} to {max(map(_size, clouds)):,} Gaussians"
+        f"{config.out}: {len(model) / 1e6:.1f} MB; {told} on {len(compared)} clouds of {min(compared):,} to "
+        f"{max(compared):,} Gaussians"
     )
 
 
-def _size(cloud: tuple[str, Gaussians, float]) -> int:
-    return len(cloud[1])
-
-
-def _real(config: ExportConfig, voxel: float) -> list[tuple[str, Gaussians, float]]:
+def _scenes(config: ExportConfig, voxel: float) -> list[Cloud]:
     """The user's own clouds."""
     clouds = []
     for path in find_scenes(config.paths) if config.paths else ():
@@ -103,5 +150,5 @@ def _real(config: ExportConfig, voxel: float) -> list[tuple[str, Gaussians, floa
         if scene.gaussians is None:
             scene = with_gaussians(scene, config.seeds)
         assert scene.gaussians is not None
-        clouds.append((scene.name, scene.gaussians, unit_of(scene, voxel)))
+        clouds.append(Cloud(scene.name, scene.gaussians, unit_of(scene, voxel)))
     return clouds

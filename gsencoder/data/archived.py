@@ -1,4 +1,4 @@
-"""How cameras, feature spaces and bases lie in an archive: written and read here by every file that holds them."""
+"""How cameras, scenes, feature spaces and bases lie in an archive: written and read here for every file."""
 
 from typing import Any
 
@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.data.archive import Archive
+from gsencoder.data.images import PIXEL_LIMIT
 from gsencoder.errors import InputError
-from gsencoder.types import Cameras, FeatureBasis, FeatureSpace
+from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, Gaussians, Scene, Views
 
 
 def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:
@@ -55,3 +56,44 @@ def read_space(file: Archive) -> tuple[FeatureSpace, Float32[np.ndarray, " D"], 
         return space, mean, None
     components, kept = file.array("components", "float32", ("R", "D")), file.value("energy_kept", float, int)
     return space, mean, FeatureBasis(mean=mean, components=components, energy_kept=kept, space=space)
+
+
+def scene_parts(scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the header values that hold what a scene is beside its Gaussians and features."""
+    arrays: dict[str, np.ndarray] = {"origin": scene.origin}
+    header: dict[str, Any] = {"name": scene.name, "metres_per_unit": scene.metres_per_unit}
+    header["up"] = None if scene.up is None else scene.up.tolist()
+    if scene.views is not None:
+        arrays |= camera_arrays(scene.views.cameras)
+        header["views"] = list(scene.views.names)
+    return arrays, header
+
+
+def read_scene(file: Archive, gaussians: Gaussians) -> Scene:
+    """The scene that a file holds, of Gaussians that may lie elsewhere.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    up = file.value("up", list, None)
+    if up is not None and not (len(up) == 3 and all(type(part) in (int, float) for part in up)):
+        raise InputError(f"expected three numbers for up in the header, got {str(up)[:60]}")
+    return Scene(
+        name=file.value("name", str),
+        gaussians=gaussians,
+        views=_read_views(file) if "views" in file else None,
+        origin=file.array("origin", "float64", (3,)),
+        metres_per_unit=file.value("metres_per_unit", float, int, None),
+        up=None if up is None else np.array(up, np.float64),
+    )
+
+
+def _read_views(file: Archive) -> Views:
+    names = file.value("views", list)
+    if not all(isinstance(name, str) for name in names):
+        raise InputError("expected the names of views to be text")
+    cameras = read_cameras(file)
+    pixels = cameras.widths.astype(np.int64) * cameras.heights
+    if len(pixels) and pixels.max() > PIXEL_LIMIT:
+        raise InputError(f"expected views of at most {PIXEL_LIMIT:,} pixels, got one of {pixels.max():,}")
+    return Views(cameras=cameras, names=tuple(names))

@@ -5,12 +5,14 @@ Reference: Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rend
 
 import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from jaxtyping import Float32
 
 from gsencoder.data.splat_raw import SH_COEFFICIENTS, RawSplat
 from gsencoder.errors import InputError, SceneWarning
@@ -202,10 +204,13 @@ def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElem
     return table.view(np.dtype([(name, np.float64) for name in names])).reshape(-1)
 
 
-def write_inria(stream: BinaryIO, raw: RawSplat, *, double_means: bool) -> None:
+def write_inria(
+    stream: BinaryIO, raw: RawSplat, *, double_means: bool, further: Mapping[str, Float32[np.ndarray, " N"]]
+) -> None:
     """Writes binary little-endian rows x y z nx ny nz f_dc f_rest opacity scale rot; normals are 0.
 
-    `double_means` writes x y z as doubles, for scenes far from zero; everything else is float.
+    `double_means` writes x y z as doubles, for scenes far from zero; everything else is float. `further` properties
+    follow.
     """
     rest = raw.sh.shape[1] - 1
     position = "f8" if double_means else "f4"
@@ -219,7 +224,7 @@ def write_inria(stream: BinaryIO, raw: RawSplat, *, double_means: bool) -> None:
         *(f"f_dc_{i}" for i in range(3)),
         *(f"f_rest_{i}" for i in range(3 * rest)),
     ]
-    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), *further]
     dtype = np.dtype([(name, "<" + (position if name in "xyz" else "f4")) for name in names])
     words = {"<f8": "double", "<f4": "float"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(raw)}"]
@@ -238,4 +243,6 @@ def write_inria(stream: BinaryIO, raw: RawSplat, *, double_means: bool) -> None:
         for axis in range(4):
             block[f"rot_{axis}"] = raw.quats[part, axis]
         block["opacity"] = raw.logit_opacities[part]
+        for name, values in further.items():
+            block[name] = values[part]
         stream.write(block.tobytes())

@@ -13,10 +13,11 @@ import hashlib
 import os
 import stat
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from gsencoder.data.atomic import atomic_file
 from gsencoder.data.splat_compressed import is_compressed, morton_order, packed_bytes, read_compressed
@@ -169,6 +170,7 @@ def save_splat(
     origin: Float64[np.ndarray, "3"] | None = None,
     spz_version: int = 4,
     keep_order: bool = False,
+    further: Mapping[str, Float32[np.ndarray, " N"]] | None = None,
 ) -> None:
     """Writes a splat; the suffix chooses the format, and the file appears whole or not at all.
 
@@ -180,6 +182,7 @@ def save_splat(
         spz_version: 4 (zstd), or 3 (gzip) for older readers.
         keep_order: a .compressed.ply is otherwise written along a Z-order curve, which is what makes its chunks
             precise, so row i of the file is not row i of `gaussians`. The other formats always keep the order.
+        further: properties of a .ply beside those that it must have, one value a Gaussian, by name.
 
     Precision of a round trip:
         .ply: means exact, quaternions 1e-6, scales 1e-5 relative, opacities 1e-6 (0 and 1 become logits of ±20).
@@ -202,6 +205,11 @@ def save_splat(
         raise InputError(f"spz_version={spz_version}: expected 3 or 4")
     if len(gaussians) == 0:
         raise InputError(f"{path}: there are no Gaussians to write")
+    columns = further or {}
+    if columns and name.endswith((".spz", ".compressed.ply")):
+        raise InputError(f"{path}: only a plain .ply holds further properties ({', '.join(columns)[:60]})")
+    if any(len(values) != len(gaussians) for values in columns.values()):
+        raise InputError(f"{path}: expected further properties of {len(gaussians)} values, one a Gaussian")
     shift = _checked_origin(origin)
     raw = RawSplat(
         means=gaussians.means + shift,
@@ -219,7 +227,7 @@ def save_splat(
             ordered = raw if keep_order else raw.select(morton_order(raw.means))
             stream.write(packed_bytes(ordered))
         else:
-            write_inria(stream, raw, double_means=bool(shift.any()))
+            write_inria(stream, raw, double_means=bool(shift.any()), further=columns)
 
 
 def _check_packable(path: Path, raw: RawSplat) -> None:

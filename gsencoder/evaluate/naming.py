@@ -15,8 +15,8 @@ from jaxtyping import Float32, Int64
 from gsencoder.data.seeds import SeedConfig
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError
-from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.sources import Source, with_features
+from gsencoder.fusion.field_error import field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher

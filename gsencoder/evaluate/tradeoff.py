@@ -19,9 +19,9 @@ from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError
 from gsencoder.evaluate.boxes import Hit, accuracy
-from gsencoder.evaluate.cosine import FieldError, field_error
 from gsencoder.evaluate.localization import LocalizationProtocol, ask
 from gsencoder.evaluate.memory import memory_growth
+from gsencoder.fusion.field_error import FieldError, field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of

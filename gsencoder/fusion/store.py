@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from gsencoder.data.archive import Archive, open_archive, write_archive
-from gsencoder.data.archived import camera_arrays, read_cameras, read_space, space_parts
-from gsencoder.data.images import PIXEL_LIMIT
+from gsencoder.data.archived import read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
-from gsencoder.types import GaussianFeatures, Gaussians, Scene, Views
+from gsencoder.fusion.packages import PACKAGE_FILE, load_package
+from gsencoder.types import GaussianFeatures, Gaussians, Scene
 
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 BLOCK = 16_384
@@ -36,14 +36,9 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
     gaussians = scene.gaussians
     if gaussians is None or len(gaussians) != len(features):
         raise InputError(f"save_features: {len(features)} features need as many Gaussians in scene {scene.name}")
-    arrays = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
-    arrays["origin"] = scene.origin
-    header: dict[str, Any] = {"name": scene.name, "metres_per_unit": scene.metres_per_unit}
-    header["up"] = None if scene.up is None else scene.up.tolist()
-    if scene.views is not None:
-        arrays |= camera_arrays(scene.views.cameras)
-        header["views"] = list(scene.views.names)
-    write_archive(folder / SCENE_FILE, arrays, header)
+    around, header = scene_parts(scene)
+    own = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+    write_archive(folder / SCENE_FILE, own | around, header)
     rows = np.flatnonzero(features.weights > 0)
     # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
     blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
@@ -70,13 +65,15 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
 
 
 def load_features(folder: Path) -> Scene:
-    """The scene and its features from a folder that `save_features` wrote.
+    """The scene and its features from a folder that `save_features` or `packages.save_package` wrote.
 
     Raises:
         InputError: not such a folder, damaged, of another version, or features of another splat.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of features made by `gsencoder fuse` or `encode`")
+        raise InputError(f"{folder}: expected a folder of features made by `gsencoder fuse`, `encode` or `pack`")
+    if (folder / PACKAGE_FILE).is_file():
+        return load_package(folder)
     with _open(folder, SCENE_FILE) as file:
         gaussians = Gaussians(
             means=file.array("means", "float32", ("N", 3)),
@@ -85,17 +82,7 @@ def load_features(folder: Path) -> Scene:
             opacities=file.array("opacities", "float32", ("N",)),
             sh=file.array("sh", "float32", ("N", "K", 3)),
         )
-        up = file.value("up", list, None)
-        if up is not None and not (len(up) == 3 and all(type(part) in (int, float) for part in up)):
-            raise InputError(f"expected three numbers for up in the header, got {str(up)[:60]}")
-        scene = Scene(
-            name=file.value("name", str),
-            gaussians=gaussians,
-            views=_load_views(file) if "views" in file else None,
-            origin=file.array("origin", "float64", (3,)),
-            metres_per_unit=file.value("metres_per_unit", float, int, None),
-            up=None if up is None else np.array(up, np.float64),
-        )
+        scene = read_scene(file, gaussians)
     features = _load_rows(folder, gaussians)
     return replace(scene, features={features.space.name: features})
 
@@ -115,17 +102,6 @@ def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
     if not (folder / name).is_file():
         raise InputError(f"{folder}: {name} is missing; this is no folder of gsencoder features")
     return open_archive(folder / name)
-
-
-def _load_views(file: Archive) -> Views:
-    names = file.value("views", list)
-    if not all(isinstance(name, str) for name in names):
-        raise InputError("expected the names of views to be text")
-    cameras = read_cameras(file)
-    pixels = cameras.widths.astype(np.int64) * cameras.heights
-    if len(pixels) and pixels.max() > PIXEL_LIMIT:
-        raise InputError(f"expected views of at most {PIXEL_LIMIT:,} pixels, got one of {pixels.max():,}")
-    return Views(cameras=cameras, names=tuple(names))
 
 
 def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:

@@ -4,59 +4,65 @@ import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from gsencoder.errors import InputError
+from gsencoder.fusion.field_error import field_error
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx_header import FIELDS, OUTPUT, SETTINGS, OnnxHeader, to_metadata
 from gsencoder.infer.onnx_runtime import OnnxEncoder, inputs_of
-from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.choices import Stored
 from gsencoder.models.raw_encoder import RawEncoder
 from gsencoder.tracking import Track, untracked
 from gsencoder.types import Gaussians
 
-OPSET = 20
 TOLERANCE = 1e-4
 """Largest difference from torch, as a share of the largest output."""
+COSINE = 0.99
+"""Smallest mean centred cosine of a cheaper precision's features to float32's."""
+
+ON_CPU = EncodeConfig(precision="float32", device="cpu")
 
 
-def export_onnx(encoder: TorchEncoder) -> bytes:
-    """What the file is to hold: the graph, and what a runtime must know of it.
+class Cloud(NamedTuple):
+    """Gaussians to compare on.
+
+    Attributes:
+        name: for messages.
+        gaussians: they.
+        metres_per_unit: of their world.
+    """
+
+    name: str
+    gaussians: Gaussians
+    metres_per_unit: float = 1.0
+
+
+def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
+    """The encoder as an ONNX graph whose convolutions are still operators of ours; see `onnx_operators`.
+
+    Args:
+        encoder: to be exported.
+        half: compute in float16 once Gaussians have been merged into tokens.
 
     Raises:
         InputError: onnx or onnxscript is missing.
     """
     try:
-        import onnx
+        import onnx  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise InputError(f"export needs the package {error.name}: pip install 'gsencoder[export]'") from error
-    shape = encoder.network.config.transformer
-    header = OnnxHeader(
-        voxel=encoder.voxel,
-        levels=shape.levels,
-        orders=shape.orders,
-        patch=shape.patch,
-        outputs=encoder.outputs,
-        words=encoder.words,
-        made_by=encoder.made_by,
-    )
-    model = _graph(encoder.network, header)
-    for name, value in _settings(header).items():
-        model.graph.initializer.append(onnx.numpy_helper.from_array(value, name))
-    for key, text in to_metadata(header).items():
-        model.metadata_props.add(key=key, value=text)
-    done: bytes = model.SerializeToString()
-    return done
+    from gsencoder.infer.onnx_operators import OPSET, TRANSLATIONS
 
-
-def _graph(encoder: GaussianEncoder, header: OnnxHeader) -> Any:
-    from gsencoder.infer.onnx_operators import TRANSLATIONS
-
+    header = header_of(encoder)
+    network = deepcopy(encoder.network).half() if half else encoder.network
     cloud = random_cloud(300, header.voxel)
     clouds, patches = torch.export.Dim("gaussians"), torch.export.Dim("patches")
     example = [torch.from_numpy(value) for value in inputs_of(cloud).values()]
@@ -64,7 +70,7 @@ def _graph(encoder: GaussianEncoder, header: OnnxHeader) -> Any:
     sizes = (*({0: clouds} for _ in FIELDS), {}, {}, {1: patches})
     with torch.no_grad(), _quiet():
         program = torch.export.export(
-            RawEncoder(encoder, header.outputs).eval(),
+            RawEncoder(network, header.outputs).eval(),
             (*example, voxel, corner, starts.repeat(1, 5)),
             dynamic_shapes=sizes,
         )
@@ -79,6 +85,62 @@ def _graph(encoder: GaussianEncoder, header: OnnxHeader) -> Any:
         )
     assert exported is not None
     return exported.model_proto
+
+
+def export_onnx(
+    encoder: TorchEncoder,
+    lowered: Any,
+    precision: Stored = "float32",
+    *,
+    scenes: Sequence[Cloud] = (),
+    track: Track = untracked,
+) -> bytes:
+    """What the file is to hold: the graph, and what a runtime must know of it.
+
+    Args:
+        encoder: to be exported.
+        lowered: what `lower` made of it, in half precision for float16.
+        precision: what the graph is to compute in.
+        scenes: for int8_static: what its ranges are taken from.
+        track: wraps the loop over them to show progress.
+
+    Raises:
+        InputError: int8_static without scenes.
+    """
+    import onnx
+
+    from gsencoder.infer.onnx_operators import in_standard_operators
+    from gsencoder.infer.onnx_precision import calibrate, products_in_int8, weights_in_int8
+
+    header = header_of(encoder, precision)
+    if precision == "int8_weights":
+        lowered = weights_in_int8(lowered)
+    elif precision == "int8_dynamic":
+        lowered = products_in_int8(lowered)
+    elif precision == "int8_static":
+        lowered = products_in_int8(lowered, calibrate(lowered, _settings(header), scenes, track=track))
+    model = in_standard_operators(lowered)
+    for name, value in _settings(header).items():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(value, name))
+    for key, text in to_metadata(header).items():
+        model.metadata_props.add(key=key, value=text)
+    done: bytes = model.SerializeToString()
+    return done
+
+
+def header_of(encoder: TorchEncoder, precision: Stored = "float32") -> OnnxHeader:
+    """What a runtime must know of an encoder that was exported."""
+    shape = encoder.network.config.transformer
+    return OnnxHeader(
+        voxel=encoder.voxel,
+        levels=shape.levels,
+        orders=shape.orders,
+        patch=shape.patch,
+        outputs=encoder.outputs,
+        words=encoder.words,
+        precision=precision,
+        made_by=encoder.made_by,
+    )
 
 
 def _settings(header: OnnxHeader) -> dict[str, np.ndarray]:
@@ -127,7 +189,7 @@ def random_cloud(count: int, voxel: float, seed: int = 0) -> Gaussians:
 def check_parity(
     model: bytes,
     encoder: TorchEncoder,
-    clouds: Sequence[tuple[str, Gaussians, float]],
+    clouds: Sequence[Cloud],
     *,
     tolerance: float = TOLERANCE,
     track: Track = untracked,
@@ -135,9 +197,9 @@ def check_parity(
     """Runs an exported model, and the encoder that it was made from, on the same clouds.
 
     Args:
-        model: what `export_onnx` gave.
+        model: what `export_onnx` gave, in float32.
         encoder: see there.
-        clouds: to try, each with its name and its metres per unit.
+        clouds: to try.
         tolerance: see `TOLERANCE`.
         track: wraps the loop over clouds to show progress.
 
@@ -150,9 +212,8 @@ def check_parity(
     runtime = OnnxEncoder(model, device="cpu")
     errors: dict[str, float] = {}
     for name, cloud, unit in track(clouds, "comparing"):
-        config = EncodeConfig(precision="float32", device="cpu")
-        theirs = encoder.encode(cloud, config, metres_per_unit=unit).features
-        ours = runtime.encode(cloud, config, metres_per_unit=unit).features
+        theirs = encoder.encode(cloud, ON_CPU, metres_per_unit=unit).features
+        ours = runtime.encode(cloud, ON_CPU, metres_per_unit=unit).features
         errors[name] = float(np.abs(ours - theirs).max() / max(float(np.abs(theirs).max()), 1e-30))
         if not errors[name] <= tolerance:
             raise InputError(
@@ -160,3 +221,36 @@ def check_parity(
                 f"than {tolerance:.2g}; no file was written"
             )
     return errors
+
+
+def check_cosines(
+    model: bytes, exact: bytes, clouds: Sequence[Cloud], *, cosine: float = COSINE, track: Track = untracked
+) -> dict[str, float]:
+    """Runs a model of a cheaper precision, and the same in float32, on the same clouds.
+
+    Args:
+        model: what `export_onnx` gave.
+        exact: what it gave in float32.
+        clouds: to try.
+        cosine: see `COSINE`.
+        track: wraps the loop over clouds to show progress.
+
+    Returns:
+        The mean centred cosine of the two's features on each cloud.
+
+    Raises:
+        InputError: they are further apart.
+    """
+    cheap, full = OnnxEncoder(model, device="cpu"), OnnxEncoder(exact, device="cpu")
+    found: dict[str, float] = {}
+    for name, cloud, unit in track(clouds, "comparing"):
+        ours, theirs = (
+            each.encode(cloud, replace(ON_CPU, precision="auto"), metres_per_unit=unit) for each in (cheap, full)
+        )
+        found[name] = 1 - field_error(ours, theirs).centred
+        if not found[name] >= cosine:
+            raise InputError(
+                f"export: on {name} {cheap.header.precision} gives features whose mean centred cosine to float32's is "
+                f"{found[name]:.4f}, below cosine={cosine}; no file was written. Take another precision"
+            )
+    return found

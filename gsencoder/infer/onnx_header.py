@@ -1,13 +1,14 @@
 """What an exported encoder says of itself: entries of text beside the graph, which any program can read.
 
 `gsencoder` is JSON: the format's version, the grid, the curves, the feature space, and for each array its type and
-shape. `gsencoder.NAME` is the array NAME, little-endian, in base64.
+shape. `gsencoder.NAME` is the array NAME: little-endian, deflated, in base64.
 """
 
 import base64
 import binascii
 import json
 import math
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, get_args
@@ -16,12 +17,14 @@ import numpy as np
 
 from gsencoder.data.text_table import TextTable, unrounded
 from gsencoder.errors import InputError
+from gsencoder.models.choices import Stored
 from gsencoder.models.output_space import OutputSpace, write_outputs
 from gsencoder.models.serialize import ALIGN, Order
+from gsencoder.rounding import round_columns
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 KEY = "gsencoder"
-VERSION = 1
+VERSION = 2
 FIELDS = ("means", "quats", "scales", "opacities", "sh_dc")
 """Inputs of the graph that every cloud has."""
 SETTINGS = ("voxel", "corner", "starts")
@@ -50,7 +53,7 @@ class OnnxHeader:
     patch: int
     outputs: OutputSpace
     words: TextTable | None = None
-    precision: str = "float32"
+    precision: Stored = "float32"
     made_by: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -60,6 +63,10 @@ class OnnxHeader:
             raise InputError(
                 f"expected a positive voxel, 1 to {ALIGN.bit_length()} levels and patches of 1 or more, got "
                 f"{self.voxel}, {self.levels}, {self.patch}"
+            )
+        if self.precision not in get_args(Stored):
+            raise InputError(
+                f"expected a precision among {', '.join(get_args(Stored))}, got {str(self.precision)[:40]}"
             )
         if not self.orders or not set(self.orders) <= known:
             raise InputError(f"expected orders among {', '.join(sorted(known))}, got {str(self.orders)[:80]}")
@@ -79,13 +86,17 @@ def to_metadata(header: OnnxHeader) -> dict[str, str]:
         "made_by": dict(header.made_by),
     }
     if words is not None:
-        arrays |= {"words": words.embeddings.astype(np.float16), "words_mean": words.mean}
+        arrays["words_mean"] = words.mean
+        if header.precision.startswith("int8"):
+            arrays["words"], arrays["words_scale"] = round_columns(words.embeddings)
+        else:
+            arrays["words"] = words.embeddings.astype(np.float16)
         values["words"] = {"names": list(words.names), "space": asdict(words.space)}
     values["arrays"] = {name: {"dtype": value.dtype.name, "shape": value.shape} for name, value in arrays.items()}
     entries = {KEY: json.dumps(values, ensure_ascii=False)}
     for name, value in arrays.items():
         little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
-        entries[f"{KEY}.{name}"] = base64.b64encode(little.tobytes()).decode("ascii")
+        entries[f"{KEY}.{name}"] = base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
     return entries
 
 
@@ -121,7 +132,7 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
         if "words" in values:
             words = TextTable(
                 names=tuple(values["words"]["names"]),
-                embeddings=unrounded(arrays["words"].astype(np.float32)),
+                embeddings=unrounded(arrays["words"].astype(np.float32) * arrays.get("words_scale", np.float32(1))),
                 space=FeatureSpace(**values["words"]["space"]),
                 mean=arrays["words_mean"],
             )
@@ -135,16 +146,20 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
             precision=values["precision"],
             made_by=values["made_by"],
         )
-    except (ValueError, KeyError, TypeError, AttributeError, binascii.Error) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, binascii.Error, zlib.error) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"its entries are damaged ({type(error).__name__}: {str(error)[:80]})") from error
 
 
 def _array(entries: Mapping[str, str], name: str, *, dtype: str, shape: list[int]) -> np.ndarray:
-    if dtype not in ("float32", "float16"):
-        raise InputError(f"expected {name} of float32 or float16, got {dtype[:20]!r}")
-    raw = base64.b64decode(entries[f"{KEY}.{name}"], validate=True)
+    if dtype not in ("float32", "float16", "int8"):
+        raise InputError(f"expected {name} of float32, float16 or int8, got {dtype[:20]!r}")
+    wanted = math.prod(shape) * np.dtype(dtype).itemsize
+    unpacking = zlib.decompressobj()
+    raw = unpacking.decompress(base64.b64decode(entries[f"{KEY}.{name}"], validate=True), wanted + 1)
+    if len(raw) != wanted or not unpacking.eof:
+        raise InputError(f"expected {wanted} bytes of {name}, got {'more' if len(raw) > wanted else len(raw)}")
     values = np.frombuffer(raw, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)
     if not np.isfinite(values).all():
         raise InputError(f"{name} holds values that are not finite")

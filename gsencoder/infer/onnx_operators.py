@@ -1,66 +1,171 @@
-"""Operators that the exporter does not know, in others of ONNX."""
+"""Operators that the exporter does not know, in others of ONNX.
+
+Convolutions stay operators of our own (`gsencoder::convolve`) until a graph is finished, so that what changes the
+graph's precision finds them; `in_standard_operators` then writes them out.
+"""
 
 from typing import Any
 
+import onnx
+import onnx_ir.passes.common as passes
 import torch
-from onnxscript import FLOAT, INT32, INT64, graph, script
-from onnxscript import opset18 as op
+from onnxscript import FLOAT, INT8, INT32, INT64, UINT8, graph, ir, script
+from onnxscript import opset18 as traced
+from onnxscript import opset20 as op
+from onnxscript.values import OnnxFunction, Opset
 
 import gsencoder.models.neighbors  # noqa: F401  the operator of the convolution
 
+OPSET = 20
 ROWS_AT_ONCE = 1024
 """Rows that are convolved together."""
 
+OURS = Opset("gsencoder", 1)
 
-@script(default_opset=op)
+
+@script(default_opset=traced)
 def search(keys: INT64, wanted: INT64, more: INT64) -> INT64:
     """How many of the sorted keys are below wanted + more, by halving steps from the first power of two above their
     number (or the second, where the logarithm is near a whole number)."""
-    size = op.Size(keys)
-    halvings = op.Cast(op.Floor(op.Log(op.Cast(size, to=1)) * 1.4426950408889634 + 1e-3), to=7) + 1
-    one = op.Constant(value_int=1)
-    step = op.Cast(op.BitShift(op.Cast(one, to=13), op.Cast(halvings, to=13), direction="LEFT"), to=7)
-    largest = op.Constant(value_int=9223372036854775807)
-    missing = op.Expand(largest, op.Reshape(step - size, op.Constant(value_ints=[1])))
+    size = traced.Size(keys)
+    halvings = traced.Cast(traced.Floor(traced.Log(traced.Cast(size, to=1)) * 1.4426950408889634 + 1e-3), to=7) + 1
+    one = traced.Constant(value_int=1)
+    step = traced.Cast(traced.BitShift(traced.Cast(one, to=13), traced.Cast(halvings, to=13), direction="LEFT"), to=7)
+    largest = traced.Constant(value_int=9223372036854775807)
+    missing = traced.Expand(largest, traced.Reshape(step - size, traced.Constant(value_ints=[1])))
     # Place k holds key k − 1, so that a count is the place of the last key that it counts.
-    placed = op.Concat(op.Expand(largest, op.Constant(value_ints=[1])), keys, missing, axis=0)
+    placed = traced.Concat(traced.Expand(largest, traced.Constant(value_ints=[1])), keys, missing, axis=0)
     target = wanted + more
     found = wanted - wanted
     for _ in range(halvings):
         step = step / 2
         tried = found + step
-        found = op.Where(op.Less(op.Gather(placed, tried, axis=0), target), tried, found)
+        found = traced.Where(traced.Less(traced.Gather(placed, tried, axis=0), target), tried, found)
     return found
 
 
-@script(default_opset=op)
-def convolve(x: FLOAT, neighbors: INT32, weight: FLOAT) -> FLOAT:
-    """As `models.neighbors.NeighborConv`, some rows at a time, so that what they take stays in the cache."""
-    first, second = op.Constant(value_ints=[0]), op.Constant(value_ints=[1])
+@script(OURS, default_opset=op)
+def in_blocks(neighbors: INT32) -> INT32:
+    """Neighbourhoods in blocks of some rows, [blocks, rows, 27], so that what a block takes stays in the cache."""
+    first = op.Constant(value_ints=[0])
     rows = op.Gather(op.Shape(neighbors), first)
     blocks = (rows + (ROWS_AT_ONCE - 1)) / ROWS_AT_ONCE
     size = (rows + blocks - 1) / blocks
     # Rows that fill up the last block have no neighbours: they read the row of zeros, as missing cells do.
     missing = op.Concat(blocks * size - rows, op.Constant(value_ints=[27]), axis=0)
-    table = op.Concat(neighbors, op.Expand(op.CastLike(rows, neighbors), missing), axis=0)
-    table = op.Reshape(table, op.Concat(blocks, size, op.Constant(value_ints=[27]), axis=0))
-    zeros = op.Expand(op.CastLike(0.0, x), op.Concat(second, op.Gather(op.Shape(x), second), axis=0))
-    padded = op.Concat(x, zeros, axis=0)
-    wide = op.Reshape(weight, op.Concat(op.Constant(value_ints=[-1]), op.Gather(op.Shape(weight), second + 1), axis=0))
+    filled = op.Concat(neighbors, op.Expand(op.CastLike(rows, neighbors), missing), axis=0)
+    return op.Reshape(filled, op.Concat(blocks, size, op.Constant(value_ints=[27]), axis=0))
+
+
+@script(OURS, default_opset=op)
+def out_of_blocks(found: FLOAT, neighbors: INT32) -> FLOAT:
+    """The rows of all blocks, [blocks, rows, channels], as many as there are neighbourhoods."""
+    first, last = op.Constant(value_ints=[0]), op.Constant(value_ints=[2])
+    flat = op.Reshape(found, op.Concat(op.Constant(value_ints=[-1]), op.Gather(op.Shape(found), last), axis=0))
+    return op.Slice(flat, first, op.Gather(op.Shape(neighbors), first), first)
+
+
+@script(OURS, default_opset=op)
+def with_row(x: FLOAT, value: FLOAT) -> FLOAT:
+    """One more row, of one value: what missing cells hold."""
+    second = op.Constant(value_ints=[1])
+    row = op.Expand(value, op.Concat(second, op.Gather(op.Shape(x), second), axis=0))
+    return op.Concat(x, row, axis=0)
+
+
+@script(OURS, default_opset=op)
+def convolve(x: FLOAT, neighbors: INT32, weight: FLOAT) -> FLOAT:
+    """As `models.neighbors.NeighborConv`."""
+    table = in_blocks(neighbors)
+    padded = with_row(x, op.CastLike(0.0, x))
+    columns = op.Gather(op.Shape(weight), op.Constant(value_ints=[2]))
+    wide = op.Reshape(weight, op.Concat(op.Constant(value_ints=[-1]), columns, axis=0))
 
     @graph()
     def block(part: INT32[...]) -> FLOAT[...]:
-        near = op.Reshape(op.Gather(padded, part), op.Concat(size, op.Constant(value_ints=[-1]), axis=0))
+        near = op.Reshape(op.Gather(padded, part), op.Constant(value_ints=[0, -1]))
         return op.MatMul(near, wide)
 
     found = op.Scan(table, body=block, num_scan_inputs=1)
-    flat = op.Reshape(found, op.Concat(op.Constant(value_ints=[-1]), op.Gather(op.Shape(weight), second + 1), axis=0))
-    return op.Slice(flat, first, rows, first)
+    return out_of_blocks(found, neighbors)
+
+
+@script(OURS, default_opset=op)
+def convolve_int8(x: UINT8, step: FLOAT, zero: UINT8, neighbors: INT32, weight: INT8, scale: FLOAT) -> FLOAT:
+    """The same on integers: x stands for step · (x − zero), and weight [27·C, D] for scale[D] · weight.
+
+    Bytes are gathered, a quarter of what `convolve` moves, and their products are summed in int32."""
+    table = in_blocks(neighbors)
+    padded = with_row(x, zero)
+    unit = step * scale
+
+    @graph()
+    def block(part: INT32[...]) -> FLOAT[...]:
+        near = op.Reshape(op.Gather(padded, part), op.Constant(value_ints=[0, -1]))
+        return op.Cast(op.MatMulInteger(near, weight, zero), to=1) * unit
+
+    found = op.Scan(table, body=block, num_scan_inputs=1)
+    return out_of_blocks(found, neighbors)
+
+
+@script(OURS, default_opset=op)
+def linear_int8(x: UINT8, step: FLOAT, zero: UINT8, weight: INT8, scale: FLOAT, bias: FLOAT) -> FLOAT:
+    """A linear layer on integers, which stand for what they do in `convolve_int8`; weight [C, D]."""
+    return op.Cast(op.MatMulInteger(x, weight, zero), to=1) * (step * scale) + bias
+
+
+FUNCTIONS: tuple[OnnxFunction, ...] = (in_blocks, out_of_blocks, with_row, convolve, convolve_int8, linear_int8)
+
+# What the exporter must know of the one that it meets.
+_T = onnx.defs.OpSchema.FormalParameter
+onnx.defs.register_schema(
+    onnx.defs.OpSchema(
+        convolve.name,
+        OURS.domain,
+        OURS.version,
+        inputs=[_T("x", "T"), _T("neighbors", "tensor(int32)"), _T("weight", "T")],
+        outputs=[_T("y", "T")],
+        type_constraints=[("T", ["tensor(float)", "tensor(float16)"], "")],
+    )
+)
+
+
+def in_standard_operators(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The model with our operators written out, equal parts once, and without where in the source each came from.
+
+    The types of values stay: they are a hundredth of the file, and onnxruntime takes four times as long to find them.
+    """
+    whole = onnx.ModelProto()
+    whole.CopyFrom(model)
+    for function in FUNCTIONS:
+        proto = function.to_function_proto()
+        # Annotations are types here, and floats may be of either width.
+        del proto.value_info[:]
+        for body in (each.g for node in proto.node for each in node.attribute if each.name == "body"):
+            for value in body.output:
+                value.ClearField("type")
+        whole.functions.append(proto)
+    graph = ir.serde.deserialize_model(whole)
+    for each in (
+        passes.InlinePass(),
+        passes.RemoveUnusedFunctionsPass(),
+        passes.RemoveUnusedOpsetsPass(),
+        passes.DeduplicateInitializersPass(),
+        passes.CommonSubexpressionEliminationPass(),
+        passes.RemoveUnusedNodesPass(),
+        passes.ClearMetadataAndDocStringPass(),
+    ):
+        each(graph)
+    return ir.serde.serialize_model(graph)
+
+
+def _convolve(x: Any, neighbors: Any, weight: Any) -> Any:
+    return OURS.convolve(x, neighbors, weight)
 
 
 def _searchsorted(keys: Any, wanted: Any, right: bool = False, **others: Any) -> Any:
     assert not any(others.values()), f"searchsorted is translated without {others}"
-    return search(keys, wanted, op.Constant(value_int=int(right)))
+    return search(keys, wanted, traced.Constant(value_int=int(right)))
 
 
 def _sort(values: Any, *, dim: int = -1, descending: bool = False, **others: Any) -> Any:
@@ -68,11 +173,13 @@ def _sort(values: Any, *, dim: int = -1, descending: bool = False, **others: Any
     assert dim == -1
     assert not descending
     assert set(others) <= {"stable"}
-    return op.TopK(values, op.Reshape(op.Size(values), op.Constant(value_ints=[1])), largest=0, sorted=1)
+    return traced.TopK(
+        values, traced.Reshape(traced.Size(values), traced.Constant(value_ints=[1])), largest=0, sorted=1
+    )
 
 
 TRANSLATIONS: dict[Any, Any] = {
-    torch.ops.gsencoder.convolve.default: convolve,
+    torch.ops.gsencoder.convolve.default: _convolve,
     torch.ops.aten.searchsorted.Tensor: _searchsorted,
     torch.ops.aten.sort.stable: _sort,
 }

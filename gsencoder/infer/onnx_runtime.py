@@ -42,7 +42,7 @@ class OnnxEncoder:
                 device.
         """
         self.name = "the model" if isinstance(file, bytes) else str(find_file(str(file), "weights"))
-        self._session = _session(file if isinstance(file, bytes) else self.name, self.name, device, threads)
+        self._session = open_session(file if isinstance(file, bytes) else self.name, self.name, device, threads)
         try:
             self.header: OnnxHeader = from_metadata(self._session.get_modelmeta().custom_metadata_map)
             wanted = {f"{name}: {self._type(name)}" for name in (*FIELDS, *SETTINGS)}
@@ -109,18 +109,27 @@ class OnnxEncoder:
         return header.outputs.features(features)
 
     def _run(self, part: Gaussians, whole: Curves | None, voxel: float) -> Float32[np.ndarray, "n channels"]:
-        scaled = np.floor(part.means.astype(np.float64) / voxel)
-        check_extent(float((scaled.max(axis=0) - scaled.min(axis=0)).max()) + 1, voxel)
-        feed = inputs_of(part) | {"voxel": np.array(voxel, np.float64)}
-        if whole is not None:
-            feed |= {"corner": whole.corner, "starts": rows_of(whole)}
         try:
-            (found,) = self._session.run([OUTPUT], feed)
+            (found,) = self._session.run([OUTPUT], feed_of(part, whole, voxel))
+        except InputError:
+            raise
         except Exception as error:  # onnxruntime raises its own classes, which share only this base
             raise InputError(f"{self.name}: onnxruntime could not run it: {_first_line(error)}") from error
         if found.shape != (len(part), self.header.outputs.channels):
             raise InputError(f"{self.name}: expected {self.header.outputs.channels} channels, got {found.shape}")
         return np.asarray(found, np.float32)
+
+
+def feed_of(part: Gaussians, whole: Curves | None, voxel: float) -> dict[str, np.ndarray]:
+    """What the graph takes of a part of a scene, in the grid of the whole; `whole` is None where it is all of it.
+
+    Raises:
+        InputError: the part spreads over too many cells.
+    """
+    scaled = np.floor(part.means.astype(np.float64) / voxel)
+    check_extent(float((scaled.max(axis=0) - scaled.min(axis=0)).max()) + 1, voxel)
+    feed = inputs_of(part) | {"voxel": np.array(voxel, np.float64)}
+    return feed if whole is None else feed | {"corner": whole.corner, "starts": rows_of(whole)}
 
 
 def inputs_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -138,7 +147,12 @@ def rows_of(curves: Curves) -> Int64[np.ndarray, "rows P"]:
     return table
 
 
-def _session(model: str | bytes, name: str, device: Device, threads: int) -> Any:
+def open_session(model: str | bytes, name: str, device: Device, threads: int = 0) -> Any:
+    """onnxruntime with a graph.
+
+    Raises:
+        InputError: no model that it reads, or no such device.
+    """
     import onnxruntime
 
     available = onnxruntime.get_available_providers()

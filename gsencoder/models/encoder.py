@@ -74,6 +74,8 @@ class GaussianEncoder(nn.Module):
         if not torch.compiler.is_exporting():
             # Levels may end in tokens that stand for nothing.
             tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
+        # An encoder in half precision takes tokens that were merged in single.
+        tokens = tokens.to(self.head.weight.dtype)
         x = functional.gelu(self.stem_norm(self.stem(tokens, plan.levels[0].neighbors)))
         x = self.transformer(x, plan)
         features = self.head(self.head_norm(x))

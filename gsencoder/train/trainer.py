@@ -2,12 +2,14 @@
 
 import math
 import signal
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -350,3 +352,11 @@ def _begin_worker(worker: int) -> None:  # noqa: ARG001
     for name in ("SIGTERM", "SIGHUP", "SIGINT"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
+    sys.excepthook = _quiet_of_ended_connections
+
+
+def _quiet_of_ended_connections(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """A training process that is stopped while it takes a sample from a worker says why itself; the thread that handed
+    the sample over would print that its connection was reset."""
+    if not issubclass(kind, ConnectionError):
+        sys.__excepthook__(kind, error, trace)

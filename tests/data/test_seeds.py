@@ -453,8 +453,8 @@ class TestMesh:
 
 
 class TestTsdf:
+    @pytest.mark.usefixtures("open3d")
     def test_a_sphere_is_fused_to_its_surface(self):
-        pytest.importorskip("open3d")
         center = np.array([0.1, -0.05, 1.6])
         cameras = [camera(p, center) for p in ((0, 0, 0.3), (1.2, 0.1, 1.1), (-1.1, 0.3, 1.0))]
         g = seed_from_tsdf(frames(*[(view, sphere_depth(view, center, 0.2)) for view in cameras]), voxel=0.02)

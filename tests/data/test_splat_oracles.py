@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,21 +12,17 @@ from gsencoder.data import splats
 from gsencoder.data.splats import fingerprint, load_splat, read_raw, save_splat
 
 
-def open3d_point_cloud(path: Path) -> dict[str, np.ndarray]:
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d does not import here: {error}")
+def open3d_point_cloud(open3d: Any, path: Path) -> dict[str, np.ndarray]:
     points = open3d.t.io.read_point_cloud(str(path)).point
     return {name: points[name].numpy() for name in points}
 
 
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "v3.spz"])
-def test_open3d_reads_what_we_write_and_sees_the_same(tmp_path: Path, name: str, degree: int) -> None:
+def test_open3d_reads_what_we_write_and_sees_the_same(tmp_path: Path, open3d: Any, name: str, degree: int) -> None:
     gaussians = samples.make_gaussians(500, degree)
     save_splat(tmp_path / name, gaussians, spz_version=3 if "v3" in name else 4)
-    seen, ours = open3d_point_cloud(tmp_path / name), load_splat(tmp_path / name)
+    seen, ours = open3d_point_cloud(open3d, tmp_path / name), load_splat(tmp_path / name)
     assert np.array_equal(seen["positions"], ours.means)
     assert np.allclose(seen["scale"], ours.scales, rtol=1e-5)
     assert np.allclose(samples.same_sign(seen["rot"], ours.quats), ours.quats, atol=1e-6)
@@ -36,13 +33,10 @@ def test_open3d_reads_what_we_write_and_sees_the_same(tmp_path: Path, name: str,
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.splat"])
-def test_we_read_what_open3d_writes(tmp_path: Path, name: str) -> None:
+def test_we_read_what_open3d_writes(tmp_path: Path, open3d: Any, name: str) -> None:
     gaussians = samples.make_gaussians(200, 0)
     gaussians = replace(gaussians, sh=gaussians.sh.clip(-1.5, 1.5))
     save_splat(tmp_path / "ours.ply", gaussians)
-    open3d_point_cloud(tmp_path / "ours.ply")
-    import open3d
-
     cloud = open3d.t.io.read_point_cloud(str(tmp_path / "ours.ply"))
     assert open3d.t.io.write_point_cloud(str(tmp_path / name), cloud)
     loaded = load_splat(tmp_path / name)
@@ -98,14 +92,14 @@ def test_real_files_load_whole(shared: Path, name: str, count: int, degree: int)
 
 
 @pytest.mark.shared
-def test_gsply_and_open3d_agree_with_us_on_the_real_files(shared: Path) -> None:
+def test_gsply_and_open3d_agree_with_us_on_the_real_files(shared: Path, open3d: Any) -> None:
     import gsply
 
     folder = shared / "fixtures"
     guitar = str(folder / "guitar.compressed.ply")
     assert_same_raw(read_raw(guitar), gsply.plyread(guitar), 5e-5)
     assert_same_raw(read_raw(folder / "playbot_sog"), gsply.sogread(str(folder / "playbot_sog")), 2e-6)
-    biker, seen = load_splat(folder / "biker.spz"), open3d_point_cloud(folder / "biker.spz")
+    biker, seen = load_splat(folder / "biker.spz"), open3d_point_cloud(open3d, folder / "biker.spz")
     assert np.array_equal(seen["positions"], biker.means)
     assert np.allclose(seen["scale"], biker.scales, rtol=1e-5)
     assert np.allclose(seen["f_dc"], biker.sh[:, 0], atol=1e-6)

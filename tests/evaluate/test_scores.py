@@ -7,10 +7,10 @@ import pytest
 
 from gsencoder.errors import InputError
 from gsencoder.evaluate.boxes import Hit, aabb_iou, accuracy, asked_objects, score_boxes
-from gsencoder.evaluate.cosine import field_error
 from gsencoder.evaluate.localization import scores, scores_by_name
 from gsencoder.evaluate.memory import memory_growth
 from gsencoder.evaluate.tables import csv_text
+from gsencoder.fusion.field_error import field_error
 from gsencoder.types import Box, FeatureBasis, FeatureSpace, GaussianFeatures, Localization, Scene, SceneObject
 
 SPACE = FeatureSpace(name="s", channels=4)

@@ -4,6 +4,7 @@ import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -258,9 +259,9 @@ def test_json_holds_what_the_boxes_hold() -> None:
 
 
 @pytest.mark.parametrize("oriented", [False, True])
-def test_the_ply_of_boxes_opens_in_other_programs_with_all_its_points(tmp_path: Path, oriented: bool) -> None:
-    import open3d
-
+def test_the_ply_of_boxes_opens_in_other_programs_with_all_its_points(
+    tmp_path: Path, open3d: Any, oriented: bool
+) -> None:
     far = make_room_scene(origin=(1e6, 0, 0))
     found = localize(far, ["mug", "chair"], TABLE)
     path = tmp_path / "boxes.ply"

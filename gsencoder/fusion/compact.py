@@ -1,0 +1,250 @@
+"""Features in a few bytes a Gaussian: as many as an error budget asks for.
+
+Coordinates are turned so that the first hold most, each is replaced by the nearest of 2ᵇ levels (Lloyd 1982, Max 1960),
+and bits go one at a time to the coordinate whose error they lower most. A name or a patch lives near few directions, so
+that most coordinates need one or two bits, or none.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from gsencoder.errors import InputError
+from gsencoder.evenly import evenly
+from gsencoder.fusion.field_error import field_error
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
+
+MOST_BITS = 8
+"""Of a coordinate."""
+SAMPLE = 10_000
+"""Gaussians that levels are fitted to."""
+ROUNDS = 10
+BLOCK = 16_384
+"""Rows that are turned into bits, or back, at a time."""
+LIGHTEST = 1e-6
+"""A share of the largest weight; lighter Gaussians are stored with that."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CompactFeatures:
+    """Features as codes.
+
+    Attributes:
+        codes: of the seen rows, each row's bits one coordinate after the other, the first in the highest bit.
+        bits: of each coordinate.
+        levels: what the codes of each coordinate stand for, 2ᵇ values each.
+        weight_codes: of the seen rows; 255 = `heaviest`, and each step less is a factor.
+        heaviest: the largest weight.
+        rows: which Gaussians were seen, ascending.
+        total: Gaussians.
+        mean: of the space.
+        basis: what the coordinates stand for.
+        space: what decoded features are.
+        error: 1 − mean centred cosine to what was compacted, over a sample of 20,000 rows.
+    """
+
+    codes: UInt8[np.ndarray, "n row_bytes"]
+    bits: UInt8[np.ndarray, " R"]
+    levels: Float32[np.ndarray, " L"]
+    weight_codes: UInt8[np.ndarray, " n"]
+    heaviest: float
+    rows: Int64[np.ndarray, " n"]
+    total: int
+    basis: FeatureBasis
+    error: float
+
+    def __post_init__(self) -> None:
+        used = int(self.bits.astype(np.int64).sum())
+        fits = self.codes.shape[1] == -(-used // 8) and len(self.levels) == int((1 << self.bits.astype(np.int64)).sum())
+        if not fits or len(self.bits) != self.basis.rank or self.bits.max(initial=0) > MOST_BITS or not self.bits.all():
+            raise InputError(
+                f"CompactFeatures: {self.codes.shape[1]} bytes a row and {len(self.levels)} levels do not go with bits "
+                f"{self.bits.tolist()[:20]} of {self.basis.rank} coordinates"
+            )
+        ordered = len(self.rows) == 0 or (self.rows[0] >= 0 and self.rows[-1] < self.total)
+        if not ordered or (np.diff(self.rows) <= 0).any() or not 0 < self.heaviest < np.inf:
+            raise InputError(f"CompactFeatures: expected rows that rise from 0 to at most {self.total - 1}")
+
+    def __len__(self) -> int:
+        return self.total
+
+    def coordinates(self, places: np.ndarray | slice = slice(None)) -> Float32[np.ndarray, "k R"]:
+        """Coordinates in the basis of seen rows, by their place among these."""
+        codes = self.codes[places]
+        bits = self.bits.astype(np.int64)
+        begins = np.concatenate(([0], np.cumsum(bits)))
+        offsets = np.concatenate(([0], np.cumsum(1 << bits)))
+        found = np.empty((len(codes), len(bits)), np.float32)
+        for start in range(0, len(codes), BLOCK):
+            ones = np.unpackbits(codes[start : start + BLOCK], axis=1)
+            for number, width in enumerate(bits):
+                part = ones[:, begins[number] : begins[number + 1]]
+                code = part @ (1 << np.arange(width - 1, -1, -1))
+                found[start : start + BLOCK, number] = self.levels[offsets[number] + code]
+        return found
+
+    def features(self) -> GaussianFeatures:
+        """All of them, as other stages take them."""
+        values = np.zeros((self.total, self.basis.rank), np.float32)
+        weights = np.zeros(self.total, np.float32)
+        values[self.rows] = self.coordinates()
+        weights[self.rows] = self.heaviest * LIGHTEST ** ((255 - self.weight_codes.astype(np.float32)) / 255)
+        return GaussianFeatures(
+            features=values, weights=weights, mean=self.basis.mean, space=self.space, basis=self.basis
+        )
+
+    @property
+    def space(self) -> FeatureSpace:
+        """What decoded features are."""
+        return self.basis.space
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row's codes."""
+        return int(self.codes.shape[1])
+
+
+def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatures:
+    """The fewest bytes a row whose features come within a budget.
+
+    Args:
+        features: fused or encoded.
+        error: budget of 1 − mean centred cosine.
+
+    Raises:
+        InputError: a budget out of range, or below what 8 bits a coordinate reach; nothing seen.
+    """
+    if not 0 < error < 1:
+        raise InputError(f"error: expected a budget between 0 and 1, got {error}")
+    rows = np.flatnonzero(features.seen)
+    if not len(rows):
+        raise InputError("compact: no Gaussian has features")
+    centred = _centred(features, rows[evenly(len(rows), SAMPLE)])
+    norms = np.sqrt((centred * centred).sum(axis=1))
+    # A cosine weighs an error by what it is an error of.
+    heft = 1 / np.maximum(norms, 1e-6 * max(float(norms.max()), 1e-30)) ** 2
+    _, vectors = np.linalg.eigh((centred * heft[:, None]).T @ centred)
+    turned = vectors[:, ::-1]
+    choice = _Choice(centred @ turned, heft)
+    rough = 1.0
+    while True:
+        rough = choice.add_bits(8)
+        if rough > error and choice.can_grow:
+            continue
+        found = _encode(features, rows, turned, choice)
+        if found.error <= error:
+            return found
+        if not choice.can_grow:
+            raise InputError(
+                f"error={error}: {MOST_BITS} bits a coordinate reach {found.error:.2g}; give a larger budget, or "
+                "another form"
+            )
+
+
+def _centred(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray, "n R"]:
+    values = features.features[rows].astype(np.float64)
+    return values if features.basis is not None else values - features.mean
+
+
+class _Choice:
+    """How many bits each coordinate has, and its levels, on a sample."""
+
+    def __init__(self, sample: Float64[np.ndarray, "n R"], heft: Float64[np.ndarray, " n"]) -> None:
+        self._sample, self._heft = sample, heft
+        count = sample.shape[1]
+        self.bits = np.zeros(count, np.int64)
+        self.levels = [np.zeros(1)] * count
+        self._rounded = np.zeros_like(sample)
+        self._now = heft @ sample**2
+        self._next = [self._fit(number, 1) for number in range(count)]
+
+    @property
+    def energy_kept(self) -> float:
+        """Share of the energy that lies in coordinates with bits."""
+        energy = (self._sample**2).sum(axis=0)
+        return float(energy[self.bits > 0].sum() / max(float(energy.sum()), 1e-300))
+
+    @property
+    def can_grow(self) -> bool:
+        """Whether some coordinate may have more bits."""
+        return bool((self.bits < MOST_BITS).any())
+
+    def add_bits(self, count: int) -> float:
+        """Gives some more bits, each where it lowers the error most; the mean 1 − cosine that is left."""
+        for _ in range(count):
+            gains = [
+                self._now[number] - self._next[number][0] if self.bits[number] < MOST_BITS else -1.0
+                for number in range(len(self.bits))
+            ]
+            best = int(np.argmax(gains))
+            if self.bits[best] == MOST_BITS:
+                break
+            self._now[best], self.levels[best] = self._next[best]
+            self.bits[best] += 1
+            self._rounded[:, best] = self.levels[best][_nearest(self.levels[best], self._sample[:, best])]
+            if self.bits[best] < MOST_BITS:
+                self._next[best] = self._fit(best, int(self.bits[best]) + 1)
+        norms = (self._rounded**2).sum(axis=1) * (self._sample**2).sum(axis=1)
+        return float(1 - ((self._rounded * self._sample).sum(axis=1) / np.sqrt(norms + 1e-60)).mean())
+
+    def _fit(self, number: int, bits: int) -> tuple[float, Float64[np.ndarray, " L"]]:
+        """The weighted error that is left, and the levels: each the mean of what is nearest to it."""
+        values = self._sample[:, number]
+        best: tuple[float, np.ndarray] = (np.inf, np.zeros(1))
+        count = 1 << bits
+        spread = np.linspace(values.min(), values.max(), 2 * count + 1)[1::2]
+        for levels in (np.quantile(values, (np.arange(count) + 0.5) / count), spread):
+            for _ in range(ROUNDS):
+                near = _nearest(levels, values)
+                weight = np.bincount(near, self._heft, count)
+                total = np.bincount(near, self._heft * values, count)
+                levels = np.sort(np.where(weight > 0, total / np.where(weight > 0, weight, 1), levels))
+            left = float(self._heft @ (levels[_nearest(levels, values)] - values) ** 2)
+            if left < best[0]:
+                best = (left, levels)
+        return best
+
+
+def _nearest(levels: np.ndarray, values: np.ndarray) -> Int64[np.ndarray, " n"]:
+    """Which of the ascending levels each value is nearest to."""
+    return np.searchsorted((levels[1:] + levels[:-1]) / 2, values)
+
+
+def _encode(
+    features: GaussianFeatures, rows: Int64[np.ndarray, " n"], turned: Float64[np.ndarray, "R R"], choice: _Choice
+) -> CompactFeatures:
+    used = np.flatnonzero(choice.bits)
+    bits, levels = choice.bits[used], [choice.levels[number].astype(np.float32) for number in used]
+    codes = np.empty((len(rows), -(-int(bits.sum()) // 8)), np.uint8)
+    for start in range(0, len(rows), BLOCK):
+        values = _centred(features, rows[start : start + BLOCK]) @ turned[:, used]
+        ones = [
+            _nearest(each, values[:, number])[:, None] >> np.arange(width - 1, -1, -1) & 1
+            for number, (each, width) in enumerate(zip(levels, bits, strict=True))
+        ]
+        codes[start : start + BLOCK] = np.packbits(np.concatenate(ones, axis=1).astype(np.uint8), axis=1)
+    axes = turned[:, used].T
+    basis = features.basis
+    components = axes if basis is None else axes @ basis.components
+    weights = features.weights[rows].astype(np.float64)
+    heaviest = float(weights.max())
+    shares = np.log(np.maximum(weights / heaviest, LIGHTEST)) / np.log(LIGHTEST)
+    made = CompactFeatures(
+        codes=codes,
+        bits=bits.astype(np.uint8),
+        levels=np.concatenate(levels),
+        weight_codes=np.rint(255 * (1 - shares)).astype(np.uint8),
+        heaviest=heaviest,
+        rows=rows,
+        total=len(features),
+        basis=FeatureBasis(
+            mean=features.mean,
+            components=np.ascontiguousarray(components, np.float32),
+            energy_kept=choice.energy_kept * (1.0 if basis is None else basis.energy_kept),
+            space=features.space,
+        ),
+        error=0.0,
+    )
+    found = field_error(made.features(), features).centred
+    return replace(made, error=found)

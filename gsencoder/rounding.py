@@ -1,0 +1,13 @@
+"""Matrices in eight bits."""
+
+import numpy as np
+from jaxtyping import Float32, Int8
+
+
+def round_columns(
+    matrix: Float32[np.ndarray, "rows columns"],
+) -> tuple[Int8[np.ndarray, "rows columns"], Float32[np.ndarray, " columns"]]:
+    """Integers from −127 to 127 and the scale of each column: matrix ≈ integers · scale, within half a scale."""
+    largest = np.abs(matrix).max(axis=0)
+    scale = np.where(largest > 0, largest / 127, 1).astype(np.float32)
+    return np.clip(np.rint(matrix / scale), -127, 127).astype(np.int8), scale
