@@ -30,6 +30,8 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh_dc")
 SETTINGS = ("voxel", "corner", "starts")
 """Inputs that have values of their own: the grid in metres, and those of a cloud that is no part of another."""
 OUTPUT = "features"
+WORD_STEPS = 63
+"""Largest integer of a word's embedding in a file of int8: seven bits leave a cosine of 0.9999, and deflate well."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +90,7 @@ def to_metadata(header: OnnxHeader) -> dict[str, str]:
     if words is not None:
         arrays["words_mean"] = words.mean
         if header.precision.startswith("int8"):
-            arrays["words"], arrays["words_scale"] = round_columns(words.embeddings)
+            arrays["words"], arrays["words_scale"] = round_columns(words.embeddings, WORD_STEPS)
         else:
             arrays["words"] = words.embeddings.astype(np.float16)
         values["words"] = {"names": list(words.names), "space": asdict(words.space)}
