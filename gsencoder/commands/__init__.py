@@ -38,6 +38,7 @@ COMMANDS = {
         Command(name="fuse", config="FuseCommandConfig", help="per-Gaussian features from a teacher's maps"),
         Command(name="train", config="TrainConfig", help="distil a teacher into an encoder of splats"),
         Command(name="encode", config="EncodeCommandConfig", help="per-Gaussian features of a splat in one pass"),
+        Command(name="pack", config="PackConfig", help="features in a few bytes a Gaussian, or for other programs"),
         Command(name="export", config="ExportConfig", help="an encoder as one ONNX file that takes raw Gaussians"),
         Command(name="localize", config="LocalizeCommandConfig", help="boxes, scores and pictures for words"),
         Command(name="evaluate", config="EvaluateConfig", help="a paper's metric on labelled scenes"),

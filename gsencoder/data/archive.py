@@ -3,6 +3,7 @@
 A file comes from anywhere: an array of another size would otherwise be broadcast, or end the run far from its cause.
 """
 
+import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -100,6 +101,17 @@ class Archive:
             raise InputError(f"{self.path}: expected {key} ({names}) in the header, got {got}")
         return value
 
+    def verify(self) -> None:
+        """Checks the sum that `write_archive` wrote with the contents, which reads all of them.
+
+        Raises:
+            InputError: there is none, or the file is damaged.
+        """
+        arrays = {name: self._file.get_tensor(name) for name in self._names}
+        header = {key: value for key, value in self._header.items() if key not in ("version", "sum")}
+        if self.value("sum", str) != _sum(arrays, header):
+            raise InputError(f"{self.path}: its contents do not have the sum that was written with them; it is damaged")
+
     def __contains__(self, key: str) -> bool:
         return key in self._header or key in self._names
 
@@ -108,8 +120,26 @@ def _listed(shape: tuple[int | str, ...]) -> str:
     return ", ".join(map(str, shape))
 
 
-def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+def _sum(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
+    """sha256 over the header and over names, types, shapes and bytes of all arrays."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = _contiguous(arrays[name])
+        digest.update(f"{name} {array.dtype.name}{array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def write_archive(
+    path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], *, summed: bool = False
+) -> None:
     """Writes arrays and header; what had the name stays until the new file is whole.
+
+    Args:
+        path: the file.
+        arrays: by name.
+        header: values that JSON has.
+        summed: with a sum for `Archive.verify`.
 
     Raises:
         InputError: the disk is full, or the system refuses.
@@ -118,7 +148,8 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     from safetensors.numpy import save_file
 
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    metadata = {"gsencoder": json.dumps({"version": VERSION, **header})}
+    told = {**header, "sum": _sum(arrays, header)} if summed else header
+    metadata = {"gsencoder": json.dumps({"version": VERSION, **told})}
     try:
         save_file({name: _contiguous(array) for name, array in arrays.items()}, temporary, metadata)
         with temporary.open("rb") as stream:

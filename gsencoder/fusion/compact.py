@@ -5,14 +5,13 @@ and bits go one at a time to the coordinate whose error they lower most. A name 
 that most coordinates need one or two bits, or none.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.errors import InputError
 from gsencoder.evenly import evenly
-from gsencoder.fusion.field_error import field_error
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 MOST_BITS = 8
@@ -20,6 +19,8 @@ MOST_BITS = 8
 SAMPLE = 10_000
 """Gaussians that levels are fitted to."""
 ROUNDS = 10
+"""Of moving levels to the mean of what is nearest to them."""
+BINS = 1024
 BLOCK = 16_384
 """Rows that are turned into bits, or back, at a time."""
 LIGHTEST = 1e-6
@@ -41,7 +42,7 @@ class CompactFeatures:
         mean: of the space.
         basis: what the coordinates stand for.
         space: what decoded features are.
-        error: 1 − mean centred cosine to what was compacted, over a sample of 20,000 rows.
+        error: 1 − mean centred cosine to what was compacted, over the seen rows.
     """
 
     codes: UInt8[np.ndarray, "n row_bytes"]
@@ -123,7 +124,7 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
     centred = _centred(features, rows[evenly(len(rows), SAMPLE)])
     norms = np.sqrt((centred * centred).sum(axis=1))
     # A cosine weighs an error by what it is an error of.
-    heft = 1 / np.maximum(norms, 1e-6 * max(float(norms.max()), 1e-30)) ** 2
+    heft = 1 / np.maximum(norms, max(1e-6 * float(norms.max()), 1e-30)) ** 2
     _, vectors = np.linalg.eigh((centred * heft[:, None]).T @ centred)
     turned = vectors[:, ::-1]
     choice = _Choice(centred @ turned, heft)
@@ -185,16 +186,20 @@ class _Choice:
             self._rounded[:, best] = self.levels[best][_nearest(self.levels[best], self._sample[:, best])]
             if self.bits[best] < MOST_BITS:
                 self._next[best] = self._fit(best, int(self.bits[best]) + 1)
-        norms = (self._rounded**2).sum(axis=1) * (self._sample**2).sum(axis=1)
-        return float(1 - ((self._rounded * self._sample).sum(axis=1) / np.sqrt(norms + 1e-60)).mean())
+        return float(1 - _cosines(self._sample, self._rounded, (self._sample**2).sum(axis=1)).mean())
 
     def _fit(self, number: int, bits: int) -> tuple[float, Float64[np.ndarray, " L"]]:
         """The weighted error that is left, and the levels: each the mean of what is nearest to it."""
         values = self._sample[:, number]
         best: tuple[float, np.ndarray] = (np.inf, np.zeros(1))
         count = 1 << bits
+        # What levels end as depends on where they begin. Many that share a smooth density lie as dense as its cube root
+        # (Panter and Dite 1951); a few kinds of features are no density, and are found from an even spread.
+        mass, edges = np.histogram(values, BINS, weights=self._heft)
+        filled = np.concatenate(([0], np.cumsum(np.cbrt(mass))))
+        dense = np.interp((np.arange(count) + 0.5) / count * filled[-1], filled, edges)
         spread = np.linspace(values.min(), values.max(), 2 * count + 1)[1::2]
-        for levels in (np.quantile(values, (np.arange(count) + 0.5) / count), spread):
+        for levels in (dense, spread):
             for _ in range(ROUNDS):
                 near = _nearest(levels, values)
                 weight = np.bincount(near, self._heft, count)
@@ -217,20 +222,24 @@ def _encode(
     used = np.flatnonzero(choice.bits)
     bits, levels = choice.bits[used], [choice.levels[number].astype(np.float32) for number in used]
     codes = np.empty((len(rows), -(-int(bits.sum()) // 8)), np.uint8)
+    cosines = 0.0
     for start in range(0, len(rows), BLOCK):
-        values = _centred(features, rows[start : start + BLOCK]) @ turned[:, used]
-        ones = [
-            _nearest(each, values[:, number])[:, None] >> np.arange(width - 1, -1, -1) & 1
-            for number, (each, width) in enumerate(zip(levels, bits, strict=True))
-        ]
+        centred = _centred(features, rows[start : start + BLOCK])
+        values = centred @ turned[:, used]
+        ones, rounded = [], np.empty_like(values)
+        for number, (each, width) in enumerate(zip(levels, bits, strict=True)):
+            code = _nearest(each, values[:, number])
+            rounded[:, number] = each[code]
+            ones.append(code[:, None] >> np.arange(width - 1, -1, -1) & 1)
         codes[start : start + BLOCK] = np.packbits(np.concatenate(ones, axis=1).astype(np.uint8), axis=1)
+        cosines += float(_cosines(values, rounded, (centred**2).sum(axis=1)).sum())
     axes = turned[:, used].T
     basis = features.basis
     components = axes if basis is None else axes @ basis.components
     weights = features.weights[rows].astype(np.float64)
     heaviest = float(weights.max())
     shares = np.log(np.maximum(weights / heaviest, LIGHTEST)) / np.log(LIGHTEST)
-    made = CompactFeatures(
+    return CompactFeatures(
         codes=codes,
         bits=bits.astype(np.uint8),
         levels=np.concatenate(levels),
@@ -244,7 +253,13 @@ def _encode(
             energy_kept=choice.energy_kept * (1.0 if basis is None else basis.energy_kept),
             space=features.space,
         ),
-        error=0.0,
+        error=1 - cosines / len(rows),
     )
-    found = field_error(made.features(), features).centred
-    return replace(made, error=found)
+
+
+def _cosines(
+    values: Float64[np.ndarray, "n R"], rounded: Float64[np.ndarray, "n R"], squares: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """Of rows and what they were rounded to; `squares` are the rows' own, with coordinates that were left out."""
+    norms = np.sqrt(squares) * np.sqrt((rounded**2).sum(axis=1))
+    return np.asarray((values * rounded).sum(axis=1) / np.where(norms > 0, norms, 1))

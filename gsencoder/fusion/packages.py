@@ -4,7 +4,6 @@ Three forms are for other programs: an .npz, a safetensors file, or properties o
 for gsencoder: codes of a few bytes (`compact`), memory-mapped, checked by a sum, bound to its splat by a fingerprint.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -25,7 +24,6 @@ Form = Literal["compact", "npz", "safetensors", "ply"]
 SPLAT_FILE, PACKAGE_FILE = "splat.ply", "features.gsf"
 NPZ_FILE, SAFETENSORS_FILE, BASIS_FILE = "features.npz", "features.safetensors", "basis.npz"
 FORMAT = 1
-CODED = ("bits", "levels", "codes", "weight_codes", "seen", "mean", "components")
 
 
 def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, error: float) -> CompactFeatures:
@@ -60,9 +58,8 @@ def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, erro
         "total": len(made),
         "heaviest": made.heaviest,
         "error": made.error,
-        "sum": _checksum(coded),
     }
-    write_archive(folder / PACKAGE_FILE, arrays | coded, header)
+    write_archive(folder / PACKAGE_FILE, arrays | coded, header, summed=True)
     return made
 
 
@@ -76,29 +73,22 @@ def open_package(file: Path) -> CompactFeatures:
         form = archive.value("form", int)
         if form != FORMAT:
             raise InputError(f"expected form {FORMAT} of a package, got {form}; pack the features again")
-        arrays = {
-            "bits": archive.array("bits", "uint8", ("R",)),
-            "levels": archive.array("levels", "float32", ("L",)),
-            "seen": archive.array("seen", "uint8", ("S",)),
-        }
-        _, mean, basis = read_space(archive)
+        archive.verify()
+        _, _, basis = read_space(archive)
         if basis is None:
             raise InputError("expected components of a basis; the file is damaged or from another program")
-        arrays |= {"mean": mean, "components": basis.components}
-        arrays |= map_arrays(file, {"codes": ("uint8", 2), "weight_codes": ("uint8", 1)})
-        if archive.value("sum", str) != _checksum(arrays):
-            raise InputError("its contents do not have the sum that was written with them; the file is damaged")
-        total = archive.value("total", int)
-        if not 0 <= total <= 8 * len(arrays["seen"]) < total + 8:
-            raise InputError(f"expected marks of {total} Gaussians, got {8 * len(arrays['seen'])}")
-        rows = np.flatnonzero(np.unpackbits(arrays["seen"], count=total))
-        if not len(rows) == len(arrays["codes"]) == len(arrays["weight_codes"]):
-            raise InputError(f"{len(rows)} Gaussians are marked, and {len(arrays['codes'])} have codes")
+        mapped = map_arrays(file, {"codes": ("uint8", 2), "weight_codes": ("uint8", 1)})
+        seen, total = archive.array("seen", "uint8", ("S",)), archive.value("total", int)
+        if not 0 <= total <= 8 * len(seen) < total + 8:
+            raise InputError(f"expected marks of {total} Gaussians, got {8 * len(seen)}")
+        rows = np.flatnonzero(np.unpackbits(seen, count=total))
+        if not len(rows) == len(mapped["codes"]) == len(mapped["weight_codes"]):
+            raise InputError(f"{len(rows)} Gaussians are marked, and {len(mapped['codes'])} have codes")
         return CompactFeatures(
-            codes=arrays["codes"],
-            bits=arrays["bits"],
-            levels=arrays["levels"],
-            weight_codes=arrays["weight_codes"],
+            codes=mapped["codes"],
+            bits=archive.array("bits", "uint8", ("R",)),
+            levels=archive.array("levels", "float32", ("L",)),
+            weight_codes=mapped["weight_codes"],
             heaviest=archive.value("heaviest", float, int),
             rows=rows,
             total=total,
@@ -188,13 +178,3 @@ def _plain(features: GaussianFeatures, *, decoded: bool) -> dict[str, np.ndarray
 def _about(features: GaussianFeatures, belongs: str, *, decoded: bool) -> dict[str, Any]:
     kind = "vectors" if decoded or features.basis is None else "coordinates: vector = mean + features @ components"
     return {"space": asdict(features.space), "features": kind, "fingerprint": belongs}
-
-
-def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
-    """sha256 over names, types, shapes and bytes."""
-    digest = hashlib.sha256()
-    for name in CODED:
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name}{array.dtype.name}{array.shape}".encode())
-        digest.update(array.data)
-    return digest.hexdigest()

@@ -1,77 +1,40 @@
 """The exported encoder against the one that it was made from, and files that are no such encoder."""
 
+import base64
 import json
 import os
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import jaxtyping
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
-import torch
 from splats import random_gaussians
 
 from gsencoder import cli
 from gsencoder.data.splats import save_splat
-from gsencoder.data.text_table import make_text_table, save_text_table
 from gsencoder.errors import InputError
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.encoders import Encoder, load_encoder
-from gsencoder.infer.export_onnx import TOLERANCE, check_parity, export_onnx, random_cloud
+from gsencoder.infer.export_onnx import TOLERANCE, Cloud, check_parity, lower, random_cloud
 from gsencoder.infer.onnx_header import KEY, OnnxHeader, from_metadata, to_metadata
 from gsencoder.infer.onnx_operators import search
 from gsencoder.infer.onnx_runtime import OnnxEncoder, inputs_of
-from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
-from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.point_transformer import TransformerConfig
-from gsencoder.models.weights import save_weights
-from gsencoder.types import FeatureBasis, FeatureSpace, Gaussians
+from gsencoder.types import Gaussians
 
 WORDS = ("mug", "plant", "chair")
-SHAPE = TransformerConfig(
-    encoder_depths=(1, 2, 1),
-    encoder_channels=(16, 16, 32),
-    decoder_depths=(1, 1),
-    decoder_channels=(16, 16),
-    head_channels=8,
-    patch=24,
-)
 ALONE = EncodeConfig(chunk=0, precision="float32", device="cpu")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights with a basis and words beside them, as `train` leaves them, and what they were exported to."""
-    folder = tmp_path_factory.mktemp("encoder")
-    rng = np.random.default_rng(0)
-    table = make_text_table(WORDS, np.linalg.qr(rng.normal(size=(6, 3)))[0].T, "words-6")
-    space = FeatureSpace(name="six", channels=6, teacher="labels", text_encoder="words-6", preprocessing="none")
-    mean = rng.normal(size=6).astype(np.float32)
-    basis = FeatureBasis(
-        mean=mean,
-        components=np.linalg.qr(rng.normal(size=(6, 4)))[0].T.astype(np.float32),
-        energy_kept=0.9,
-        space=space,
-    )
-    torch.manual_seed(0)
-    encoder = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), 4)
-    outputs = OutputSpace(space=space, mean=mean, scale=2.0, basis=basis)
-    save_weights(folder / "encoder.safetensors", encoder, outputs, {"steps": 3})
-    save_text_table(folder / "words.safetensors", table)
-    # Sizes that are symbols are not what the checks of shapes expect.
-    jaxtyping.config.update("jaxtyping_disable", True)
-    try:
-        words = [f"weights={folder}", f"out={folder / 'encoder.onnx'}", "sizes=[1,50]", "quiet=true"]
-        assert cli.main(["export", *words]) == 0
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
-    return folder
+def folder(exported: Path) -> Path:
+    return exported
 
 
 @pytest.fixture(scope="module")
@@ -173,13 +136,17 @@ def changed(header: OnnxHeader, key: str, value: object) -> dict[str, str]:
     return entries | {KEY: json.dumps(values)}
 
 
+def deflated(raw: bytes) -> str:
+    return base64.b64encode(zlib.compress(raw)).decode()
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         (lambda header: {}, "no encoder that `gsencoder export` wrote"),
         (lambda header: {KEY: "{"}, "is damaged"),
         (lambda header: {KEY: "[]"}, "is damaged"),
-        (lambda header: changed(header, "version", 2), "format version 2, and this gsencoder reads 1"),
+        (lambda header: changed(header, "version", 1), "format version 1, and this gsencoder reads 2"),
         (lambda header: changed(header, "levels", 0), "1 to 7 levels"),
         (lambda header: changed(header, "levels", "3"), "1 to 7 levels"),
         (lambda header: changed(header, "voxel", -1), "positive voxel"),
@@ -188,11 +155,17 @@ def changed(header: OnnxHeader, key: str, value: object) -> dict[str, str]:
         (lambda header: changed(header, "space", {"name": "x"}), "damaged"),
         (lambda header: changed(header, "space", {"name": "x", "channels": 9}), "expected"),
         (lambda header: changed(header, "arrays", {}), "damaged"),
-        (lambda header: changed(header, "arrays", {"mean": {"dtype": "object", "shape": [6]}}), "float32 or float16"),
-        (lambda header: changed(header, "arrays", {"mean": {"dtype": "float32", "shape": [7]}}), "damaged"),
+        (
+            lambda header: changed(header, "arrays", {"mean": {"dtype": "object", "shape": [6]}}),
+            "float32, float16 or int8",
+        ),
+        (lambda header: changed(header, "arrays", {"mean": {"dtype": "float32", "shape": [7]}}), "28 bytes of mean"),
         (lambda header: changed(header, "words", {"names": ["a"], "space": {}}), "damaged"),
         (lambda header: to_metadata(header) | {f"{KEY}.mean": "no base64!"}, "damaged"),
-        (lambda header: to_metadata(header) | {f"{KEY}.mean": "AADAfwAAwH8AAMB/AADAfwAAwH8AAMB/"}, "not finite"),
+        (lambda header: to_metadata(header) | {f"{KEY}.mean": "AADAfwAAwH8AAMB/AADAfwAAwH8AAMB/"}, "damaged"),
+        (lambda header: to_metadata(header) | {f"{KEY}.mean": deflated(b"\0\0\xc0\x7f" * 6)}, "not finite"),
+        (lambda header: to_metadata(header) | {f"{KEY}.mean": deflated(b"\0" * 10**7)}, "24 bytes of mean, got more"),
+        (lambda header: changed(header, "precision", "int4"), "expected a precision among float32"),
     ],
 )
 @pytest.mark.usefixtures("no_jaxtyping")
@@ -265,7 +238,7 @@ def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[TorchEn
     head = next(each for each in model.graph.initializer if each.name.endswith("head.bias"))
     head.CopyFrom(onnx.numpy_helper.from_array(onnx.numpy_helper.to_array(head) + np.float32(0.01), head.name))
     with pytest.raises(InputError, match="on a sheet onnxruntime and torch differ by .* no file was written"):
-        check_parity(model.SerializeToString(), both[0], [("a sheet", random_cloud(50, 0.05), 1.0)])
+        check_parity(model.SerializeToString(), both[0], [Cloud("a sheet", random_cloud(50, 0.05))])
 
 
 def test_the_command_tells_what_it_compared(folder: Path) -> None:
@@ -283,6 +256,9 @@ def test_the_command_tells_what_it_compared(folder: Path) -> None:
         (["out=encoder.safetensors"], "expected a file that ends in .onnx"),
         (["out=encoder.onnx", "sizes=[0]"], "sizes: expected one or more numbers from 1"),
         (["out=encoder.onnx", "tolerance=0"], "tolerance: expected a share between 0 and 1"),
+        (["out=encoder.onnx", "cosine=2"], "cosine: expected -1 to 1"),
+        (["out=encoder.onnx", "precision=int4"], "precision"),
+        (["out=encoder.onnx", "precision=int8_static"], "give splats or scenes to calibrate on"),
         (["out=encoder.onnx", "weights=nothing"], "weights: no file at nothing"),
         (["out=taken.onnx"], "taken.onnx: exists; give another out= or overwrite=true"),
         (["out=encoder.onnx", "none.ply"], "none.ply"),
@@ -307,7 +283,7 @@ def test_without_the_packages_of_an_export_it_says_which(both: tuple[TorchEncode
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "onnxscript", None)
         with pytest.raises(InputError, match=r"needs the package onnxscript: pip install 'gsencoder\[export\]'"):
-            export_onnx(both[0])
+            lower(both[0])
 
 
 def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,60 @@
+"""An encoder that is small, and what it was exported to."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from symbolic import symbolic_sizes
+
+from gsencoder import cli
+from gsencoder.data.text_table import make_text_table, save_text_table
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.export_onnx import lower
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.weights import save_weights
+from gsencoder.types import FeatureBasis, FeatureSpace
+
+SHAPE = TransformerConfig(
+    encoder_depths=(1, 2, 1),
+    encoder_channels=(16, 16, 32),
+    decoder_depths=(1, 1),
+    decoder_channels=(16, 16),
+    head_channels=8,
+    patch=24,
+)
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights with a basis and words beside them, as `train` leaves them, and what they were exported to."""
+    folder = tmp_path_factory.mktemp("encoder")
+    rng = np.random.default_rng(0)
+    table = make_text_table(("mug", "plant", "chair"), np.linalg.qr(rng.normal(size=(6, 3)))[0].T, "words-6")
+    space = FeatureSpace(name="six", channels=6, teacher="labels", text_encoder="words-6", preprocessing="none")
+    mean = rng.normal(size=6).astype(np.float32)
+    basis = FeatureBasis(
+        mean=mean,
+        components=np.linalg.qr(rng.normal(size=(6, 4)))[0].T.astype(np.float32),
+        energy_kept=0.9,
+        space=space,
+    )
+    torch.manual_seed(0)
+    encoder = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), 4)
+    outputs = OutputSpace(space=space, mean=mean, scale=2.0, basis=basis)
+    save_weights(folder / "encoder.safetensors", encoder, outputs, {"steps": 3})
+    save_text_table(folder / "words.safetensors", table)
+    with symbolic_sizes():
+        words = [f"weights={folder}", f"out={folder / 'encoder.onnx'}", "sizes=[1,50]", "quiet=true"]
+        assert cli.main(["export", *words]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def lowered(exported: Path) -> Any:
+    """The encoder as a graph whose convolutions are still one operator each."""
+    with symbolic_sizes():
+        return lower(TorchEncoder(str(exported)))

@@ -1,0 +1,212 @@
+"""Exports in cheaper precisions: integer arithmetic held against the same in numpy, and features against float32's."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from onnx import helper
+from symbolic import symbolic_sizes
+
+from gsencoder import cli
+from gsencoder.data.splats import save_splat
+from gsencoder.errors import InputError
+from gsencoder.fusion.field_error import field_error
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.export_onnx import Cloud, check_cosines, export_onnx, lower, random_cloud
+from gsencoder.infer.onnx_operators import OPSET, OURS, in_standard_operators
+from gsencoder.infer.onnx_precision import step_and_zero
+from gsencoder.infer.onnx_runtime import OnnxEncoder
+from gsencoder.models.neighbors import convolve_reference, neighbor_table
+from gsencoder.rounding import round_columns
+
+CLOUD = Cloud("a sheet", random_cloud(3000, 0.05))
+ANY = EncodeConfig(chunk=0, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def encoder(exported: Path) -> TorchEncoder:
+    return TorchEncoder(str(exported))
+
+
+@pytest.fixture(scope="module")
+def exact(exported: Path) -> bytes:
+    return (exported / "encoder.onnx").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def build(encoder: TorchEncoder, lowered: Any) -> Callable[[Any], bytes]:
+    """The export in a precision, each made once."""
+    made: dict[str, bytes] = {}
+
+    def built(precision: Any) -> bytes:
+        if precision not in made:
+            with symbolic_sizes():
+                graph = lower(encoder, half=True) if precision == "float16" else lowered
+            made[precision] = export_onnx(encoder, graph, precision, scenes=[CLOUD])
+        return made[precision]
+
+    return built
+
+
+@pytest.mark.parametrize(
+    ("precision", "least", "largest"),
+    [
+        ("float16", 0.99999, 0.8),
+        ("int8_weights", 0.999, 0.65),
+        ("int8_dynamic", 0.99, 0.65),
+        ("int8_static", 0.99, 0.65),
+    ],
+)
+def test_a_cheaper_precision_is_smaller_and_close(
+    build: Callable[[Any], bytes], exact: bytes, precision: Any, least: float, largest: float
+) -> None:
+    model = build(precision)
+    assert len(model) < largest * len(exact)
+    runtime = OnnxEncoder(model, device="cpu")
+    assert runtime.header.precision == precision
+    (cosine,) = check_cosines(model, exact, [CLOUD], cosine=least).values()
+    assert cosine < 1 - 1e-9
+    assert runtime.words is not None
+    full = OnnxEncoder(exact, device="cpu").words
+    assert full is not None
+    np.testing.assert_allclose(runtime.words.embeddings, full.embeddings, atol=0.02)
+    for count in (1, 2, 40):
+        cloud = random_cloud(count, 0.05)
+        found = runtime.encode(cloud, ANY).features
+        assert np.abs(found - OnnxEncoder(exact, device="cpu").encode(cloud, ANY).features).max() < 0.5
+    with pytest.raises(InputError, match=f"the model computes in {precision}, not float32"):
+        runtime.encode(CLOUD.gaussians, EncodeConfig(precision="float32"))
+    loaded = onnx.load_from_string(model)
+    assert {each.domain for each in loaded.opset_import} == {""}
+    onnx.checker.check_model(loaded)
+
+
+def test_weights_in_int8_are_the_rounded_weights_in_torch(build: Callable[[Any], bytes], exported: Path) -> None:
+    rounded = TorchEncoder(str(exported))
+    with torch.no_grad():
+        for name, value in rounded.network.named_parameters():
+            if value.ndim == 1:
+                continue
+            columns = value.flatten(0, 1) if value.ndim == 3 else value.T
+            # Queries, keys and values have scales of their own, as all columns do.
+            whole, scale = round_columns(columns.numpy())
+            near = torch.from_numpy(whole * scale)
+            value.copy_(near.view_as(value) if value.ndim == 3 else near.T)
+            assert name
+    ours = OnnxEncoder(build("int8_weights"), device="cpu").encode(CLOUD.gaussians, ANY)
+    theirs = rounded.encode(CLOUD.gaussians, EncodeConfig(chunk=0, precision="float32", device="cpu"))
+    assert np.abs(ours.features - theirs.features).max() < 1e-4 * np.abs(theirs.features).max()
+
+
+def test_a_static_file_is_right_for_what_it_was_calibrated_on(
+    build: Callable[[Any], bytes], encoder: TorchEncoder, lowered: Any, exact: bytes
+) -> None:
+    """Ranges of a cloud that is another kind clip what goes into products."""
+    few = Cloud("few", random_cloud(4, 0.05, seed=1))
+    narrow = export_onnx(encoder, lowered, "int8_static", scenes=[few])
+    wide = export_onnx(encoder, lowered, "int8_static", scenes=[few, CLOUD])
+    full = OnnxEncoder(exact, device="cpu").encode(CLOUD.gaussians, ANY)
+    lost = [
+        field_error(OnnxEncoder(model, device="cpu").encode(CLOUD.gaussians, ANY), full).centred
+        for model in (narrow, wide, build("int8_static"))
+    ]
+    assert lost[1] < lost[0]
+    assert lost[2] < lost[0]
+    with pytest.raises(InputError, match="give splats or scenes to calibrate on"):
+        export_onnx(encoder, lowered, "int8_static")
+
+
+def operator(name: str, values: dict[str, np.ndarray]) -> np.ndarray:
+    """One of our operators under onnxruntime."""
+    kinds = {each: helper.np_dtype_to_tensor_dtype(value.dtype) for each, value in values.items()}
+    inputs = [helper.make_tensor_value_info(each, kinds[each], value.shape) for each, value in values.items()]
+    output = helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, ["rows", "columns"])
+    node = helper.make_node(name, list(values), ["y"], domain=OURS.domain)
+    graph = helper.make_graph([node], "one", inputs, [output])
+    opsets = [helper.make_opsetid("", OPSET), helper.make_opsetid(OURS.domain, OURS.version)]
+    model = in_standard_operators(helper.make_model(graph, opset_imports=opsets, ir_version=10))
+    session = onnxruntime.InferenceSession(model.SerializeToString())
+    (found,) = session.run(None, values)
+    return np.asarray(found)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 1023, 1024, 1025, 3000])
+def test_a_convolution_of_integers_is_that_of_what_they_stand_for(rows: int) -> None:
+    rng = np.random.default_rng(rows)
+    cells = np.unique(rng.integers(0, 14, (2 * rows, 3)), axis=0)[:rows]
+    neighbors = neighbor_table(torch.from_numpy(cells)).numpy()
+    x = rng.integers(0, 256, (len(cells), 5)).astype(np.uint8)
+    weight = rng.integers(-127, 128, (27 * 5, 7)).astype(np.int8)
+    step, zero, scale = np.float32(0.02), np.uint8(113), rng.uniform(0.001, 0.1, 7).astype(np.float32)
+    found = operator(
+        "convolve_int8",
+        {"x": x, "step": np.array(step), "zero": np.array(zero), "n": neighbors, "weight": weight, "scale": scale},
+    )
+    stands = torch.from_numpy(step.astype(np.float64) * (x.astype(np.float64) - zero))
+    matrix = torch.from_numpy((weight * scale.astype(np.float64)).reshape(27, 5, 7))
+    expected = convolve_reference(stands, torch.from_numpy(neighbors), matrix).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
+    found = operator("convolve", {"x": stands.numpy().astype(np.float32), "n": neighbors, "w": matrix.float().numpy()})
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+
+
+def test_a_linear_layer_of_integers_is_that_of_what_they_stand_for() -> None:
+    rng = np.random.default_rng(0)
+    x, weight = rng.integers(0, 256, (40, 64)).astype(np.uint8), rng.integers(-127, 128, (64, 9)).astype(np.int8)
+    scale, bias = rng.uniform(0.001, 0.1, 9).astype(np.float32), rng.normal(size=9).astype(np.float32)
+    values = {
+        "x": x,
+        "step": np.array(0.5, np.float32),
+        "zero": np.array(7, np.uint8),
+        "w": weight,
+        "s": scale,
+        "b": bias,
+    }
+    expected = 0.5 * (x.astype(float) - 7) @ (weight * scale.astype(float)) + bias
+    np.testing.assert_allclose(operator("linear_int8", values), expected, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(-1.0, 3.0), (2.0, 5.0), (-7.0, -3.0), (0.0, 0.0), (-1e-30, 1e30), (-1e30, 1e-30), (-1e-42, 0.0)]
+)
+def test_bytes_span_a_range_and_hold_zero(low: float, high: float) -> None:
+    step, zero = step_and_zero(low, high)
+    assert step > 0
+    assert step * (0 - float(zero)) <= min(low, 0) + 0.51 * step
+    assert step * (255 - float(zero)) >= max(high, 0) - 0.51 * step
+
+
+@pytest.mark.parametrize("most", [1, 63, 127])
+def test_rounded_columns_are_within_half_a_step(most: int) -> None:
+    rng = np.random.default_rng(0)
+    matrix = (rng.normal(size=(50, 6)) * [1, 1e-8, 1e6, 0, 1, 1e-30]).astype(np.float32)
+    whole, scale = round_columns(matrix, most)
+    assert np.abs(whole).max() == most
+    assert (np.abs(whole * scale - matrix) <= 0.5001 * scale).all()
+    assert not whole[:, 3].any()
+    assert (scale > 0).all()
+
+
+def test_the_command_judges_what_it_writes(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_splat(tmp_path / "room.ply", CLOUD.gaussians)
+    out = tmp_path / "small.onnx"
+    words = [str(tmp_path / "room.ply"), f"weights={exported}", f"out={out}", "sizes=[1]", "precision=int8_static"]
+    with symbolic_sizes():
+        assert cli.main(["export", *words, "cosine=0.999999"]) == 2
+        told = capsys.readouterr().err
+        assert "on room int8_static gives features whose mean centred cosine" in told
+        assert not out.exists()
+        assert cli.main(["export", *words]) == 0
+    results = json.loads(Path(f"{out}.summary.json").read_text())["results"]
+    assert results["precision"] == "int8_static"
+    assert results["bytes"] == out.stat().st_size < results["bytes_float32"]
+    assert list(results["cosines"]) == ["room"]
+    assert results["cosines"]["room"] > 0.99
+    assert cli.main(["encode", str(tmp_path / "room.ply"), f"weights={out}", f"out={tmp_path / 'features'}"]) == 0
