@@ -59,7 +59,7 @@ def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise InputError(f"export needs the package {error.name}: pip install 'gsencoder[export]'") from error
-    from gsencoder.infer.onnx_operators import OPSET, TRANSLATIONS
+    from gsencoder.infer.onnx_operators import OPSET, TRANSLATIONS, simplified
 
     header = header_of(encoder)
     network = deepcopy(encoder.network).half() if half else encoder.network
@@ -81,10 +81,11 @@ def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
             custom_translation_table=TRANSLATIONS,
             input_names=[*FIELDS, *SETTINGS],
             output_names=[OUTPUT],
+            optimize=False,
             verbose=False,
         )
     assert exported is not None
-    return exported.model_proto
+    return simplified(exported.model)
 
 
 def export_onnx(

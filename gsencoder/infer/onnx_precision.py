@@ -12,7 +12,6 @@ import numpy as np
 import onnx
 from jaxtyping import Float32, UInt8
 from onnx import helper, numpy_helper
-from onnx.reference import ReferenceEvaluator
 
 from gsencoder.errors import InputError
 from gsencoder.infer.chunks import EncodeConfig, cut
@@ -142,7 +141,7 @@ def calibrate(
 
 
 def _products(graph: onnx.GraphProto) -> Iterator[Product]:
-    known = _constants(graph)
+    known = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
     for node in graph.node:
         if node.domain == OURS.domain and node.op_type == convolve.name and node.input[2] in known:
             weight = known[node.input[2]]
@@ -151,16 +150,6 @@ def _products(graph: onnx.GraphProto) -> Iterator[Product]:
             given = {each.name: helper.get_attribute_value(each) for each in node.attribute}
             if given.get("transB", 0) == 1 and not given.get("transA", 0) and len(node.input) == 3:
                 yield Product(node, node.input[0], node.input[1], known[node.input[1]].T)
-
-
-def _constants(graph: onnx.GraphProto) -> dict[str, np.ndarray]:
-    """Stored arrays, and parts of them: of the weights of attention, queries, keys and values each take a third."""
-    known = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
-    for node in graph.node:
-        if node.op_type == "Slice" and all(name in known for name in node.input):
-            feed = {name: known[name] for name in node.input}
-            (known[node.output[0]],) = ReferenceEvaluator(node).run(None, feed)
-    return known
 
 
 def _quantize(graph: onnx.GraphProto, x: str, names: Sequence[str], ranges: Ranges | None) -> onnx.NodeProto:

@@ -29,8 +29,8 @@ SHAPE = TransformerConfig(
 
 
 @pytest.fixture(scope="session")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights with a basis and words beside them, as `train` leaves them, and what they were exported to."""
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of weights with a basis and words beside them, as `train` leaves them."""
     folder = tmp_path_factory.mktemp("encoder")
     rng = np.random.default_rng(0)
     table = make_text_table(("mug", "plant", "chair"), np.linalg.qr(rng.normal(size=(6, 3)))[0].T, "words-6")
@@ -47,14 +47,21 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     outputs = OutputSpace(space=space, mean=mean, scale=2.0, basis=basis)
     save_weights(folder / "encoder.safetensors", encoder, outputs, {"steps": 3})
     save_text_table(folder / "words.safetensors", table)
-    with symbolic_sizes():
-        words = [f"weights={folder}", f"out={folder / 'encoder.onnx'}", "sizes=[1,50]", "quiet=true"]
-        assert cli.main(["export", *words]) == 0
     return folder
 
 
 @pytest.fixture(scope="session")
-def lowered(exported: Path) -> Any:
-    """The encoder as a graph whose convolutions are still one operator each."""
+def lowered(weights: Path) -> Any:
+    """The encoder as a graph whose convolutions are still one operator each, which takes as long as all else."""
     with symbolic_sizes():
-        return lower(TorchEncoder(str(exported)))
+        return lower(TorchEncoder(str(weights)))
+
+
+@pytest.fixture(scope="session")
+def exported(weights: Path, lowered: Any) -> Path:
+    """The same folder, and in it what the command exported the encoder to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsencoder.commands.export.lower", lambda _: lowered)
+        words = [f"weights={weights}", f"out={weights / 'encoder.onnx'}", "sizes=[1,50]", "quiet=true"]
+        assert cli.main(["export", *words]) == 0
+    return weights

@@ -1,0 +1,64 @@
+"""Exports of one encoder in several precisions: bytes, features and seconds beside the first of them.
+
+    python bench/precision.py FLOAT32.onnx OTHER.onnx … --scenes SCENE …
+
+Features are compared by centred cosine, Gaussian by Gaussian; 1 % of them are below the second figure. Seconds are the
+best of three passes, in which the files take turns.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeds import with_gaussians
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.onnx_runtime import OnnxEncoder
+from gsencoder.types import GaussianFeatures
+
+PASSES = 3
+
+
+def cosines(ours: GaussianFeatures, theirs: GaussianFeatures) -> np.ndarray:
+    """Of coordinates, which are centred as they are, or of vectors less the space's mean."""
+    mean = ours.mean if ours.basis is None else np.float32(0)
+    a, b = (each.features.astype(np.float64) - mean for each in (ours, theirs))
+    return np.asarray((a * b).sum(axis=1) / np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1) + 1e-60))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("models", nargs="+")
+    parser.add_argument("--scenes", nargs="+", required=True)
+    chosen = parser.parse_args()
+    config = EncodeConfig(chunk=0, device="cpu")
+    encoders = {name: OnnxEncoder(name, device="cpu") for name in chosen.models}
+    means, lows, seconds = ({name: list[float]() for name in encoders} for _ in range(3))
+    for scene in chosen.scenes:
+        gaussians = with_gaussians(load_scene(scene)).gaussians
+        assert gaussians is not None
+        found = {name: encoder.encode(gaussians, config) for name, encoder in encoders.items()}
+        best = dict.fromkeys(encoders, np.inf)
+        for _ in range(PASSES):
+            for name, encoder in encoders.items():
+                start = time.perf_counter()
+                encoder.encode(gaussians, config)
+                best[name] = min(best[name], time.perf_counter() - start)
+        for name in encoders:
+            near = cosines(found[name], found[chosen.models[0]])
+            means[name].append(float(near.mean()))
+            lows[name].append(float(np.quantile(near, 0.01)))
+            seconds[name].append(best[name] / best[chosen.models[0]])
+    size = Path(chosen.models[0]).stat().st_size
+    for name, encoder in encoders.items():
+        print(
+            f"{encoder.header.precision}: bytes {Path(name).stat().st_size / size:.3f}; centred cosine "
+            f"{np.mean(means[name]):.5f} (worst scene {min(means[name]):.5f}), 1 % below {np.mean(lows[name]):.4f}; "
+            f"seconds {np.median(seconds[name]):.2f} ({min(seconds[name]):.2f} to {max(seconds[name]):.2f})"
+        )
+
+
+if __name__ == "__main__":
+    main()
