@@ -3,6 +3,9 @@
 Coordinates are turned so that the first hold most, each is replaced by the nearest of 2ᵇ levels (Lloyd 1982, Max 1960),
 and bits go one at a time to the coordinate whose error they lower most. A name or a patch lives near few directions, so
 that most coordinates need one or two bits, or none.
+
+Kinds of features count alike, however many Gaussians they have: what is asked for is a mug more often than a ceiling,
+and a mean over Gaussians is all ceiling.
 """
 
 from dataclasses import dataclass
@@ -18,6 +21,8 @@ MOST_BITS = 8
 """Of a coordinate."""
 SAMPLE = 10_000
 """Gaussians that levels are fitted to."""
+ALIKE = 0.9
+"""Rows whose centred cosine is above are of one kind."""
 ROUNDS = 10
 """Of moving levels to the mean of what is nearest to them."""
 BINS = 1024
@@ -42,7 +47,8 @@ class CompactFeatures:
         mean: of the space.
         basis: what the coordinates stand for.
         space: what decoded features are.
-        error: 1 − mean centred cosine to what was compacted, over the seen rows.
+        error: 1 − mean centred cosine to what was compacted: over the seen rows, or over their kinds (a sample in which
+            each row counts by how few are like it), whichever is larger.
     """
 
     codes: UInt8[np.ndarray, "n row_bytes"]
@@ -111,7 +117,7 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
 
     Args:
         features: fused or encoded.
-        error: budget of 1 − mean centred cosine.
+        error: budget of `CompactFeatures.error`.
 
     Raises:
         InputError: a budget out of range, or below what 8 bits a coordinate reach; nothing seen.
@@ -123,15 +129,15 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
         raise InputError("compact: no Gaussian has features")
     centred = _centred(features, rows[evenly(len(rows), SAMPLE)])
     norms = np.sqrt((centred * centred).sum(axis=1))
+    rarity = _rarity(centred, norms)
     # A cosine weighs an error by what it is an error of.
-    heft = 1 / np.maximum(norms, max(1e-6 * float(norms.max()), 1e-30)) ** 2
+    heft = rarity / np.maximum(norms, max(1e-6 * float(norms.max()), 1e-30)) ** 2
     _, vectors = np.linalg.eigh((centred * heft[:, None]).T @ centred)
     turned = vectors[:, ::-1]
-    choice = _Choice(centred @ turned, heft)
-    rough = 1.0
+    choice = _Choice(centred @ turned, heft, rarity)
     while True:
-        rough = choice.add_bits(8)
-        if rough > error and choice.can_grow:
+        choice.add_bits(8)
+        if max(choice.errors()) > error and choice.can_grow:
             continue
         found = _encode(features, rows, turned, choice)
         if found.error <= error:
@@ -148,11 +154,23 @@ def _centred(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray
     return values if features.basis is not None else values - features.mean
 
 
+def _rarity(centred: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """1 over the number of rows that point the same way, which adds up to one for each kind of feature."""
+    units = (centred / np.where(norms > 0, norms, 1)[:, None]).astype(np.float32)
+    alike = [(units[start : start + 1024] @ units.T > ALIKE).sum(axis=1) for start in range(0, len(units), 1024)]
+    return 1 / np.maximum(np.concatenate(alike), 1)
+
+
 class _Choice:
     """How many bits each coordinate has, and its levels, on a sample."""
 
-    def __init__(self, sample: Float64[np.ndarray, "n R"], heft: Float64[np.ndarray, " n"]) -> None:
-        self._sample, self._heft = sample, heft
+    def __init__(
+        self,
+        sample: Float64[np.ndarray, "n R"],
+        heft: Float64[np.ndarray, " n"],
+        rarity: Float64[np.ndarray, " n"],
+    ) -> None:
+        self._sample, self._heft, self._rarity = sample, heft, rarity
         count = sample.shape[1]
         self.bits = np.zeros(count, np.int64)
         self.levels = [np.zeros(1)] * count
@@ -171,8 +189,13 @@ class _Choice:
         """Whether some coordinate may have more bits."""
         return bool((self.bits < MOST_BITS).any())
 
-    def add_bits(self, count: int) -> float:
-        """Gives some more bits, each where it lowers the error most; the mean 1 − cosine that is left."""
+    def errors(self) -> tuple[float, float]:
+        """The mean of 1 − cosine over rows, and over kinds."""
+        each = 1 - _cosines(self._sample, self._rounded, (self._sample**2).sum(axis=1))
+        return float(each.mean()), float(self._rarity @ each / self._rarity.sum())
+
+    def add_bits(self, count: int) -> None:
+        """Gives some more bits, each where it lowers the error most."""
         for _ in range(count):
             gains = [
                 self._now[number] - self._next[number][0] if self.bits[number] < MOST_BITS else -1.0
@@ -186,7 +209,6 @@ class _Choice:
             self._rounded[:, best] = self.levels[best][_nearest(self.levels[best], self._sample[:, best])]
             if self.bits[best] < MOST_BITS:
                 self._next[best] = self._fit(best, int(self.bits[best]) + 1)
-        return float(1 - _cosines(self._sample, self._rounded, (self._sample**2).sum(axis=1)).mean())
 
     def _fit(self, number: int, bits: int) -> tuple[float, Float64[np.ndarray, " L"]]:
         """The weighted error that is left, and the levels: each the mean of what is nearest to it."""
@@ -253,7 +275,7 @@ def _encode(
             energy_kept=choice.energy_kept * (1.0 if basis is None else basis.energy_kept),
             space=features.space,
         ),
-        error=1 - cosines / len(rows),
+        error=max(1 - cosines / len(rows), choice.errors()[1]),
     )
 
 
