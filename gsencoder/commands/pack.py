@@ -20,7 +20,8 @@ class PackConfig(CommonConfig):
     """Settings of `pack`."""
 
     paths: tuple[str, ...] = field(
-        default=(), metadata={"help": "a folder that fuse or encode made", "metavar": "FEATURES", "required": True}
+        default=(),
+        metadata={"help": "a folder that fuse, encode or pack made", "metavar": "FEATURES", "required": True},
     )
     form: Form = field(
         default="compact",
@@ -30,11 +31,16 @@ class PackConfig(CommonConfig):
         },
     )
     error: float = field(
-        default=0.01, metadata={"help": "of form=compact: the mean loss of centred cosine that is allowed"}
+        default=0.01,
+        metadata={
+            "help": "of form=compact: the mean loss of centred cosine that is allowed, over Gaussians and over kinds"
+        },
     )
     decoded: bool = field(
         default=False,
-        metadata={"help": "of the other forms: whole vectors in place of coordinates in a basis; float16 in arrays"},
+        metadata={
+            "help": "of the other forms: whole vectors in place of coordinates in a basis; in float16, but for ply"
+        },
     )
 
     def __post_init__(self) -> None:
@@ -77,9 +83,20 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
     size = (folder / PACKAGE_FILE).stat().st_size
     share = size / (dense * len(features))
     summary.results.update(
-        bytes=size, row_bytes=made.row_bytes, rank=made.basis.rank, error=made.error, share_of_float16=share
+        bytes=size,
+        row_bytes=made.row_bytes,
+        rank=made.basis.rank,
+        error=made.error,
+        lowest=made.lowest,
+        weight_error=(made.heaviest / made.lightest) ** (1 / 510) - 1,
+        share_of_float16=share,
     )
     return (
-        f"features of {seen:,} of {len(features):,} Gaussians in {size / 1e6:.1f} MB, 1/{1 / share:.0f} of float16 "
-        f"vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centred cosines lose {made.error:.4f}"
+        f"features of {seen:,} of {len(features):,} Gaussians in {size / 1e6:.3g} MB, {_ratio(share)} of float16 "
+        f"vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centred cosines lose "
+        f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
     )
+
+
+def _ratio(share: float) -> str:
+    return f"1/{1 / share:.0f}" if share < 0.5 else f"{share:.2f}"

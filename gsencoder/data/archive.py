@@ -17,6 +17,7 @@ from gsencoder.data.atomic import is_full_disk
 from gsencoder.errors import InputError, about
 
 VERSION = 1
+LARGEST_NUMBER = 2.0**63
 DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", "I64": "int64", "U8": "uint8"}
 """safetensors' names of the number types that are written here."""
 
@@ -99,6 +100,8 @@ class Archive:
             names = " or ".join("null" if kind is None else kind.__name__ for kind in kinds)
             got = f"{str(value)[:60]!r}" if key in self._header else "nothing"
             raise InputError(f"{self.path}: expected {key} ({names}) in the header, got {got}")
+        if isinstance(value, (int, float)) and not abs(value) < LARGEST_NUMBER:
+            raise InputError(f"{self.path}: expected a finite {key} in the header, got {str(value)[:20]}")
         return value
 
     def verify(self) -> None:

@@ -76,7 +76,7 @@ def read_scene(file: Archive, gaussians: Gaussians) -> Scene:
         InputError: missing or damaged.
     """
     up = file.value("up", list, None)
-    if up is not None and not (len(up) == 3 and all(type(part) in (int, float) for part in up)):
+    if up is not None and not (len(up) == 3 and all(type(part) in (int, float) and abs(part) < 2 for part in up)):
         raise InputError(f"expected three numbers for up in the header, got {str(up)[:60]}")
     return Scene(
         name=file.value("name", str),

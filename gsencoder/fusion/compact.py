@@ -23,13 +23,15 @@ SAMPLE = 10_000
 """Gaussians that levels are fitted to."""
 ALIKE = 0.9
 """Rows whose centred cosine is above are of one kind."""
+RETRIES = 3
+"""Times that a sample is completed by rows that it missed."""
 ROUNDS = 10
 """Of moving levels to the mean of what is nearest to them."""
 BINS = 1024
 BLOCK = 16_384
 """Rows that are turned into bits, or back, at a time."""
-LIGHTEST = 1e-6
-"""A share of the largest weight; lighter Gaussians are stored with that."""
+LOST = 0.8
+"""A row whose cosine falls below is of a kind that the sample missed; generous budgets take a lower bound."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,7 +42,8 @@ class CompactFeatures:
         codes: of the seen rows, each row's bits one coordinate after the other, the first in the highest bit.
         bits: of each coordinate.
         levels: what the codes of each coordinate stand for, 2ᵇ values each.
-        weight_codes: of the seen rows; 255 = `heaviest`, and each step less is a factor.
+        weight_codes: of the seen rows; 0 = `lightest`, 255 = `heaviest`, and each step between is the same factor.
+        lightest: the smallest weight of a seen row.
         heaviest: the largest weight.
         rows: which Gaussians were seen, ascending.
         total: Gaussians.
@@ -48,30 +51,43 @@ class CompactFeatures:
         basis: what the coordinates stand for.
         space: what decoded features are.
         error: 1 − mean centred cosine to what was compacted: over the seen rows, or over their kinds (a sample in which
-            each row counts by how few are like it), whichever is larger.
+            each row counts by how few are like it), whichever is larger. Features at the space's mean have no cosine.
+        lowest: the centred cosine that one row in a thousand is below.
     """
 
     codes: UInt8[np.ndarray, "n row_bytes"]
     bits: UInt8[np.ndarray, " R"]
     levels: Float32[np.ndarray, " L"]
     weight_codes: UInt8[np.ndarray, " n"]
+    lightest: float
     heaviest: float
     rows: Int64[np.ndarray, " n"]
     total: int
     basis: FeatureBasis
     error: float
+    lowest: float
 
     def __post_init__(self) -> None:
-        used = int(self.bits.astype(np.int64).sum())
-        fits = self.codes.shape[1] == -(-used // 8) and len(self.levels) == int((1 << self.bits.astype(np.int64)).sum())
-        if not fits or len(self.bits) != self.basis.rank or self.bits.max(initial=0) > MOST_BITS or not self.bits.all():
+        counts = self.bits.astype(np.int64)
+        fits = self.codes.shape[1] == -(-int(counts.sum()) // 8) and len(self.levels) == int((1 << counts).sum())
+        if not fits or len(counts) != self.basis.rank or not len(counts) or not 1 <= counts.min() <= counts.max() <= 8:
             raise InputError(
                 f"CompactFeatures: {self.codes.shape[1]} bytes a row and {len(self.levels)} levels do not go with bits "
-                f"{self.bits.tolist()[:20]} of {self.basis.rank} coordinates"
+                f"{counts.tolist()[:20]} of {self.basis.rank} coordinates"
             )
-        ordered = len(self.rows) == 0 or (self.rows[0] >= 0 and self.rows[-1] < self.total)
-        if not ordered or (np.diff(self.rows) <= 0).any() or not 0 < self.heaviest < np.inf:
+        if not len(self.codes) == len(self.weight_codes) == len(self.rows) > 0:
+            raise InputError(
+                f"CompactFeatures: {len(self.rows)} seen rows, {len(self.codes)} codes and {len(self.weight_codes)} "
+                "weights; expected as many of each"
+            )
+        if self.rows[0] < 0 or self.rows[-1] >= self.total or (np.diff(self.rows) <= 0).any():
             raise InputError(f"CompactFeatures: expected rows that rise from 0 to at most {self.total - 1}")
+        tiny, largest = np.finfo(np.float32).tiny, np.finfo(np.float32).max
+        if not tiny <= self.lightest <= self.heaviest <= largest or not 0 <= self.error <= 2:
+            raise InputError(
+                f"CompactFeatures: expected weights in float32's range and an error from 0, got {self.lightest} to "
+                f"{self.heaviest} and {self.error}"
+            )
 
     def __len__(self) -> int:
         return self.total
@@ -96,7 +112,8 @@ class CompactFeatures:
         values = np.zeros((self.total, self.basis.rank), np.float32)
         weights = np.zeros(self.total, np.float32)
         values[self.rows] = self.coordinates()
-        weights[self.rows] = self.heaviest * LIGHTEST ** ((255 - self.weight_codes.astype(np.float32)) / 255)
+        share = self.weight_codes / 255
+        weights[self.rows] = np.exp((1 - share) * np.log(self.lightest) + share * np.log(self.heaviest))
         return GaussianFeatures(
             features=values, weights=weights, mean=self.basis.mean, space=self.space, basis=self.basis
         )
@@ -127,11 +144,29 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
     rows = np.flatnonzero(features.seen)
     if not len(rows):
         raise InputError("compact: no Gaussian has features")
-    centred = _centred(features, rows[evenly(len(rows), SAMPLE)])
+    sample = rows[evenly(len(rows), SAMPLE)]
+    bound = min(LOST, 1 - 10 * error)
+    for _ in range(RETRIES):
+        found, cosines = _within(features, rows, sample, error)
+        lost = np.setdiff1d(rows[cosines < bound], sample)
+        if not len(lost):
+            break
+        sample = np.union1d(sample, lost[evenly(len(lost), SAMPLE // 4)])
+    return found
+
+
+def _within(
+    features: GaussianFeatures, rows: Int64[np.ndarray, " n"], sample: Int64[np.ndarray, " k"], error: float
+) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
+    """The fewest bytes a row that a sample asks for, and what they leave of the cosine of each row."""
+    centred = _centred(features, sample)
     norms = np.sqrt((centred * centred).sum(axis=1))
+    centred, norms = centred[norms > 0], norms[norms > 0]
+    if not len(norms):
+        raise InputError("compact: all features are the space's mean, which no direction tells from one another")
     rarity = _rarity(centred, norms)
     # A cosine weighs an error by what it is an error of.
-    heft = rarity / np.maximum(norms, max(1e-6 * float(norms.max()), 1e-30)) ** 2
+    heft = rarity / np.maximum(norms, 1e-6 * float(norms.max())) ** 2
     _, vectors = np.linalg.eigh((centred * heft[:, None]).T @ centred)
     turned = vectors[:, ::-1]
     choice = _Choice(centred @ turned, heft, rarity)
@@ -139,9 +174,9 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
         choice.add_bits(8)
         if max(choice.errors()) > error and choice.can_grow:
             continue
-        found = _encode(features, rows, turned, choice)
+        found, cosines = _encode(features, rows, turned, choice)
         if found.error <= error:
-            return found
+            return found, cosines
         if not choice.can_grow:
             raise InputError(
                 f"error={error}: {MOST_BITS} bits a coordinate reach {found.error:.2g}; give a larger budget, or "
@@ -156,7 +191,7 @@ def _centred(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray
 
 def _rarity(centred: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """1 over the number of rows that point the same way, which adds up to one for each kind of feature."""
-    units = (centred / np.where(norms > 0, norms, 1)[:, None]).astype(np.float32)
+    units = (centred / norms[:, None]).astype(np.float32)
     alike = [(units[start : start + 1024] @ units.T > ALIKE).sum(axis=1) for start in range(0, len(units), 1024)]
     return 1 / np.maximum(np.concatenate(alike), 1)
 
@@ -240,11 +275,11 @@ def _nearest(levels: np.ndarray, values: np.ndarray) -> Int64[np.ndarray, " n"]:
 
 def _encode(
     features: GaussianFeatures, rows: Int64[np.ndarray, " n"], turned: Float64[np.ndarray, "R R"], choice: _Choice
-) -> CompactFeatures:
+) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
     used = np.flatnonzero(choice.bits)
     bits, levels = choice.bits[used], [choice.levels[number].astype(np.float32) for number in used]
     codes = np.empty((len(rows), -(-int(bits.sum()) // 8)), np.uint8)
-    cosines = 0.0
+    cosines = np.ones(len(rows))
     for start in range(0, len(rows), BLOCK):
         centred = _centred(features, rows[start : start + BLOCK])
         values = centred @ turned[:, used]
@@ -254,18 +289,21 @@ def _encode(
             rounded[:, number] = each[code]
             ones.append(code[:, None] >> np.arange(width - 1, -1, -1) & 1)
         codes[start : start + BLOCK] = np.packbits(np.concatenate(ones, axis=1).astype(np.uint8), axis=1)
-        cosines += float(_cosines(values, rounded, (centred**2).sum(axis=1)).sum())
+        squares = (centred**2).sum(axis=1)
+        cosines[start : start + BLOCK] = np.where(squares > 0, _cosines(values, rounded, squares), np.nan)
     axes = turned[:, used].T
     basis = features.basis
     components = axes if basis is None else axes @ basis.components
     weights = features.weights[rows].astype(np.float64)
-    heaviest = float(weights.max())
-    shares = np.log(np.maximum(weights / heaviest, LIGHTEST)) / np.log(LIGHTEST)
-    return CompactFeatures(
+    tiny = float(np.finfo(np.float32).tiny)
+    lightest, heaviest = max(float(weights.min()), tiny), max(float(weights.max()), tiny)
+    shares = np.log(np.maximum(weights, lightest) / lightest) / max(np.log(heaviest / lightest), 1e-12)
+    made = CompactFeatures(
         codes=codes,
         bits=bits.astype(np.uint8),
         levels=np.concatenate(levels),
-        weight_codes=np.rint(255 * (1 - shares)).astype(np.uint8),
+        weight_codes=np.rint(255 * shares).astype(np.uint8),
+        lightest=lightest,
         heaviest=heaviest,
         rows=rows,
         total=len(features),
@@ -275,8 +313,10 @@ def _encode(
             energy_kept=choice.energy_kept * (1.0 if basis is None else basis.energy_kept),
             space=features.space,
         ),
-        error=max(1 - cosines / len(rows), choice.errors()[1]),
+        error=max(1 - float(np.nanmean(cosines)), choice.errors()[1], 0.0),
+        lowest=float(np.nanquantile(cosines, 0.001)),
     )
+    return made, cosines
 
 
 def _cosines(

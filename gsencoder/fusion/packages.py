@@ -18,7 +18,7 @@ from gsencoder.data.atomic import atomic_file
 from gsencoder.data.splats import fingerprint, load_splat, save_splat
 from gsencoder.errors import InputError
 from gsencoder.fusion.compact import CompactFeatures, compact
-from gsencoder.types import FeatureBasis, GaussianFeatures, Scene
+from gsencoder.types import GaussianFeatures, Scene
 
 Form = Literal["compact", "npz", "safetensors", "ply"]
 SPLAT_FILE, PACKAGE_FILE = "splat.ply", "features.gsf"
@@ -56,8 +56,10 @@ def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, erro
         "form": FORMAT,
         "fingerprint": written,
         "total": len(made),
+        "lightest": made.lightest,
         "heaviest": made.heaviest,
         "error": made.error,
+        "lowest": made.lowest,
     }
     write_archive(folder / PACKAGE_FILE, arrays | coded, header, summed=True)
     return made
@@ -81,19 +83,18 @@ def open_package(file: Path) -> CompactFeatures:
         seen, total = archive.array("seen", "uint8", ("S",)), archive.value("total", int)
         if not 0 <= total <= 8 * len(seen) < total + 8:
             raise InputError(f"expected marks of {total} Gaussians, got {8 * len(seen)}")
-        rows = np.flatnonzero(np.unpackbits(seen, count=total))
-        if not len(rows) == len(mapped["codes"]) == len(mapped["weight_codes"]):
-            raise InputError(f"{len(rows)} Gaussians are marked, and {len(mapped['codes'])} have codes")
         return CompactFeatures(
             codes=mapped["codes"],
             bits=archive.array("bits", "uint8", ("R",)),
             levels=archive.array("levels", "float32", ("L",)),
             weight_codes=mapped["weight_codes"],
+            lightest=archive.value("lightest", float, int),
             heaviest=archive.value("heaviest", float, int),
-            rows=rows,
+            rows=np.flatnonzero(np.unpackbits(seen, count=total)),
             total=total,
             basis=basis,
             error=archive.value("error", float, int),
+            lowest=archive.value("lowest", float, int),
         )
 
 
@@ -104,16 +105,17 @@ def load_package(folder: Path) -> Scene:
         InputError: damaged, of another version, or features of another splat.
     """
     file = folder / PACKAGE_FILE
-    features = open_package(file).features()
+    packed = open_package(file)
     with open_archive(file) as archive:
         origin, belongs = archive.array("origin", "float64", (3,)), archive.value("fingerprint", str)
         gaussians = load_splat(folder / SPLAT_FILE, origin=origin)
         actual = fingerprint(gaussians)
-        if belongs != actual:
+        if belongs != actual or len(gaussians) != len(packed):
             raise InputError(
                 f"the features belong to splat {belongs[:8]}…, {SPLAT_FILE} is {actual[:8]}…; pack this splat's own"
             )
         scene = read_scene(archive, gaussians)
+    features = packed.features()
     return replace(scene, features={features.space.name: features})
 
 
@@ -126,7 +128,7 @@ def save_arrays(
     Raises:
         InputError: no Gaussians, or vectors that float16 does not hold.
     """
-    arrays = _plain(features, decoded=decoded)
+    arrays = _plain(features, decoded="float16" if decoded else "")
     about = _about(features, _save_splat(folder, scene), decoded=decoded)
     if form == "npz":
         with atomic_file(folder / NPZ_FILE) as stream:
@@ -142,8 +144,8 @@ def save_ply(folder: Path, scene: Scene, features: GaussianFeatures, *, decoded:
     Raises:
         InputError: no Gaussians.
     """
-    arrays = _plain(features, decoded=decoded)
-    columns = arrays.pop("features").T.astype(np.float32)
+    arrays = _plain(features, decoded="float32" if decoded else "")
+    columns = np.ascontiguousarray(arrays.pop("features").T)
     further = {f"feature_{number}": column for number, column in enumerate(columns)}
     written = _save_splat(folder, scene, {**further, "feature_weight": arrays.pop("weights")})
     about = _about(features, written, decoded=decoded)
@@ -159,19 +161,19 @@ def _save_splat(folder: Path, scene: Scene, further: Mapping[str, np.ndarray] | 
     return fingerprint(load_splat(folder / SPLAT_FILE, origin=scene.origin))
 
 
-def _plain(features: GaussianFeatures, *, decoded: bool) -> dict[str, np.ndarray]:
+def _plain(features: GaussianFeatures, *, decoded: str) -> dict[str, np.ndarray]:
+    """The arrays; `decoded` is the type of whole vectors, or empty for coordinates."""
     arrays = {"weights": features.weights, "mean": features.mean}
-    basis: FeatureBasis | None = features.basis
-    if basis is None or not decoded:
-        components = {} if basis is None else {"components": basis.components}
+    if not decoded:
+        components = {} if features.basis is None else {"components": features.basis.components}
         return {"features": features.features, **arrays, **components}
-    vectors = np.zeros((len(features), features.space.channels), np.float16)
+    vectors = np.zeros((len(features), features.space.channels), decoded)
     seen = np.flatnonzero(features.seen)
     for rows in np.array_split(seen, max(1, len(seen) // 65536)):
         with np.errstate(over="ignore"):
             vectors[rows] = features.decode(rows)
         if not np.isfinite(vectors[rows]).all():
-            raise InputError("decoded=true: vectors beyond 65,504 do not fit into float16; take decoded=false")
+            raise InputError(f"decoded=true: the vectors do not fit into {decoded}; take decoded=false, or form=ply")
     return {"features": vectors, **arrays}
 
 

@@ -73,6 +73,8 @@ def load_features(folder: Path) -> Scene:
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of features made by `gsencoder fuse`, `encode` or `pack`")
     if (folder / PACKAGE_FILE).is_file():
+        if (folder / SCENE_FILE).is_file():
+            raise InputError(f"{folder}: holds {SCENE_FILE} and {PACKAGE_FILE}, two kinds of features; keep one")
         return load_package(folder)
     with _open(folder, SCENE_FILE) as file:
         gaussians = Gaussians(

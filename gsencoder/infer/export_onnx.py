@@ -15,7 +15,7 @@ from gsencoder.errors import InputError
 from gsencoder.fusion.field_error import field_error
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.onnx_header import FIELDS, OUTPUT, SETTINGS, OnnxHeader, to_metadata
+from gsencoder.infer.onnx_header import FIELDS, NO_SUM, OUTPUT, SETTINGS, SUM, OnnxHeader, to_metadata, with_sum
 from gsencoder.infer.onnx_runtime import OnnxEncoder, inputs_of
 from gsencoder.models.choices import Stored
 from gsencoder.models.raw_encoder import RawEncoder
@@ -125,8 +125,8 @@ def export_onnx(
         model.graph.initializer.append(onnx.numpy_helper.from_array(value, name))
     for key, text in to_metadata(header).items():
         model.metadata_props.add(key=key, value=text)
-    done: bytes = model.SerializeToString()
-    return done
+    model.metadata_props.add(key=SUM, value=NO_SUM)
+    return with_sum(model.SerializeToString())
 
 
 def header_of(encoder: TorchEncoder, precision: Stored = "float32") -> OnnxHeader:

@@ -1,11 +1,13 @@
 """What an exported encoder says of itself: entries of text beside the graph, which any program can read.
 
 `gsencoder` is JSON: the format's version, the grid, the curves, the feature space, and for each array its type and
-shape. `gsencoder.NAME` is the array NAME: little-endian, deflated, in base64.
+shape. `gsencoder.NAME` is the array NAME: little-endian, deflated, in base64. `gsencoder.sum` is the sha256 of the
+whole file, with zeros in the sum's own place.
 """
 
 import base64
 import binascii
+import hashlib
 import json
 import math
 import zlib
@@ -25,11 +27,15 @@ from gsencoder.types import FeatureBasis, FeatureSpace
 
 KEY = "gsencoder"
 VERSION = 2
+SUM, NO_SUM = f"{KEY}.sum", "0" * 64
 FIELDS = ("means", "quats", "scales", "opacities", "sh_dc")
 """Inputs of the graph that every cloud has."""
 SETTINGS = ("voxel", "corner", "starts")
 """Inputs that have values of their own: the grid in metres, and those of a cloud that is no part of another."""
 OUTPUT = "features"
+ARRAYS = ("mean", "components", "words", "words_mean", "words_scale")
+MOST_DEFLATED = 20
+"""Bytes that a character of text may stand for, where an array is large."""
 WORD_STEPS = 63
 """Largest integer of a word's embedding in an int8 file: seven bits leave centred cosines of 0.9995 or more."""
 
@@ -120,7 +126,7 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
             f"is of format version {str(version)[:20]}, and this gsencoder reads {VERSION}; export it again"
         )
     try:
-        arrays = {name: _array(entries, name, **each) for name, each in values["arrays"].items()}
+        arrays = {name: _array(entries, name, **values["arrays"][name]) for name in ARRAYS if name in values["arrays"]}
         space = FeatureSpace(**values["space"])
         basis = None
         if "components" in arrays:
@@ -139,27 +145,67 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
                 mean=arrays["words_mean"],
             )
         return OnnxHeader(
-            voxel=values["voxel"],
+            voxel=float(values["voxel"]),
             levels=values["levels"],
             orders=tuple(values["orders"]),
             patch=values["patch"],
-            outputs=OutputSpace(space=space, mean=arrays["mean"], scale=values["scale"], basis=basis),
+            outputs=OutputSpace(space=space, mean=arrays["mean"], scale=float(values["scale"]), basis=basis),
             words=words,
             precision=values["precision"],
             made_by=values["made_by"],
         )
-    except (ValueError, KeyError, TypeError, AttributeError, binascii.Error, zlib.error) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, binascii.Error, zlib.error) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"its entries are damaged ({type(error).__name__}: {str(error)[:80]})") from error
 
 
+def with_sum(model: bytes) -> bytes:
+    """A serialised model whose entry `SUM` is filled in."""
+    place = _sum_place(model)
+    if place is None:
+        raise ValueError(f"the model has no entry {SUM}")
+    return model[:place] + _digest(model, place) + model[place + len(NO_SUM) :]
+
+
+def check_sum(model: bytes) -> bool:
+    """Whether a file has a sum.
+
+    Raises:
+        InputError: it has another than its contents.
+    """
+    place = _sum_place(model)
+    if place is not None and model[place : place + len(NO_SUM)] != _digest(model, place):
+        raise InputError(
+            "its contents do not have the sum that was written with them: it is damaged, or was changed by a program "
+            f"that left the entry {SUM} in it"
+        )
+    return place is not None
+
+
+def _sum_place(model: bytes) -> int | None:
+    """Where the digits of the sum begin: an entry is its key, then the mark of a second field and the length of it."""
+    key = SUM.encode() + bytes((0x12, len(NO_SUM)))
+    found = model.rfind(key)
+    return found + len(key) if found >= 0 and found + len(key) + len(NO_SUM) <= len(model) else None
+
+
+def _digest(model: bytes, place: int) -> bytes:
+    digest = hashlib.sha256(model[:place])
+    digest.update(NO_SUM.encode())
+    digest.update(model[place + len(NO_SUM) :])
+    return digest.hexdigest().encode()
+
+
 def _array(entries: Mapping[str, str], name: str, *, dtype: str, shape: list[int]) -> np.ndarray:
     if dtype not in ("float32", "float16", "int8"):
         raise InputError(f"expected {name} of float32, float16 or int8, got {dtype[:20]!r}")
+    text = entries[f"{KEY}.{name}"]
     wanted = math.prod(shape) * np.dtype(dtype).itemsize
+    if not 0 <= wanted <= max(1 << 24, MOST_DEFLATED * len(text)):
+        raise InputError(f"{name} claims {str(wanted)[:20]} bytes in {len(text)} of text")
     unpacking = zlib.decompressobj()
-    raw = unpacking.decompress(base64.b64decode(entries[f"{KEY}.{name}"], validate=True), wanted + 1)
+    raw = unpacking.decompress(base64.b64decode(text, validate=True), wanted + 1)
     if len(raw) != wanted or not unpacking.eof:
         raise InputError(f"expected {wanted} bytes of {name}, got {'more' if len(raw) > wanted else len(raw)}")
     values = np.frombuffer(raw, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)

@@ -1,5 +1,6 @@
 """The exported encoder under onnxruntime: features of a splat, and words for them, without torch."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,9 @@ from jaxtyping import Float32, Int64
 
 from gsencoder.data.model_files import find_file
 from gsencoder.data.text_table import TextTable
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning, about
 from gsencoder.infer.chunks import EncodeConfig, encode_by_chunks
-from gsencoder.infer.onnx_header import FIELDS, OUTPUT, SETTINGS, OnnxHeader, from_metadata
+from gsencoder.infer.onnx_header import FIELDS, OUTPUT, SETTINGS, SUM, OnnxHeader, check_sum, from_metadata
 from gsencoder.models.choices import Device
 from gsencoder.models.curves import Curves, curves_of
 from gsencoder.models.serialize import NEVER, check_extent
@@ -42,7 +43,13 @@ class OnnxEncoder:
                 device.
         """
         self.name = "the model" if isinstance(file, bytes) else str(find_file(str(file), "weights"))
-        self._session = open_session(file if isinstance(file, bytes) else self.name, self.name, device, threads)
+        try:
+            model = file if isinstance(file, bytes) else Path(self.name).read_bytes()
+        except OSError as error:
+            raise InputError(f"{self.name}: cannot be read: {error.strerror or error}") from error
+        with about(self.name):
+            summed = check_sum(model)
+        self._session = open_session(model, self.name, device, threads)
         try:
             self.header: OnnxHeader = from_metadata(self._session.get_modelmeta().custom_metadata_map)
             wanted = {f"{name}: {self._type(name)}" for name in (*FIELDS, *SETTINGS)}
@@ -52,6 +59,12 @@ class OnnxEncoder:
                 raise InputError(f"expected inputs {', '.join(sorted(wanted))}, got {', '.join(sorted(found))}")
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from error
+        if not summed:
+            warnings.warn(
+                f"{self.name}: has no entry {SUM}: another program changed it, and damage would not be noticed",
+                SceneWarning,
+                stacklevel=2,
+            )
 
     @staticmethod
     def _type(name: str) -> str:

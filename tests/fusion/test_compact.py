@@ -73,6 +73,43 @@ def test_a_rare_kind_is_kept_as_well_as_a_common_one() -> None:
     assert field_error(found, alone, sample=0).centred <= 0.06
 
 
+def test_a_kind_that_the_sample_misses_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SAMPLE", 200)
+    features = make_features(n=10_000, rank=12, kinds=6)
+    values = features.features.copy()
+    hidden = np.arange(5001, 5040)
+    hidden = hidden[features.seen[hidden]]
+    values[hidden] = np.random.default_rng(5).normal(size=12)
+    mixed = replace(features, features=values)
+    made = compact(mixed, error=0.01)
+    alone = replace(mixed, weights=np.where(np.isin(np.arange(10_000), hidden), 1, 0).astype(np.float32))
+    assert field_error(made.features(), alone, sample=0).centred <= 0.05
+    assert made.lowest > 0.9
+
+
+@pytest.mark.parametrize("zeros", [1, 100, 2399])
+def test_features_at_the_mean_count_for_nothing(zeros: int) -> None:
+    features = make_features()
+    values = features.features.copy()
+    values[np.flatnonzero(features.seen)[:zeros]] = 0
+    made = compact(replace(features, features=values), error=0.01)
+    assert made.error <= 0.01
+    with pytest.raises(InputError, match="all features are the space's mean"):
+        compact(replace(features, features=0 * values))
+
+
+@pytest.mark.parametrize(("low", "high"), [(1e-30, 1e30), (1.0, 1.0), (1e-3, 1e6)])
+def test_weights_of_any_range_come_back_within_their_step(low: float, high: float) -> None:
+    features = make_features()
+    rng = np.random.default_rng(0)
+    weights = np.exp(rng.uniform(np.log(low), np.log(high), len(features))).astype(np.float32)
+    weights[:2] = low, high
+    found = compact(replace(features, weights=weights), error=0.1).features().weights
+    step = (high / low) ** (1 / 510)
+    assert (found <= weights * step * 1.001).all()
+    assert (found >= weights / step / 1.001).all()
+
+
 def test_any_rows_decode_to_what_all_decode_to(monkeypatch: pytest.MonkeyPatch) -> None:
     made = compact(make_features(), error=0.01)
     whole = made.coordinates()
@@ -124,6 +161,7 @@ def test_impossible_budgets_and_empty_fields_are_refused() -> None:
         compact(nothing)
 
 
+@pytest.mark.usefixtures("no_jaxtyping")
 def test_codes_that_do_not_fit_their_levels_are_refused() -> None:
     made = compact(make_features(), error=0.01)
     for wrong in (
@@ -133,6 +171,9 @@ def test_codes_that_do_not_fit_their_levels_are_refused() -> None:
         {"rows": made.rows[::-1].copy()},
         {"total": 10},
         {"heaviest": float("nan")},
+        {"lightest": 0.0},
+        {"error": float("nan")},
+        {"weight_codes": made.weight_codes[1:]},
     ):
         with pytest.raises(InputError):
             replace(made, **wrong)

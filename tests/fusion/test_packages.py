@@ -103,6 +103,7 @@ def test_features_of_another_splat_are_refused(package: Path) -> None:
         load_features(package)
 
 
+@pytest.mark.usefixtures("no_jaxtyping")
 def test_a_package_of_another_version_is_refused(package: Path) -> None:
     file = package / PACKAGE_FILE
     arrays = load_file(file)
@@ -118,14 +119,18 @@ def test_a_package_of_another_version_is_refused(package: Path) -> None:
     with pytest.raises(InputError, match="expected marks"):
         open_package(file)
     write_archive(file, arrays | {"codes": arrays["codes"][1:]}, header, summed=True)
-    with pytest.raises(InputError, match="have codes"):
+    with pytest.raises(InputError, match="expected as many of each"):
         open_package(file)
+    for lie in ({"heaviest": 10**400}, {"error": float("nan")}, {"lightest": -1.0}, {"total": -1}):
+        write_archive(file, arrays, header | lie, summed=True)
+        with pytest.raises(InputError):
+            open_package(file)
     write_archive(file, arrays, header, summed=True)
     open_package(file)
 
 
-HEADER = ("name", "metres_per_unit", "up", "views", "space", "energy_kept", "form", "fingerprint", "total", "heaviest")
-HEADER += ("error",)
+HEADER = ("name", "metres_per_unit", "up", "views", "space", "energy_kept", "form", "fingerprint", "total")
+HEADER += ("error", "lightest", "heaviest", "lowest")
 
 
 @pytest.fixture
@@ -212,9 +217,16 @@ def test_vectors_beyond_half_precision_are_refused(tmp_path: Path, capsys: pytes
     folder = tmp_path / "features"
     folder.mkdir()
     save_features(folder, make_scene(0.0), make_features(n=N, magnitude=1e6), {})
-    words = ["form=npz", "decoded=true", f"out={tmp_path / 'out'}"]
-    assert cli.main(["pack", str(folder), *words]) == 2
+    words = ["decoded=true", f"out={tmp_path / 'out'}"]
+    assert cli.main(["pack", str(folder), "form=npz", *words]) == 2
     assert "do not fit into float16" in capsys.readouterr().err
+    assert cli.main(["pack", str(folder), "form=ply", *words]) == 0
+
+
+def test_a_folder_of_two_kinds_of_features_is_refused(folder: Path, package: Path) -> None:
+    (folder / PACKAGE_FILE).write_bytes((package / PACKAGE_FILE).read_bytes())
+    with pytest.raises(InputError, match="two kinds of features; keep one"):
+        load_features(folder)
 
 
 def test_a_package_loads_without_torch(package: Path) -> None:

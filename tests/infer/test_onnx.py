@@ -18,12 +18,12 @@ from splats import random_gaussians
 
 from gsencoder import cli
 from gsencoder.data.splats import save_splat
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.encoders import Encoder, load_encoder
 from gsencoder.infer.export_onnx import TOLERANCE, Cloud, check_parity, lower, random_cloud
-from gsencoder.infer.onnx_header import KEY, OnnxHeader, from_metadata, to_metadata
+from gsencoder.infer.onnx_header import KEY, SUM, OnnxHeader, from_metadata, to_metadata, with_sum
 from gsencoder.infer.onnx_operators import search
 from gsencoder.infer.onnx_runtime import OnnxEncoder, inputs_of
 from gsencoder.types import Gaussians
@@ -165,6 +165,8 @@ def deflated(raw: bytes) -> str:
         (lambda header: to_metadata(header) | {f"{KEY}.mean": "AADAfwAAwH8AAMB/AADAfwAAwH8AAMB/"}, "damaged"),
         (lambda header: to_metadata(header) | {f"{KEY}.mean": deflated(b"\0\0\xc0\x7f" * 6)}, "not finite"),
         (lambda header: to_metadata(header) | {f"{KEY}.mean": deflated(b"\0" * 10**7)}, "24 bytes of mean, got more"),
+        (lambda header: changed(header, "voxel", 10**400), "damaged"),
+        (lambda header: changed(header, "arrays", {"mean": {"dtype": "int8", "shape": [2**62, 4]}}), "claims .* bytes"),
         (lambda header: changed(header, "precision", "int4"), "expected a precision among float32"),
     ],
 )
@@ -191,11 +193,33 @@ def test_files_that_are_no_encoder_are_refused(folder: Path, tmp_path: Path) -> 
     onnx.save(other, tmp_path / "other.onnx")
     with pytest.raises(InputError, match="other.onnx: is no encoder that `gsencoder export` wrote"):
         load_encoder(str(tmp_path / "other.onnx"))
-    for entry in onnx.load(folder / "encoder.onnx").metadata_props:
+    for entry in (each for each in onnx.load(folder / "encoder.onnx").metadata_props if each.key != SUM):
         other.metadata_props.add(key=entry.key, value=entry.value)
     onnx.save(other, tmp_path / "other.onnx")
     with pytest.raises(InputError, match=r"expected inputs corner: tensor\(float\).*, got x: tensor\(float\)"):
         load_encoder(str(tmp_path / "other.onnx"))
+
+
+def test_a_changed_file_is_refused_unless_it_says_so(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "changed.onnx"
+    whole = (folder / "encoder.onnx").read_bytes()
+    for place in np.linspace(0, len(whole) - 1, 60).astype(int):
+        damaged = bytearray(whole)
+        damaged[place] ^= 64
+        file.write_bytes(damaged)
+        with pytest.raises(InputError, match="changed.onnx"):
+            load_encoder(str(file))
+    model = onnx.load(folder / "encoder.onnx")
+    (entry,) = (each for each in model.metadata_props if each.key == KEY)
+    entry.value = entry.value.replace('"patch": 24', '"patch": 25')
+    onnx.save(model, file)
+    with pytest.raises(InputError, match="do not have the sum"):
+        load_encoder(str(file))
+    (entry,) = (each for each in model.metadata_props if each.key == SUM)
+    model.metadata_props.remove(entry)
+    onnx.save(model, file)
+    with pytest.warns(SceneWarning, match="another program changed it"):
+        load_encoder(str(file))
 
 
 def test_what_cannot_be_encoded_is_refused_on_both_sides_alike(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
@@ -238,7 +262,7 @@ def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[TorchEn
     head = next(each for each in model.graph.initializer if each.name.endswith("head.bias"))
     head.CopyFrom(onnx.numpy_helper.from_array(onnx.numpy_helper.to_array(head) + np.float32(0.01), head.name))
     with pytest.raises(InputError, match="on a sheet onnxruntime and torch differ by .* no file was written"):
-        check_parity(model.SerializeToString(), both[0], [Cloud("a sheet", random_cloud(50, 0.05))])
+        check_parity(with_sum(model.SerializeToString()), both[0], [Cloud("a sheet", random_cloud(50, 0.05))])
 
 
 def test_the_command_tells_what_it_compared(folder: Path) -> None:
