@@ -31,7 +31,8 @@ def measure(model: str, splat: str) -> dict[str, float]:
     gaussians = load_splat(splat)
     keep_heap()
     encoder = load_encoder(model, "cpu")
-    config = EncodeConfig(chunk=0, precision="float32", device="cpu")
+    # A file computes in what it was exported in.
+    config = EncodeConfig(chunk=0, precision="auto" if model.endswith(".onnx") else "float32", device="cpu")
     encoder.encode(gaussians, config)
     # Linux counts a process's start in clock ticks since boot.
     ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])

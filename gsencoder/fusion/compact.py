@@ -47,9 +47,7 @@ class CompactFeatures:
         heaviest: the largest weight.
         rows: which Gaussians were seen, ascending.
         total: Gaussians.
-        mean: of the space.
         basis: what the coordinates stand for.
-        space: what decoded features are.
         error: 1 − mean centred cosine to what was compacted: over the seen rows, or over their kinds (a sample in which
             each row counts by how few are like it), whichever is larger. Features at the space's mean have no cosine.
         lowest: the centred cosine that one row in a thousand is below.
@@ -70,7 +68,8 @@ class CompactFeatures:
     def __post_init__(self) -> None:
         counts = self.bits.astype(np.int64)
         fits = self.codes.shape[1] == -(-int(counts.sum()) // 8) and len(self.levels) == int((1 << counts).sum())
-        if not fits or len(counts) != self.basis.rank or not len(counts) or not 1 <= counts.min() <= counts.max() <= 8:
+        some = len(counts) == self.basis.rank > 0 and 1 <= counts.min() <= counts.max() <= MOST_BITS
+        if not fits or not some:
             raise InputError(
                 f"CompactFeatures: {self.codes.shape[1]} bytes a row and {len(self.levels)} levels do not go with bits "
                 f"{counts.tolist()[:20]} of {self.basis.rank} coordinates"
