@@ -122,10 +122,9 @@ class OnnxEncoder:
         return header.outputs.features(features)
 
     def _run(self, part: Gaussians, whole: Curves | None, voxel: float) -> Float32[np.ndarray, "n channels"]:
+        feed = feed_of(part, whole, voxel)
         try:
-            (found,) = self._session.run([OUTPUT], feed_of(part, whole, voxel))
-        except InputError:
-            raise
+            (found,) = self._session.run([OUTPUT], feed)
         except Exception as error:  # onnxruntime raises its own classes, which share only this base
             raise InputError(f"{self.name}: onnxruntime could not run it: {_first_line(error)}") from error
         if found.shape != (len(part), self.header.outputs.channels):
@@ -160,7 +159,7 @@ def rows_of(curves: Curves) -> Int64[np.ndarray, "rows P"]:
     return table
 
 
-def open_session(model: str | bytes, name: str, device: Device, threads: int = 0) -> Any:
+def open_session(model: bytes, name: str, device: Device, threads: int = 0) -> Any:
     """onnxruntime with a graph.
 
     Raises:
