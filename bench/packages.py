@@ -1,6 +1,6 @@
 """Packed features beside the fused ones: bytes, error, and what boxes are found with each.
 
-    python bench/packages.py SCENE … [--budgets 0.003,0.01,0.03,0.1]
+python bench/packages.py SCENE … [--budgets 0.003,0.01,0.03,0.1]
 """
 
 import argparse
