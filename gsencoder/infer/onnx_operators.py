@@ -6,6 +6,7 @@ graph's precision finds them; `in_standard_operators` then writes them out.
 
 from typing import Any
 
+import numpy as np
 import onnx
 import onnx_ir.passes.common as passes
 import torch
@@ -14,7 +15,9 @@ from onnxscript import opset18 as traced
 from onnxscript import opset20 as op
 from onnxscript.values import OnnxFunction, Opset
 
-import gsencoder.models.neighbors  # noqa: F401  the operator of the convolution
+import gsencoder.models.neighbors
+import gsencoder.models.raw_encoder  # noqa: F401  these two define the operators that are translated
+from gsencoder.models.serialize import MOST_LEVELS, hilbert_table, start_of
 
 OPSET = 20
 ROWS_AT_ONCE = 1024
@@ -117,20 +120,56 @@ def linear_int8(x: UINT8, step: FLOAT, zero: UINT8, weight: INT8, scale: FLOAT, 
     return op.Cast(op.MatMulInteger(x, weight, zero), to=1) * (step * scale) + bias
 
 
-FUNCTIONS: tuple[OnnxFunction, ...] = (in_blocks, out_of_blocks, with_row, convolve, convolve_int8, linear_int8)
-
-# What the exporter must know of the one that it meets.
-_T = onnx.defs.OpSchema.FormalParameter
-onnx.defs.register_schema(
-    onnx.defs.OpSchema(
-        convolve.name,
-        OURS.domain,
-        OURS.version,
-        inputs=[_T("x", "T"), _T("neighbors", "tensor(int32)"), _T("weight", "T")],
-        outputs=[_T("y", "T")],
-        type_constraints=[("T", ["tensor(float)", "tensor(float16)"], "")],
-    )
+_TABLE = onnx.numpy_helper.from_array(hilbert_table().astype(np.uint64))
+_POWERS = onnx.numpy_helper.from_array(64 ** np.arange(1, (MOST_LEVELS + 1) // 2, dtype=np.int64))
+_STARTS = onnx.numpy_helper.from_array(
+    np.array([start_of(min(2 * steps, MOST_LEVELS)) for steps in range(1, (MOST_LEVELS + 1) // 2 + 1)], np.uint64)
 )
+
+
+@script(OURS, default_opset=op)
+def hilbert(morton: INT64) -> INT64:
+    """As `models.serialize.hilbert_from_morton`, looking no further than the largest code has digits to the base 64."""
+    table = op.Constant(value=_TABLE)
+    largest = op.ReduceMax(morton, keepdims=0)
+    further = op.ReduceSum(op.Cast(op.GreaterOrEqual(largest, op.Constant(value=_POWERS)), to=7), keepdims=0)
+    given = op.Cast(morton, to=13)
+    six = op.Cast(op.Constant(value_int=6), to=13)
+    sixty_three = op.Cast(op.Constant(value_int=63), to=13)
+    code = op.BitwiseXor(given, given)
+    state = op.BitwiseOr(code, op.Gather(op.Constant(value=_STARTS), further))
+    for step in range(further + 1):
+        away = op.Cast((further - step) * 6, to=13)
+        octants = op.BitwiseAnd(op.BitShift(given, away, direction="RIGHT"), sixty_three)
+        place = op.BitwiseOr(op.BitShift(state, six, direction="LEFT"), octants)
+        found = op.Gather(table, op.Cast(place, to=7))
+        code = op.BitwiseOr(op.BitShift(code, six, direction="LEFT"), op.BitwiseAnd(found, sixty_three))
+        state = op.BitShift(found, six, direction="RIGHT")
+    return op.Cast(code, to=7)
+
+
+FUNCTIONS: tuple[OnnxFunction, ...] = (
+    in_blocks,
+    out_of_blocks,
+    with_row,
+    convolve,
+    convolve_int8,
+    linear_int8,
+    hilbert,
+)
+
+# What the exporter must know of those that it meets.
+_T = onnx.defs.OpSchema.FormalParameter
+for _name, _inputs, _type in (
+    (convolve.name, [_T("x", "T"), _T("neighbors", "tensor(int32)"), _T("weight", "T")], "T"),
+    (hilbert.name, [_T("morton", "tensor(int64)")], "tensor(int64)"),
+):
+    _floats = [("T", ["tensor(float)", "tensor(float16)"], "")] if _type == "T" else []
+    onnx.defs.register_schema(
+        onnx.defs.OpSchema(
+            _name, OURS.domain, OURS.version, inputs=_inputs, outputs=[_T("y", _type)], type_constraints=_floats
+        )
+    )
 
 
 def simplified(graph: ir.Model) -> onnx.ModelProto:
@@ -178,6 +217,10 @@ def _convolve(x: Any, neighbors: Any, weight: Any) -> Any:
     return OURS.convolve(x, neighbors, weight)
 
 
+def _hilbert(morton: Any) -> Any:
+    return OURS.hilbert(morton)
+
+
 def _searchsorted(keys: Any, wanted: Any, right: bool = False, **others: Any) -> Any:
     assert not any(others.values()), f"searchsorted is translated without {others}"
     return search(keys, wanted, traced.Constant(value_int=int(right)))
@@ -195,6 +238,7 @@ def _sort(values: Any, *, dim: int = -1, descending: bool = False, **others: Any
 
 TRANSLATIONS: dict[Any, Any] = {
     torch.ops.gsencoder.convolve.default: _convolve,
+    torch.ops.gsencoder.hilbert.default: _hilbert,
     torch.ops.aten.searchsorted.Tensor: _searchsorted,
     torch.ops.aten.sort.stable: _sort,
 }

@@ -16,7 +16,7 @@ from gsencoder.models.neighbors import AHEAD
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.plan import Level, Plan
 from gsencoder.models.point_transformer import TransformerConfig
-from gsencoder.models.serialize import ALIGN, MOST_LEVELS, NEVER, Order, encode_morton, morton_codes
+from gsencoder.models.serialize import ALIGN, MOST_LEVELS, NEVER, Order, hilbert_from_morton, morton_codes, swapped
 
 
 class Tokens(NamedTuple):
@@ -86,7 +86,7 @@ def _plan(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, config: 
     codes, members = torch.sort(morton_codes(cells), stable=True)
     first, token_of_member = _runs(codes)
     morton = codes.index_select(0, first)
-    along = {order: encode_morton(morton, order, MOST_LEVELS) for order in config.orders}
+    along = {order: _along(morton, order) for order in config.orders}
     tokens = Tokens(cells.index_select(0, members.index_select(0, first)), morton, along)
     levels = []
     for level in range(config.levels):
@@ -119,6 +119,24 @@ def _plan(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, config: 
         counts=_lengths(first, members.shape[0]),
         levels=tuple(levels),
     )
+
+
+def _along(morton: Int64[Tensor, " T"], order: Order) -> Int64[Tensor, " T"]:
+    """As `serialize.encode_morton`."""
+    turned = swapped(morton, order)
+    return hilbert(turned) if order.startswith("hilbert") else turned
+
+
+@torch.library.custom_op("gsencoder::hilbert", mutates_args=())
+def hilbert(morton: Tensor) -> Tensor:
+    """Hilbert's curve as one operator, since how far it has to look is known only when a graph runs."""
+    found: Tensor = hilbert_from_morton(morton, MOST_LEVELS)
+    return found
+
+
+@hilbert.register_fake
+def _(morton: Tensor) -> Tensor:
+    return torch.empty_like(morton)
 
 
 def _runs(codes: Int64[Tensor, " N"]) -> tuple[Int64[Tensor, " T"], Int64[Tensor, " N"]]:

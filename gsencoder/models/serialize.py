@@ -63,10 +63,16 @@ def encode_cells(cells: Int64[Any, "N 3"], order: Order, bits: int) -> Int64[Any
 
 def encode_morton(morton: Int64[Any, " N"], order: Order, bits: int) -> Int64[Any, " N"]:
     """`encode_cells` for cells that are given by their Morton codes."""
-    if order.endswith("-trans"):
-        y = (morton & (_EVERY_THIRD << 1)) << 1
-        morton = (morton & _EVERY_THIRD) | y | ((morton >> 1) & (_EVERY_THIRD << 1))
-    return _hilbert_from_morton(morton, bits) if order.startswith("hilbert") else morton
+    morton = swapped(morton, order)
+    return hilbert_from_morton(morton, bits) if order.startswith("hilbert") else morton
+
+
+def swapped(morton: Int64[Any, " N"], order: Order) -> Int64[Any, " N"]:
+    """Morton codes with x and y swapped, for the "-trans" orders; for others as they are."""
+    if not order.endswith("-trans"):
+        return morton
+    y = (morton & (_EVERY_THIRD << 1)) << 1
+    return (morton & _EVERY_THIRD) | y | ((morton >> 1) & (_EVERY_THIRD << 1))
 
 
 def morton_codes(cells: Int64[Any, "N 3"]) -> Int64[Any, " N"]:
@@ -84,7 +90,7 @@ def morton_codes(cells: Int64[Any, "N 3"]) -> Int64[Any, " N"]:
     return (spread[:, 0] << 2) | (spread[:, 1] << 1) | spread[:, 2]
 
 
-def _hilbert_from_morton(morton: Int64[Any, " N"], bits: int) -> Int64[Any, " N"]:
+def hilbert_from_morton(morton: Int64[Any, " N"], bits: int) -> Int64[Any, " N"]:
     """Positions along Hilbert's curve, which only ever steps to a face neighbour.
 
     Hamilton 2006, "Compact Hilbert indices": the curve within a cell is one of 24 orientations, and a table gives,
@@ -92,12 +98,12 @@ def _hilbert_from_morton(morton: Int64[Any, " N"], bits: int) -> Int64[Any, " N"
     `bits` says how far to look and changes nothing else: cells that are counted from one corner are always ordered
     alike.
     """
-    table = _hilbert_table()
+    table = hilbert_table()
     if hasattr(morton, "new_tensor"):
         table = morton.new_tensor(table)
     levels = bits + bits % 2
     code = morton & 0
-    state = code + _start_of(levels)
+    state = code + start_of(levels)
     for level in range(levels - 2, -1, -2):
         found = table.take((state << 6) | ((morton >> (3 * level)) & 63))
         code = (code << 6) | (found & 63)
@@ -106,7 +112,7 @@ def _hilbert_from_morton(morton: Int64[Any, " N"], bits: int) -> Int64[Any, " N"
 
 
 @cache
-def _start_of(levels: int) -> int:
+def start_of(levels: int) -> int:
     """The orientation of the lowest corner of so many levels, within a curve of MOST_LEVELS."""
     state = 0
     for _ in range(MOST_LEVELS - levels):
@@ -115,7 +121,7 @@ def _start_of(levels: int) -> int:
 
 
 @cache
-def _hilbert_table() -> Int64[np.ndarray, " 1536"]:
+def hilbert_table() -> Int64[np.ndarray, " 1536"]:
     """For orientation·64 + two octants: the inner orientation·64 + two digits of the code."""
     rows = []
     for state in range(24):
