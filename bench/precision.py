@@ -14,6 +14,7 @@ import numpy as np
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeds import with_gaussians
+from gsencoder.fusion.field_error import row_cosines
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.onnx_runtime import OnnxEncoder
 from gsencoder.types import GaussianFeatures
@@ -25,7 +26,7 @@ def cosines(ours: GaussianFeatures, theirs: GaussianFeatures) -> np.ndarray:
     """Of coordinates, which are centred as they are, or of vectors less the space's mean."""
     mean = ours.mean if ours.basis is None else np.float32(0)
     a, b = (each.features.astype(np.float64) - mean for each in (ours, theirs))
-    return np.asarray((a * b).sum(axis=1) / np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1) + 1e-60))
+    return row_cosines(a, b)
 
 
 def main() -> None:

@@ -7,8 +7,20 @@ from jaxtyping import Float32
 
 from gsencoder.data.archive import Archive
 from gsencoder.data.images import PIXEL_LIMIT
+from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
 from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, Gaussians, Scene, Views
+
+
+def check_splat(file: Archive, gaussians: Gaussians, advice: str) -> None:
+    """Raises an error with advice unless a file of features was made for exactly these Gaussians.
+
+    Raises:
+        InputError: the fingerprint in its header is of others.
+    """
+    belongs, actual = file.value("fingerprint", str), fingerprint(gaussians)
+    if belongs != actual:
+        raise InputError(f"the features belong to splat {belongs[:8]}…, the folder holds {actual[:8]}…; {advice}")
 
 
 def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:

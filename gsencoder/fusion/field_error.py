@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
 
 from gsencoder.errors import InputError
 from gsencoder.evenly import evenly
@@ -58,14 +59,14 @@ def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, samp
     for start in range(0, len(both), CHUNK):
         part = both[start : start + CHUNK]
         a, b = features.decode(part).astype(np.float64), reference.decode(part).astype(np.float64)
-        raw += _cosines(a, b)
-        centred += _cosines(a - features.mean, b - reference.mean)
+        raw += float(row_cosines(a, b).sum())
+        centred += float(row_cosines(a - features.mean, b - reference.mean).sum())
     if not len(both):
         return FieldError(centred=1.0, raw=1.0, covered=0.0)
     return FieldError(centred=1 - centred / len(both), raw=1 - raw / len(both), covered=len(both) / len(rows))
 
 
-def _cosines(a: np.ndarray, b: np.ndarray) -> float:
-    """Sum of the cosines of rows; the eps inside the root makes a zero vector's cosine 0."""
+def row_cosines(a: Float64[np.ndarray, "n D"], b: Float64[np.ndarray, "n D"]) -> Float64[np.ndarray, " n"]:
+    """Cosine of each row with the other's; the eps inside the root makes a zero vector's cosine 0."""
     norms = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1) + 1e-60)
-    return float(((a * b).sum(axis=1) / norms).sum())
+    return np.asarray((a * b).sum(axis=1) / norms)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gsencoder.data.archive import map_arrays, open_archive, write_archive
-from gsencoder.data.archived import read_scene, read_space, scene_parts, space_parts
+from gsencoder.data.archived import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.atomic import atomic_file
 from gsencoder.data.splats import fingerprint, load_splat, save_splat
 from gsencoder.errors import InputError
@@ -107,13 +107,10 @@ def load_package(folder: Path) -> Scene:
     file = folder / PACKAGE_FILE
     packed = open_package(file)
     with open_archive(file) as archive:
-        origin, belongs = archive.array("origin", "float64", (3,)), archive.value("fingerprint", str)
-        gaussians = load_splat(folder / SPLAT_FILE, origin=origin)
-        actual = fingerprint(gaussians)
-        if belongs != actual or len(gaussians) != len(packed):
-            raise InputError(
-                f"the features belong to splat {belongs[:8]}…, {SPLAT_FILE} is {actual[:8]}…; pack this splat's own"
-            )
+        gaussians = load_splat(folder / SPLAT_FILE, origin=archive.array("origin", "float64", (3,)))
+        check_splat(archive, gaussians, "pack this splat's own features")
+        if len(gaussians) != len(packed):
+            raise InputError(f"expected features of {len(gaussians):,} Gaussians, got {len(packed):,}")
         scene = read_scene(archive, gaussians)
     features = packed.features()
     return replace(scene, features={features.space.name: features})

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.data.archive import Archive, open_archive, write_archive
-from gsencoder.data.archived import read_scene, read_space, scene_parts, space_parts
+from gsencoder.data.archived import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.splats import fingerprint
 from gsencoder.errors import InputError
 from gsencoder.fusion.packages import PACKAGE_FILE, load_package
@@ -108,12 +108,7 @@ def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
 
 def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:
     with _open(folder, FEATURES_FILE) as file:
-        belongs, actual = file.value("fingerprint", str), fingerprint(gaussians)
-        if belongs != actual:
-            raise InputError(
-                f"the features belong to splat {belongs[:8]}…, the folder holds {actual[:8]}…; "
-                "fuse or encode this splat again"
-            )
+        check_splat(file, gaussians, "fuse or encode this splat again")
         rows, n = file.array("rows", "int32", ("n",)), len(gaussians)
         if len(rows) and (rows[0] < 0 or rows[-1] >= n or (np.diff(rows) <= 0).any()):
             raise InputError(f"expected row numbers that rise from 0 to at most {n - 1}")

@@ -34,7 +34,9 @@ def find_weights(given: str) -> Path:
         if given in names:
             return SHIPPED / given / WEIGHTS_FILE
         if given and Path(given).is_dir():
-            raise InputError(f"weights: the folder {given} holds no {WEIGHTS_FILE}")
+            exports = sorted(path.name for path in Path(given).glob("*.onnx"))
+            hint = f"; give its {', '.join(exports)} by its full path" if exports else ""
+            raise InputError(f"weights: the folder {given} holds no {WEIGHTS_FILE}{hint}")
         return find_file(given, "weights")
     except InputError as error:
         raise InputError(f"{error}; gsencoder comes with {', '.join(names)}") from error
