@@ -168,6 +168,19 @@ class Cameras:
             heights=self.heights[rows],
         )
 
+    def resized(self, longest: int) -> "Cameras":
+        """The same fields of view in pictures whose longer side has so many pixels."""
+        factors = longest / np.maximum(self.widths, self.heights)
+        sizes = np.maximum(1, np.stack((self.widths, self.heights), axis=1) * factors[:, None] + 0.5).astype(np.int32)
+        scale = np.ones((len(self), 3))
+        scale[:, 0], scale[:, 1] = sizes[:, 0] / self.widths, sizes[:, 1] / self.heights
+        return Cameras(
+            cam_from_world=self.cam_from_world,
+            Ks=(self.Ks * scale[:, :, None]).astype(np.float32),
+            widths=np.ascontiguousarray(sizes[:, 0]),
+            heights=np.ascontiguousarray(sizes[:, 1]),
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Views:

@@ -60,6 +60,23 @@ def orbit_cameras(
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
     half_field = math.atan(min(width, height) / 2 / focal)
     distance = max(radius / math.sin(half_field), NEAREST)
+    outward, vertical = spiral_directions(count, up)
+    return looking_cameras(centre + distance * outward, -outward, vertical, focal, width, height)
+
+
+def spiral_directions(
+    count: int, up: Float64[np.ndarray, "3"] | None
+) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "3"]]:
+    """Unit vectors spread evenly over the directions from which things are looked at, and the vertical.
+
+    Args:
+        count: how many, along a golden-angle spiral.
+        up: where known, they keep between 15° below and 60° above the horizon; else they go all around, but for the
+            poles of -y.
+
+    Raises:
+        InputError: an up that is no direction.
+    """
     vertical = np.array([0.0, -1.0, 0.0]) if up is None else np.asarray(up, np.float64)
     length = float(np.linalg.norm(vertical))
     if not 1e-6 < length < 1e6:
@@ -73,8 +90,7 @@ def orbit_cameras(
     east /= np.linalg.norm(east)
     north = np.cross(vertical, east)
     level = np.sqrt(1 - sines**2)[:, None] * (np.cos(turns)[:, None] * east + np.sin(turns)[:, None] * north)
-    outward = level + sines[:, None] * vertical
-    return looking_cameras(centre + distance * outward, -outward, vertical, focal, width, height)
+    return level + sines[:, None] * vertical, vertical
 
 
 def looking_cameras(

@@ -25,14 +25,7 @@ def best_views(
     A view's worth is the share of its picture that the group's rows fill, by their blending weights: what hides them
     counts.
     """
-    factor = _SIDE / np.maximum(cameras.widths, cameras.heights)
-    Ks = cameras.Ks * np.stack((factor, factor, np.ones_like(factor)), axis=1)[:, :, None]
-    small = Cameras(
-        cam_from_world=cameras.cam_from_world,
-        Ks=Ks.astype(np.float32),
-        widths=np.maximum(1, cameras.widths * factor).astype(np.int32),
-        heights=np.maximum(1, cameras.heights * factor).astype(np.int32),
-    )
+    small = cameras.resized(_SIDE)
     chosen = np.zeros((len(gaussians), len(groups)), np.float32)
     for column, rows in enumerate(groups):
         chosen[rows, column] = 1

@@ -1,0 +1,123 @@
+"""Where a camera can stand: what is known to be empty, how far away surfaces are, what a ray meets."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from gsencoder.data.spacing import NEIGHBOUR
+from gsencoder.evenly import evenly
+from gsencoder.geometry import covariances, transform
+from gsencoder.render import BlendConfig, blend
+from gsencoder.types import Cameras, Gaussians
+
+OPAQUE = 0.3
+"""Gaussians of less opacity are no obstacle."""
+WATCHED_SIDE = 96
+"""Longer side of the depth maps that tell what is empty, pixels."""
+NEAREST = 8
+"""So many Gaussians are asked how far away their surface is."""
+SIGMAS = 2.0
+"""A surface ends so many standard deviations from a Gaussian's centre."""
+CELL = 2.0
+"""Edge of the cells in which rays are followed, in spacings of the splat: surfaces have no holes in such cells."""
+SPACING_SAMPLE = 5000
+"""Gaussians that tell the spacing."""
+MOST_STEPS = 512
+"""Rays are followed for so many cells."""
+
+
+class FreeSpace:
+    """The empty part of a scene, as its Gaussians and cameras that saw it tell.
+
+    Attributes:
+        cell: edge of the cells in which rays are followed, world units.
+        watchers: the cameras that tell what is empty; None where there are none.
+    """
+
+    def __init__(self, gaussians: Gaussians, watchers: Cameras | None, config: BlendConfig = BlendConfig()) -> None:
+        """Args:
+        gaussians: the splat.
+        watchers: cameras that saw it, in the same world; a depth map is rendered for each.
+        config: accuracy of the depth maps.
+        """
+        from scipy.spatial import cKDTree
+
+        solid = gaussians.opacities >= OPAQUE
+        self._solid = gaussians.select(solid) if solid.any() else gaussians
+        means = self._solid.means.astype(np.float64)
+        self._tree = cKDTree(means)
+        asked = means[evenly(len(means), SPACING_SAMPLE)]
+        distances = self._tree.query(asked, k=[min(NEIGHBOUR + 1, len(means))])[0]
+        # Of a single Gaussian, and of many in one place, the size is known.
+        self.cell = CELL * (float(np.median(distances)) or float(np.median(self._solid.scales)))
+        self._low = np.floor(means.min(axis=0) / self.cell)
+        self._sizes = (np.floor(means.max(axis=0) / self.cell) - self._low + 1).astype(np.int64)
+        self._occupied = np.unique(self._codes(means))
+        self.watchers = watchers.resized(WATCHED_SIDE) if watchers is not None and len(watchers) else None
+        self._depths: list[Float32[np.ndarray, "h w"]] = []
+        for view in range(len(self.watchers) if self.watchers is not None else 0):
+            assert self.watchers is not None
+            b = blend(gaussians, self.watchers, view, config=config)
+            # Rays that end nowhere have looked through nothing that is known.
+            self._depths.append(torch.where(b.alpha >= 0.5, b.depth, 0.0).reshape(b.shape).float().numpy())
+
+    def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+        """The cell of each point as a number; −1 outside the splat."""
+        cells = np.floor(points / self.cell) - self._low
+        inside = ((cells >= 0) & (cells < self._sizes)).all(axis=1)
+        x, y, z = np.where(inside[:, None], cells, 0).astype(np.int64).T
+        return np.where(inside, (x * self._sizes[1] + y) * self._sizes[2] + z, -1)
+
+    def occupied(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether a Gaussian lies in the cell of each point."""
+        codes = self._codes(points)
+        places = np.searchsorted(self._occupied, codes).clip(max=len(self._occupied) - 1)
+        return np.asarray(self._occupied[places] == codes)
+
+    def first_hit(
+        self,
+        starts: Float64[np.ndarray, "n 3"],
+        directions: Float64[np.ndarray, "n 3"],
+        lengths: Float64[np.ndarray, " n"],
+    ) -> Float64[np.ndarray, " n"]:
+        """How far each ray goes before the first cell that holds a Gaussian; +inf where it meets none.
+
+        Args:
+            starts: of the rays.
+            directions: unit vectors.
+            lengths: rays are followed so far, world units, or for `MOST_STEPS` cells.
+        """
+        steps = int(np.clip(np.ceil(2 * lengths.max(initial=0) / self.cell), 1, 2 * MOST_STEPS))
+        along = self.cell / 2 * np.arange(steps + 1)
+        points = starts[:, None] + along[:, None] * directions[:, None]
+        hit = self.occupied(points.reshape(-1, 3)).reshape(len(starts), -1) & (along <= lengths[:, None])
+        return np.where(hit.any(axis=1), along[hit.argmax(axis=1)], np.inf)
+
+    def clearance(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """World units from each point to the nearest surface, less than zero inside a Gaussian.
+
+        A surface lies two standard deviations from the centre of a Gaussian, towards the point.
+        """
+        count = min(NEAREST, len(self._solid))
+        distances, rows = self._tree.query(points, k=[*range(1, count + 1)])
+        offsets = points[:, None] - self._solid.means[rows]
+        directions = offsets / np.maximum(distances, 1e-12)[..., None]
+        shapes = (torch.from_numpy(part[rows]).double() for part in (self._solid.quats, self._solid.scales))
+        spread = covariances(*shapes)
+        reach = SIGMAS * np.sqrt(np.einsum("nki,nkij,nkj->nk", directions, spread.numpy(), directions))
+        return np.asarray((distances - reach).min(axis=1))
+
+    def seen_empty(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether some watcher looked through each point, at a surface at least a cell behind it."""
+        found = np.zeros(len(points), bool)
+        for view, depth in enumerate(self._depths):
+            assert self.watchers is not None
+            pose = torch.from_numpy(self.watchers.cam_from_world[view]).double()
+            inside = transform(pose, torch.from_numpy(points)).numpy()
+            z, K = inside[:, 2], self.watchers.Ks[view].astype(np.float64)
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                x, y = (inside[:, axis] / z * K[axis, axis] + K[axis, 2] for axis in (0, 1))
+            shown = (z > 0) & (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+            column, row = (np.where(shown, part, 0).astype(np.int64) for part in (x, y))
+            found |= shown & (depth[row, column] >= z + self.cell)
+        return found
