@@ -2,12 +2,13 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64, Integer
 
 from gsencoder.data.spacing import NEIGHBOUR
 from gsencoder.evenly import evenly
 from gsencoder.geometry import covariances, transform
 from gsencoder.render import BlendConfig, blend
+from gsencoder.render.threads import parallel
 from gsencoder.types import Cameras, Gaussians
 
 OPAQUE = 0.3
@@ -34,11 +35,19 @@ class FreeSpace:
         watchers: the cameras that tell what is empty; None where there are none.
     """
 
-    def __init__(self, gaussians: Gaussians, watchers: Cameras | None, config: BlendConfig = BlendConfig()) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        watchers: Cameras | None,
+        config: BlendConfig = BlendConfig(),
+        *,
+        apart: Integer[np.ndarray, " n"] | None = None,
+    ) -> None:
         """Args:
         gaussians: the splat.
         watchers: cameras that saw it, in the same world; a depth map is rendered for each.
         config: accuracy of the depth maps.
+        apart: Gaussians that rays go through.
         """
         from scipy.spatial import cKDTree
 
@@ -52,14 +61,20 @@ class FreeSpace:
         self.cell = CELL * (float(np.median(distances)) or float(np.median(self._solid.scales)))
         self._low = np.floor(means.min(axis=0) / self.cell)
         self._sizes = (np.floor(means.max(axis=0) / self.cell) - self._low + 1).astype(np.int64)
-        self._occupied = np.unique(self._codes(means))
+        met = np.ones(len(gaussians), bool)
+        met[apart if apart is not None else []] = False
+        self._occupied = np.unique(self._codes(means[met[solid] if solid.any() else met]))
         self.watchers = watchers.resized(WATCHED_SIDE) if watchers is not None and len(watchers) else None
         self._depths: list[Float32[np.ndarray, "h w"]] = []
-        for view in range(len(self.watchers) if self.watchers is not None else 0):
-            assert self.watchers is not None
-            b = blend(gaussians, self.watchers, view, config=config)
-            # Rays that end nowhere have looked through nothing that is known.
-            self._depths.append(torch.where(b.alpha >= 0.5, b.depth, 0.0).reshape(b.shape).float().numpy())
+        if self.watchers is not None:
+            small = self.watchers
+
+            def depth_map(view: int) -> Float32[np.ndarray, "h w"]:
+                b = blend(gaussians, small, view, config=config)
+                # Rays that end nowhere have looked through nothing that is known.
+                return torch.where(b.alpha >= 0.5, b.depth, 0.0).reshape(b.shape).float().numpy()
+
+            self._depths = parallel(depth_map, range(len(small)))
 
     def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
         """The cell of each point as a number; −1 outside the splat."""
@@ -71,6 +86,8 @@ class FreeSpace:
     def occupied(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether a Gaussian lies in the cell of each point."""
         codes = self._codes(points)
+        if not len(self._occupied):
+            return np.zeros(len(points), bool)
         places = np.searchsorted(self._occupied, codes).clip(max=len(self._occupied) - 1)
         return np.asarray(self._occupied[places] == codes)
 

@@ -65,7 +65,7 @@ def shell_cameras(
     outward, vertical = spiral_directions(TRIED * count, up)
     wanted, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height)
     # Up to the first surface beyond the target itself, with room to stand before it.
-    begins = reach + CLEARANCE * target.radius
+    begins = reach + free.cell / 2
     starts = target.center + begins[:, None] * outward
     open_until = begins + free.first_hit(starts, outward, np.maximum(wanted * (1 + CLEARANCE) - begins, 0))
     distance = np.minimum(wanted, open_until / (1 + CLEARANCE))

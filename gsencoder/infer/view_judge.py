@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from jaxtyping import Float32, Float64
 from gsencoder.evenly import evenly
 from gsencoder.infer.view_targets import Target
 from gsencoder.render import Blend, BlendConfig, blend
-from gsencoder.tracking import Track, untracked
+from gsencoder.render.threads import parallel
 from gsencoder.types import Cameras, Gaussians
 
 JUDGED = BlendConfig(stop_transmittance=0.02, min_weight=1e-3)
@@ -56,7 +57,6 @@ def look(
     *,
     side: int = 160,
     config: BlendConfig = JUDGED,
-    track: Track = untracked,
 ) -> tuple[Looks, ...]:
     """Judges cameras by small renders, one for each, in which every Gaussian hides what is behind it.
 
@@ -66,21 +66,43 @@ def look(
         targets: what is looked at.
         side: longer side of the renders, pixels.
         config: accuracy of the renders.
-        track: wraps the loop over cameras to show progress.
     """
     small = cameras.resized(side)
     watched = [_Watched(gaussians, target) for target in targets]
-    for view in track(range(len(cameras)), "judging views"):
+
+    def one(view: int) -> list[_Seen]:
         b = blend(gaussians, small, view, config=config)
         # Pixels that each Gaussian fills.
         weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians))
-        for each in watched:
-            each.add(b, weights, small, cameras, view, config)
-    return tuple(each.looks() for each in watched)
+        return [each.seen(b, weights, small, view, config) for each in watched]
+
+    # Whole views share the threads out better than parts of small ones.
+    found = parallel(one, range(len(cameras)))
+    return tuple(_together([each[place] for each in found], cameras, small) for place in range(len(targets)))
+
+
+class _Seen(NamedTuple):
+    """What one camera sees of one target; see `Looks`. The blur is in small pixels."""
+
+    visible: float
+    share: float
+    inside: float
+    alpha: float
+    blur: float
+    target: Float32[np.ndarray, " n"]
+    context: Float32[np.ndarray, " m"]
+
+
+def _together(seen: Sequence[_Seen], cameras: Cameras, small: Cameras) -> Looks:
+    """All cameras' sight of one target."""
+    values = {name: np.array([getattr(each, name) for each in seen], np.float64) for name in _Seen._fields[:5]}
+    values["blur"] = values["blur"] * cameras.Ks[:, 0, 0] / small.Ks[:, 0, 0]
+    target, context = (np.stack([getattr(each, name) for each in seen]) for name in ("target", "context"))
+    return Looks(**values, target=target, context=context)
 
 
 class _Watched:
-    """Collects, camera by camera, what is seen of one target."""
+    """A target, and what is needed again for every camera that looks at it."""
 
     def __init__(self, gaussians: Gaussians, target: Target) -> None:
         self._rows = target.rows
@@ -93,19 +115,11 @@ class _Watched:
         self._samples = tuple(rows[evenly(len(rows), SAMPLE)] for rows in (target.rows, around))
         # The size of a flat Gaussian is that of its disc.
         self._sizes = np.sqrt(np.sort(self._alone.scales, axis=1)[:, 1:].prod(axis=1, dtype=np.float64))
-        self._found: list[tuple[float, float, float, float, float]] = []
-        self._seen: list[tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " m"]]] = []
 
-    def add(
-        self,
-        b: Blend,
-        weights: Float64[np.ndarray, " N"],
-        small: Cameras,
-        cameras: Cameras,
-        view: int,
-        config: BlendConfig,
-    ) -> None:
-        """One more camera."""
+    def seen(
+        self, b: Blend, weights: Float64[np.ndarray, " N"], small: Cameras, view: int, config: BlendConfig
+    ) -> _Seen:
+        """What a camera sees of it."""
         alone = blend(self._alone, small, view, config=config).alpha
         shown = b.render(self._member)
         # What is half transparent at a target's rim belongs to what is behind it, too.
@@ -113,27 +127,16 @@ class _Watched:
         whole = float(alone[solid].sum())
         mine = weights[self._rows]
         depths = b.depths.numpy()[self._rows].astype(np.float64)
-        pixels = float(cameras.Ks[view, 0, 0]) * self._sizes / np.maximum(depths, config.near)
-        self._found.append(
-            (
-                min(float(shown[solid].sum()) / whole, 1.0) if whole > FAINT else 0.0,
-                float(shown.mean()),
-                _inside(self._alone.means, small, view),
-                _around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
-                float(mine @ pixels / mine.sum()) if mine.sum() > 0 else 0.0,
-            )
-        )
-        self._seen.append(tuple(weights[rows].astype(np.float32) for rows in self._samples))
-
-    def looks(self) -> Looks:
-        """All cameras together."""
-        visible, share, inside, alpha, blur = np.array(self._found, np.float64).reshape(-1, 5).T
-        target, context = (
-            np.stack([seen[part] for seen in self._seen]) if self._seen else np.zeros((0, len(rows)), np.float32)
-            for part, rows in enumerate(self._samples)
-        )
-        return Looks(
-            visible=visible, share=share, inside=inside, alpha=alpha, blur=blur, target=target, context=context
+        pixels = float(small.Ks[view, 0, 0]) * self._sizes / np.maximum(depths, config.near)
+        target, context = (weights[rows].astype(np.float32) for rows in self._samples)
+        return _Seen(
+            visible=min(float(shown[solid].sum()) / whole, 1.0) if whole > FAINT else 0.0,
+            share=float(shown.mean()),
+            inside=_inside(self._alone.means, small, view),
+            alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
+            blur=float(mine @ pixels / mine.sum()) if mine.sum() > 0 else 0.0,
+            target=target,
+            context=context,
         )
 
 

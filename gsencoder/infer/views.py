@@ -19,7 +19,6 @@ from gsencoder.infer.free_space import FreeSpace
 from gsencoder.infer.view_candidates import frames_on, shell_cameras, up_of
 from gsencoder.infer.view_judge import JUDGED, Looks, coverage, directions, look
 from gsencoder.infer.view_targets import Target, check_targets
-from gsencoder.tracking import Track, untracked
 from gsencoder.types import Cameras, Scene
 
 WATCHERS = 12
@@ -122,16 +121,13 @@ class ViewSet:
         return len(self.cameras)
 
 
-def choose_views(
-    scene: Scene, targets: Sequence[Target], config: ViewsConfig = ViewsConfig(), *, track: Track = untracked
-) -> ViewSet:
+def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = ViewsConfig()) -> ViewSet:
     """The views that show targets best.
 
     Args:
         scene: Gaussians, and cameras where it has any.
         targets: what is looked at; all count alike.
         config: see there.
-        track: wraps the loop over candidates to show progress.
 
     Raises:
         InputError: no Gaussians; no targets; frames are asked for where there are none; no camera finds room.
@@ -142,7 +138,7 @@ def choose_views(
     cameras, names, frames = (
         _uniform(scene, config) if config.method == "uniform" else _candidates(scene, targets, config)
     )
-    looks = look(scene.gaussians, cameras, targets, side=config.judged_side, track=track)
+    looks = look(scene.gaussians, cameras, targets, side=config.judged_side)
     values = _Values(cameras, targets, looks, config)
     if config.method == "uniform":
         order, gains = np.arange(len(cameras)), None
@@ -205,7 +201,7 @@ def _candidates(
                 scene.gaussians,
                 target,
                 room,
-                FreeSpace(scene.gaussians, watchers, JUDGED),
+                FreeSpace(scene.gaussians, watchers, JUDGED, apart=target.rows),
                 up=up_of(scene),
                 width=config.width,
                 height=config.height,

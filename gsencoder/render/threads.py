@@ -6,6 +6,7 @@ bits.
 """
 
 import os
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -22,12 +23,20 @@ kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract",
 """Compiles a function that parallel() may run; reassociation stays off, so sums have one order."""
 
 
+_here = threading.local()
+
+
+def _enter() -> None:
+    _here.inside = True
+
+
 def parallel(work: Callable[[int], Any], pieces: Iterable[int]) -> list[Any]:
-    """Runs `work` for each piece on as many threads as torch uses; results in order."""
+    """Runs `work` for each piece on as many threads as torch uses; results in order. Work that calls this again does
+    its own pieces one after the other: the threads are taken."""
     threads = min(torch.get_num_threads(), os.cpu_count() or 1)
-    if threads == 1:
+    if threads == 1 or getattr(_here, "inside", False):
         return [work(piece) for piece in pieces]
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads, initializer=_enter) as pool:
         return list(pool.map(work, pieces))
 
 

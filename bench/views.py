@@ -1,0 +1,143 @@
+"""Views chosen of the objects of labelled scenes: held against instance masks, and against full-size renders.
+
+    python bench/views.py SCENE … [--candidates 16,32,64] [--weights 0.3,0.1,0.2]
+
+Objects are found by their names in features of the labels teacher. Among the scene's own frames, 8 chosen ones are
+held against the 8 with most pixels of the object by its instance mask, and against 8 that are evenly spread. Views
+around objects are rendered at full size with all accuracy. Seconds are of choosing, from the loaded scene on.
+"""
+
+import argparse
+import time
+import warnings
+from dataclasses import replace
+
+import numpy as np
+
+from gsencoder.data.model_files import find_file
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeds import with_gaussians
+from gsencoder.data.text_table import load_text_table
+from gsencoder.errors import InputError, SceneWarning
+from gsencoder.evaluate.boxes import asked_objects
+from gsencoder.fusion.fuse import fuse
+from gsencoder.fusion.teachers.build import build_teacher
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.infer.free_space import FreeSpace
+from gsencoder.infer.localize import localize
+from gsencoder.infer.view_judge import look
+from gsencoder.infer.view_targets import Target, targets_of
+from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
+from gsencoder.render import BlendConfig
+from gsencoder.types import Scene, SceneObject
+
+COUNT = 8
+WORDS = "clip_vitb32_names.npz"
+
+
+def objects_of(path: str) -> tuple[Scene, list[tuple[Target, SceneObject]]]:
+    """A scene with Gaussians, and what was found of its small objects beside the labels."""
+    words = load_text_table(find_file(WORDS, "words"))
+    scene = with_gaussians(load_scene(path))
+    assert scene.gaussians is not None
+    features = fuse(scene, build_teacher(LabelsConfig(words=WORDS), scene, words)).features
+    scene = replace(scene, features={features.space.name: features})
+    asked = asked_objects(scene.objects)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)
+        found = localize(scene, list(dict.fromkeys(one.name for one in asked if one.name)), words)
+    pairs = []
+    for target in targets_of(scene.gaussians, found):
+        same = [one for one in asked if one.name == target.name]
+        away = [np.linalg.norm((one.aabb_min + one.aabb_max) / 2 - scene.origin - target.center) for one in same]
+        pairs.append((target, same[int(np.argmin(away))]))
+    return scene, pairs
+
+
+def pixels_of(scene: Scene, one: SceneObject) -> np.ndarray:
+    """Pixels of an object in each frame, by its instance mask."""
+    assert scene.views is not None
+    assert scene.views.instances is not None
+    return np.array([int((mask == one.id).sum()) for mask in scene.views.instances])
+
+
+def measured(scene: Scene, target: Target, chosen: ViewSet) -> dict[str, np.ndarray]:
+    """What full renders of chosen views show."""
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    (seen,) = look(scene.gaussians, chosen.cameras, [target], side=640, config=BlendConfig())
+    free = FreeSpace(scene.gaussians, scene.views.cameras)
+    centers = chosen.cameras.centers
+    return {
+        "visible": seen.visible >= 0.9,
+        "share": (seen.share >= 0.05) & (seen.share <= 0.6),
+        "alpha": seen.alpha >= 0.9,
+        "free": (free.clearance(centers) > 0) & free.seen_empty(centers),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("scenes", nargs="+")
+    parser.add_argument("--candidates", default="16,32,64")
+    parser.add_argument("--weights", default="")
+    chosen = parser.parse_args()
+    settings = {}
+    if chosen.weights:
+        names = ("cover_weight", "context_weight", "spread_weight")
+        settings = dict(zip(names, map(float, chosen.weights.split(",")), strict=True))
+    counts = [int(count) for count in chosen.candidates.split(",")]
+    frames: dict[str, list[float]] = {"greedy": [], "uniform": []}
+    shells: dict[int, list[dict[str, np.ndarray]]] = {count: [] for count in counts}
+    seconds: dict[int, list[float]] = {count: [] for count in counts}
+    covered: dict[int, list[float]] = {count: [] for count in counts}
+    failed: dict[int, list[str]] = {count: [] for count in counts}
+    for path in chosen.scenes:
+        scene, pairs = objects_of(path)
+        for target, one in pairs:
+            pixels = pixels_of(scene, one)
+            best = np.sort(pixels)[::-1][:COUNT].sum()
+            for method in ("greedy", "uniform"):
+                config = ViewsConfig(source="frames", method=method, candidates=max(64, COUNT), **settings)
+                views = choose_views(scene, [target], config)
+                frames[method].append(float(pixels[[each.frame for each in views.chosen]].sum() / best))
+            for count in counts:
+                config = ViewsConfig(source="shells", candidates=count, **settings)
+                start = time.perf_counter()
+                try:
+                    views = choose_views(scene, [target], config)
+                except InputError as error:
+                    failed[count].append(f"{scene.name} {target.name}: {error}")
+                    continue
+                seconds[count].append(time.perf_counter() - start)
+                covered[count].append(views.chosen[-1].covered)
+                shells[count].append(measured(scene, target, views))
+                told = {name: int(good.sum()) for name, good in shells[count][-1].items()}
+                print(
+                    f"{scene.name} {target.name}: {len(views)} of {views.judged} of {count}, {told}; "
+                    f"frames {frames['greedy'][-1]:.3f}, {frames['uniform'][-1]:.3f}",
+                    flush=True,
+                )
+    for method, ratios in frames.items():
+        print(
+            f"frames, {method}: {np.mean(ratios):.3f} of the best {COUNT}'s pixels, least {min(ratios):.3f}, "
+            f"{np.mean(np.array(ratios) >= 0.9):.2f} of {len(ratios)} objects at 0.9"
+        )
+    for count in counts:
+        total = len(shells[count]) + len(failed[count])
+        told = []
+        for name in ("visible", "share", "alpha", "free"):
+            enough = sum(each[name].sum() >= COUNT - 1 for each in shells[count])
+            mean = np.concatenate([each[name] for each in shells[count]]).mean()
+            told.append(f"{name} {enough / total:.2f} ({mean:.3f} of views)")
+        every = sum(np.logical_and.reduce(list(each.values())).sum() >= COUNT - 1 for each in shells[count])
+        print(
+            f"shells of {count}: in 7 of 8 views {', '.join(told)}; all of it {every / total:.2f} of {total} objects; "
+            f"covered {np.mean(covered[count]):.3f}; {np.median(seconds[count]):.2f} s, most {max(seconds[count]):.2f}"
+        )
+        for line in failed[count]:
+            print(f"  {line}")
+
+
+if __name__ == "__main__":
+    main()
