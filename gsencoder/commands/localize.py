@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gsencoder.commands.asked import asked_words, words_of
 from gsencoder.config import CommonConfig
-from gsencoder.data.text_table import TextTable, load_text_table
 from gsencoder.errors import InputError
-from gsencoder.fusion.store import WORDS_FILE, load_features
+from gsencoder.fusion.store import load_features
 from gsencoder.infer.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
 from gsencoder.infer.relevancy_views import relevancy_pictures
@@ -16,9 +16,6 @@ from gsencoder.outputs import output_folder, write_json
 from gsencoder.progress import console
 from gsencoder.summary import Summary
 from gsencoder.types import Localization
-
-LARGEST_QUERIES = 1 << 20
-"""Bytes of a file of queries."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +42,7 @@ class LocalizeCommandConfig(CommonConfig):
 def run(config: LocalizeCommandConfig, summary: Summary) -> None:
     """Reads features, finds each word, writes boxes as JSON and .ply, and draws them."""
     folder = Path(config.paths[0])
-    words = asked_words(config)
+    words = asked_words(config.query, config.queries)
     with summary.step("load"):
         scene = load_features(folder)
         table = words_of(folder, config.words)
@@ -66,43 +63,6 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
     for word in words:
         screen.print(f"{word}: {_first_box(found, word)}")
     screen.print(f"{out}: boxes.json, boxes.ply and pictures; boxes are drawn around Gaussian {config.localize.extent}")
-
-
-def asked_words(config: LocalizeCommandConfig) -> list[str]:
-    """The words of query= and of the file queries=, blanks stripped, each once, in order."""
-    lines = list(config.query)
-    if config.queries:
-        lines += _lines_of(Path(config.queries))
-    words = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
-    if not words:
-        raise InputError("query= is missing: one or several words, separated by commas (or queries=FILE)")
-    return words
-
-
-def _lines_of(file: Path) -> list[str]:
-    """The lines of a text file, which may begin with a byte order mark."""
-    if not file.is_file():
-        raise InputError(f"queries: {file} is no file; expected a text file with one query a line")
-    try:
-        with file.open("rb") as stream:
-            data = stream.read(LARGEST_QUERIES + 1)
-        if len(data) > LARGEST_QUERIES:
-            raise InputError(f"queries: {file} holds more than {LARGEST_QUERIES:,} bytes; expected one word a line")
-        return data.decode("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"queries: {file} cannot be read as text: {error}") from error
-
-
-def words_of(folder: Path, given: str) -> TextTable:
-    """The text table that was given, or the one that lies beside the features."""
-    if given:
-        return load_text_table(given)
-    path = folder / WORDS_FILE
-    if not path.is_file():
-        raise InputError(
-            f"{folder}: no words lead into these features; fuse with a teacher that has words, or give words="
-        )
-    return load_text_table(path)
 
 
 def _first_box(found: Localization, word: str) -> str:

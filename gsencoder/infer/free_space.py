@@ -111,9 +111,10 @@ class FreeSpace:
         return np.where(hit.any(axis=1), along[hit.argmax(axis=1)], np.inf)
 
     def clearance(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        """World units from each point to the nearest surface, less than zero inside a Gaussian.
+        """World units from each point to the nearest surface, less than zero inside a Gaussian; never too much.
 
-        A surface lies two standard deviations from the centre of a Gaussian, towards the point.
+        A surface lies two standard deviations from the centre of a Gaussian. The plane that touches it there, across
+        the line from the centre to the point, is no farther away than the surface.
         """
         count = min(NEAREST, len(self._solid))
         distances, rows = self._tree.query(points, k=[*range(1, count + 1)])

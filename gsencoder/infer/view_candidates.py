@@ -64,8 +64,8 @@ def shell_cameras(
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
     outward, vertical = spiral_directions(TRIED * count, up)
     wanted, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height)
-    # Up to the first surface beyond the target itself, with room to stand before it.
-    begins = reach + free.cell / 2
+    # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
+    begins = reach + 2 * free.cell
     starts = target.center + begins[:, None] * outward
     open_until = begins + free.first_hit(starts, outward, np.maximum(wanted * (1 + CLEARANCE) - begins, 0))
     distance = np.minimum(wanted, open_until / (1 + CLEARANCE))
@@ -115,7 +115,8 @@ def _distances(
     """Along each direction how far a camera should be, how far at least, and how far the target itself reaches."""
     rows = target.rows[evenly(len(target.rows), SAMPLE)]
     offsets = gaussians.means[rows].astype(np.float64) - target.center
-    cell = target.radius / OUTLINE
+    # A Gaussian fills a cell of its own size.
+    cell = max(target.radius / OUTLINE, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
     wanted, least, reach = (np.empty(len(outward)) for _ in range(3))
     for index, direction in enumerate(outward):
         right = np.cross(direction, vertical)

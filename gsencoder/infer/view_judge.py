@@ -67,6 +67,8 @@ def look(
         side: longer side of the renders, pixels.
         config: accuracy of the renders.
     """
+    if not targets:
+        return ()
     small = cameras.resized(side)
     watched = [_Watched(gaussians, target) for target in targets]
 

@@ -92,14 +92,15 @@ class Chosen:
         name: of the frame, or "around mug 03".
         frame: which of the scene's views it is; None where it was placed.
         gain: what it added to the choice; None for uniform frames.
-        covered: share of the targets' Gaussians that this view and those before it see well, by `coverage`.
+        covered: share of the targets' Gaussians that this view and those before it see well, by `coverage`; None where
+            there are no targets.
         sights: one for each target.
     """
 
     name: str
     frame: int | None
     gain: float | None
-    covered: float
+    covered: float | None
     sights: tuple[Sight, ...]
 
 
@@ -126,7 +127,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
 
     Args:
         scene: Gaussians, and cameras where it has any.
-        targets: what is looked at; all count alike.
+        targets: what is looked at; all count alike. Evenly spread frames need none.
         config: see there.
 
     Raises:
@@ -134,12 +135,13 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
     """
     if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
-    check_targets(targets, scene.gaussians)
+    if targets or config.method == "greedy":
+        check_targets(targets, scene.gaussians)
     cameras, names, frames = (
         _uniform(scene, config) if config.method == "uniform" else _candidates(scene, targets, config)
     )
     looks = look(scene.gaussians, cameras, targets, side=config.judged_side)
-    values = _Values(cameras, targets, looks, config)
+    values = Values(cameras, targets, looks, config)
     if config.method == "uniform":
         order, gains = np.arange(len(cameras)), None
     else:
@@ -245,7 +247,7 @@ def worth(looks: Looks, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
     return np.asarray(size * looks.visible * (0.5 + 0.5 * looks.inside) * np.clip(looks.alpha / 0.9, 0, 1) ** 2)
 
 
-class _Values:
+class Values:
     """What sets of candidates are worth."""
 
     def __init__(
@@ -264,9 +266,21 @@ class _Values:
             self._kept.append((coverage(each.target) * good, coverage(each.context) * good, towards * good))
         self._raw = [coverage(each.target) for each in looks]
 
-    def covered(self, views: Int64[np.ndarray, " n"]) -> float:
+    def covered(self, views: Int64[np.ndarray, " n"]) -> float | None:
         """Mean share of the targets' Gaussians that are seen as well as any candidate sees them."""
+        if not self._raw:
+            return None
         return float(np.mean([raw[views].max(axis=0).mean() for raw in self._raw]))
+
+    def of(self, views: Sequence[int] | Int64[np.ndarray, " n"]) -> float:
+        """What a set is worth: the sum that `greedy` makes large."""
+        chosen = list(views)
+        value = float(np.mean([worth[chosen].sum() for worth in self.worths]) / self._count)
+        for parts in self._kept:
+            for weight, part in zip(self._weights, parts, strict=True):
+                if part.shape[1]:
+                    value += weight / len(self._kept) * float(part[chosen].max(axis=0).mean())
+        return value
 
     def greedy(self, count: int) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
         """Views in the order of their gains, and these; of equal ones the first."""

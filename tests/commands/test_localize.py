@@ -5,12 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from gsencoder.commands.localize import LARGEST_QUERIES, LocalizeCommandConfig, asked_words
+from gsencoder.commands.asked import LARGEST_QUERIES, asked_words
+from gsencoder.commands.localize import LocalizeCommandConfig
 from gsencoder.errors import InputError
 
 
 def words(**settings: object) -> list[str]:
-    return asked_words(LocalizeCommandConfig(**settings))  # type: ignore[arg-type]
+    config = LocalizeCommandConfig(**settings)  # type: ignore[arg-type]
+    return asked_words(config.query, config.queries)
 
 
 def test_words_of_query_and_file_are_asked_once_each_in_order(tmp_path: Path) -> None:

@@ -1,0 +1,56 @@
+"""Chosen views as pictures: plain ones to show to a VLM, and a sheet for people that says why."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import UInt8
+
+from gsencoder.errors import InputError
+from gsencoder.infer.pictures import contact_sheet, draw_boxes
+from gsencoder.infer.views import Chosen, ViewSet
+from gsencoder.render import BlendConfig
+from gsencoder.render.rgb import RenderedImages
+from gsencoder.types import Box, Scene
+
+Picture = UInt8[np.ndarray, "_h _w 3"]
+
+
+def view_pictures(scene: Scene, views: ViewSet, *, config: BlendConfig = BlendConfig()) -> list[Picture]:
+    """The splat through each chosen camera.
+
+    Raises:
+        InputError: a scene without Gaussians.
+    """
+    if scene.gaussians is None:
+        raise InputError(f"views: scene {scene.name} has no Gaussians")
+    return list(RenderedImages(scene.gaussians, views.cameras, config))
+
+
+def view_sheet(
+    scene: Scene, views: ViewSet, pictures: Sequence[Picture], boxes: Sequence[Box], *, columns: int = 4
+) -> Picture:
+    """All chosen views with the boxes drawn, and what each shows above it.
+
+    Args:
+        scene: where the boxes are.
+        views: as chosen.
+        pictures: of `view_pictures`.
+        boxes: to draw.
+        columns: of the sheet.
+    """
+    drawn = [
+        draw_boxes(picture, boxes, pose, K, origin=scene.origin)
+        for picture, pose, K in zip(pictures, views.cameras.cam_from_world, views.cameras.Ks, strict=True)
+    ]
+    titles = [f"{number}  {told(each)}" for number, each in enumerate(views.chosen)]
+    return contact_sheet(drawn, titles, columns=columns)
+
+
+def told(chosen: Chosen) -> str:
+    """A view in a line."""
+    sights = ", ".join(
+        f"{sight.target} {sight.share:.0%} of the picture, {sight.visible:.0%} of it visible"
+        for sight in chosen.sights
+        if sight.share > 0
+    )
+    return f"{chosen.name}: {sights or 'shows none of it'}" if chosen.sights else chosen.name

@@ -1,0 +1,114 @@
+"""Where a camera can stand, in a room whose walls are known."""
+
+import numpy as np
+import pytest
+from rooms import HALF, HEIGHT, STEP, corner_cameras, room, sheet, splat
+
+from gsencoder.infer.free_space import SIGMAS, FreeSpace
+from gsencoder.types import Gaussians
+
+
+@pytest.fixture(scope="module")
+def free() -> FreeSpace:
+    scene, rows = room()
+    assert scene.gaussians is not None
+    return FreeSpace(scene.gaussians, corner_cameras(), apart=rows)
+
+
+def test_points_in_the_room_are_seen_empty_and_those_beyond_its_walls_are_not(
+    free: FreeSpace, rng: np.random.Generator
+) -> None:
+    inside = rng.uniform((-1.2, -1.2, 0.3), (1.2, 1.2, 1.3), (200, 3))
+    inside = inside[np.abs(inside - (0.3, 0.2, 0.8)).max(axis=1) > 0.5]
+    assert free.seen_empty(inside).mean() > 0.97
+    outside = rng.uniform(-1, 1, (300, 3)) * 4 + (0, 0, 1.2)
+    outside = outside[(np.abs(outside[:, :2]) > HALF + 0.2).any(axis=1)]
+    assert len(outside) > 100
+    assert not free.seen_empty(outside).any()
+
+
+def test_the_inside_of_a_closed_thing_is_not_seen_empty(free: FreeSpace) -> None:
+    assert not free.seen_empty(np.array([[0.3, 0.2, 0.8]])).any()
+
+
+def test_nobody_knows_what_is_empty_without_cameras() -> None:
+    scene, _ = room()
+    assert scene.gaussians is not None
+    blind = FreeSpace(scene.gaussians, None)
+    assert blind.watchers is None
+    assert not blind.seen_empty(np.zeros((3, 3))).any()
+
+
+def test_clearance_from_a_wall_is_at_most_the_distance_less_two_standard_deviations() -> None:
+    wall = splat(sheet((1.0, 0, 0), (1, 2), (1.0, 1.0)))
+    flat = Gaussians(
+        means=wall.means,
+        quats=wall.quats,
+        scales=wall.scales * np.array([0.1, 1, 1], np.float32),
+        opacities=wall.opacities,
+        sh=wall.sh,
+    )
+    # Straight in front of one of the Gaussians.
+    away = np.array([0.5, 0.2, 0.1])
+    at = np.array([[1 - d, *wall.means[600, 1:]] for d in away])
+    exact = away - SIGMAS * float(flat.scales[0, 0])
+    one = FreeSpace(flat.select(np.array([600])), None).clearance(at)
+    np.testing.assert_allclose(one, exact, atol=1e-6)
+    all_of_it = FreeSpace(flat, None).clearance(at)
+    assert (all_of_it <= exact + 1e-9).all()
+    assert (all_of_it >= exact - 0.4 * STEP).all()
+    assert FreeSpace(flat, None).clearance(wall.means[600:601].astype(np.float64))[0] <= 0
+
+
+def test_rays_end_at_walls_and_go_through_what_is_set_apart(free: FreeSpace) -> None:
+    start = np.array([[0.3, 0.2, 0.8]])
+    for axis, sign in ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, 1.0), (2, -1.0)):
+        direction = np.zeros((1, 3))
+        direction[0, axis] = sign
+        wall = (HALF if sign > 0 else -HALF) if axis < 2 else (HEIGHT if sign > 0 else 0.0)
+        distance = free.first_hit(start, direction, np.array([10.0]))[0]
+        assert abs(distance - abs(wall - start[0, axis])) < 2 * free.cell
+    assert free.first_hit(start, np.array([[1.0, 0, 0]]), np.array([0.5]))[0] == np.inf
+    scene, _ = room()
+    assert scene.gaussians is not None
+    assert FreeSpace(scene.gaussians, None).first_hit(start, np.array([[1.0, 0, 0]]), np.array([0.5]))[0] < 0.25
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 500.0)])
+def test_what_is_free_does_not_depend_on_the_unit_or_the_place(scale: float, shift: float) -> None:
+    wall = sheet((1.0, 0, 0), (1, 2), (1.0, 1.0))
+    moved = FreeSpace(splat(wall * scale + shift, 0.6 * STEP * scale), None)
+    here = FreeSpace(splat(wall), None)
+    start, along = np.array([[0.03, 0.01, 0.02]]), np.array([[1.0, 0, 0]])
+    assert moved.cell == pytest.approx(here.cell * scale, rel=1e-2)
+    far = moved.first_hit(start * scale + shift, along, np.array([5.0 * scale]))[0]
+    assert far == pytest.approx(here.first_hit(start, along, np.array([5.0]))[0] * scale, abs=1.5 * moved.cell)
+
+
+@pytest.mark.parametrize("count", [1, 2, 50])
+def test_few_gaussians_and_many_in_one_place_have_a_free_space(count: int) -> None:
+    together = splat(np.zeros((count, 3)), 0.1)
+    free = FreeSpace(together, None)
+    assert free.cell == pytest.approx(0.2)
+    np.testing.assert_allclose(free.clearance(np.array([[1.0, 0, 0]])), [0.8], atol=1e-6)
+    assert free.first_hit(np.array([[-1.0, 0, 0]]), np.array([[1.0, 0, 0]]), np.array([3.0]))[0] < 1.01
+
+
+def test_faint_gaussians_are_no_obstacle_unless_there_are_no_others() -> None:
+    wall = splat(sheet((1.0, 0, 0), (1, 2), (1.0, 1.0)))
+    faint = Gaussians(
+        means=wall.means - np.array([0.5, 0, 0], np.float32),
+        quats=wall.quats,
+        scales=wall.scales,
+        opacities=np.full(len(wall), 0.1, np.float32),
+        sh=wall.sh,
+    )
+    both = Gaussians(
+        **{
+            name: np.concatenate([getattr(wall, name), getattr(faint, name)])
+            for name in ("means", "quats", "scales", "opacities", "sh")
+        }
+    )
+    ray = (np.zeros((1, 3)) + 0.01, np.array([[1.0, 0, 0]]), np.array([3.0]))
+    assert FreeSpace(both, None).first_hit(*ray)[0] > 0.8
+    assert FreeSpace(faint, None).first_hit(*ray)[0] < 0.6

@@ -1,0 +1,316 @@
+"""Which views are chosen, and what they are judged by: laws in a room that is known, and a wall that hides."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rooms import CUBE, HALF, HEIGHT, UP, corner_cameras, cube, room, sheet, splat
+
+from gsencoder.data.orbits import looking_cameras
+from gsencoder.errors import InputError
+from gsencoder.infer.free_space import FreeSpace
+from gsencoder.infer.view_candidates import frames_on, shell_cameras, up_of
+from gsencoder.infer.view_judge import look
+from gsencoder.infer.view_pictures import view_pictures, view_sheet
+from gsencoder.infer.view_targets import Target, target_of, targets_of
+from gsencoder.infer.views import Values, ViewsConfig, choose_views, worth
+from gsencoder.types import Box, Gaussians, Localization, Scene
+
+SHELLS = ViewsConfig(source="shells", candidates=16, count=6, width=160, height=120)
+
+
+def cube_in_room(*others: np.ndarray) -> tuple[Scene, Target]:
+    scene, rows = room(*others)
+    assert scene.gaussians is not None
+    return scene, target_of("cube", scene.gaussians, rows)
+
+
+def box_of(word: str, rank: int, rows: np.ndarray) -> Box:
+    return Box(
+        query=word,
+        rank=rank,
+        score=0.5,
+        aabb_min=np.zeros(3),
+        aabb_max=np.ones(3),
+        obb_center=np.full(3, 0.5),
+        obb_rotation=np.eye(3),
+        obb_size=np.ones(3),
+        rows=rows,
+    )
+
+
+def test_targets_are_the_best_boxes_of_each_word_with_the_ball_that_holds_them() -> None:
+    splat_ = splat(np.concatenate([cube((0, 0, 0)), cube((1, 0, 0))]))
+    half = len(splat_) // 2
+    boxes = (box_of("a", 0, np.arange(half)), box_of("a", 1, np.arange(half, 2 * half)), box_of("b", 0, np.array([3])))
+    found = Localization(
+        queries=("a", "b", "c"),
+        relevancy=np.zeros((3, len(splat_)), np.float32),
+        thresholds=np.zeros(3, np.float32),
+        boxes=boxes,
+    )
+    assert [each.name for each in targets_of(splat_, found)] == ["a", "b"]
+    named = targets_of(splat_, found, 2)
+    assert [each.name for each in named] == ["a", "a 2", "b"]
+    np.testing.assert_allclose(named[1].center, [1, 0, 0], atol=1e-6)
+    assert named[0].radius == pytest.approx(CUBE * np.sqrt(3), rel=1e-3)
+    assert named[2].radius == pytest.approx(2 * 0.6 * 0.06, rel=1e-3)
+
+
+def test_cameras_on_shells_look_at_the_target_from_free_places_that_were_seen() -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    free = FreeSpace(scene.gaussians, corner_cameras(), apart=target.rows)
+    around = shell_cameras(scene.gaussians, target, 16, free, up=UP)
+    assert len(around) == 16
+    centers = around.centers
+    away = centers - target.center
+    forward = around.cam_from_world[:, 2, :3]
+    cosines = -(away * forward).sum(axis=1) / np.linalg.norm(away, axis=1)
+    np.testing.assert_allclose(cosines, 1, atol=1e-6)
+    assert (np.abs(centers[:, :2]) < HALF).all()
+    assert (centers[:, 2] > 0).all()
+    assert (centers[:, 2] < HEIGHT).all()
+    assert (free.clearance(centers) > 0.02).all()
+    assert free.seen_empty(centers).all()
+    # The pictures' right stays level.
+    np.testing.assert_allclose(around.cam_from_world[:, 0, 2], 0, atol=1e-6)
+
+
+def test_a_target_by_itself_is_seen_whole_and_fills_what_it_should() -> None:
+    # A plate of side 0.4 two units in front of a camera.
+    plate = splat(sheet((0, 0, 2.0), (0, 1), (0.2, 0.2), 0.02), 0.012)
+    cameras = looking_cameras(np.zeros((1, 3)), np.array([[0, 0, 1.0]]), np.array([0, -1.0, 0]), 200.0, 160, 120)
+    (seen,) = look(plate, cameras, [target_of("plate", plate, np.arange(len(plate)))])
+    assert seen.visible[0] == pytest.approx(1)
+    assert seen.inside[0] == 1
+    # At least the means' square, at most that with two standard deviations on every side.
+    least, most = ((side * 200 / 2) ** 2 / (160 * 120) for side in (0.4, 0.4 + 4 * 0.012))
+    assert least < seen.share[0] < most
+    assert seen.blur[0] == pytest.approx(200 * 0.012 / 2, rel=1e-3)
+    assert 0.2 < seen.alpha[0] < 0.4
+    assert seen.target.shape == (1, len(plate))
+    assert seen.context.shape == (1, 0)
+
+
+def test_what_stands_before_a_target_hides_it_by_its_share() -> None:
+    plate = sheet((0, 0, 2.0), (0, 1), (0.2, 0.2), 0.02)
+    cameras = looking_cameras(np.zeros((1, 3)), np.array([[0, 0, 1.0]]), np.array([0, -1.0, 0]), 200.0, 160, 120)
+    visible = []
+    for edge in (-0.4, 0.0, 0.4):
+        # A screen at half the distance whose right edge covers none, half, or all of the plate.
+        screen = sheet((edge / 2 - 0.5, 0, 1.0), (0, 1), (0.5, 0.5), 0.02)
+        both = splat(np.concatenate([plate, screen]), 0.012)
+        (seen,) = look(both, cameras, [target_of("plate", both, np.arange(len(plate)))])
+        visible.append(seen.visible[0])
+    assert visible[0] > 0.98
+    # The screen's rim is twice as wide on the plate.
+    assert 0.38 < visible[1] < 0.52
+    assert visible[2] < 0.02
+
+
+def test_views_of_two_targets_are_judged_as_each_by_itself() -> None:
+    scene, target = cube_in_room(cube((-0.6, 0.2, 0.8)))
+    assert scene.gaussians is not None
+    other = target_of(
+        "other", scene.gaussians, np.arange(len(scene.gaussians) - len(target.rows), len(scene.gaussians))
+    )
+    cameras = corner_cameras(5)
+    both = look(scene.gaussians, cameras, [target, other])
+    for place, one in enumerate((target, other)):
+        (alone,) = look(scene.gaussians, cameras, [one])
+        for name in ("visible", "share", "inside", "alpha", "blur", "target", "context"):
+            assert (getattr(both[place], name) == getattr(alone, name)).all()
+
+
+def test_views_are_chosen_from_the_side_that_a_wall_leaves_open() -> None:
+    # A screen beside the cube, from the floor up to 1.6, across the whole room.
+    screen = sheet((0.0, 0.0, 0.8), (1, 2), (HALF, 0.8))
+    scene, target = cube_in_room(screen)
+    chosen = choose_views(scene, [target], SHELLS)
+    assert len(chosen) == 6
+    assert (chosen.cameras.centers[:, 0] > 0.05).sum() >= 5
+    assert all(each.sights[0].visible > 0.9 for each in chosen.chosen)
+    assert all(0.05 <= each.sights[0].share <= 0.6 for each in chosen.chosen)
+    assert all(each.sights[0].alpha > 0.9 for each in chosen.chosen)
+
+
+def test_the_same_views_are_chosen_however_the_gaussians_are_ordered_and_wherever_the_room_is(
+    rng: np.random.Generator,
+) -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    here = choose_views(scene, [target], replace(SHELLS, source="both"))
+    order = rng.permutation(len(scene.gaussians))
+    mixed = replace(scene, gaussians=scene.gaussians.select(order))
+    again = choose_views(
+        mixed, [replace(target, rows=np.sort(np.argsort(order)[target.rows]))], replace(SHELLS, source="both")
+    )
+    assert [each.name for each in again.chosen] == [each.name for each in here.chosen]
+    np.testing.assert_allclose(again.cameras.centers, here.cameras.centers, atol=0.05)
+
+
+def test_gains_never_grow_and_the_choice_is_near_the_best_of_all() -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    cameras = corner_cameras(10, 160, 120)
+    config = ViewsConfig(count=3, candidates=10, cover_weight=1.0, context_weight=0.5, spread_weight=1.0)
+    values = Values(cameras, [target], look(scene.gaussians, cameras, [target]), config)
+    order, gains = values.greedy(10)
+    assert (np.diff(gains) <= 1e-12).all()
+    assert sorted(order.tolist()) == list(range(10))
+    best = max(values.of(each) for each in itertools.combinations(range(10), 3))
+    assert values.of(order[:3]) == pytest.approx(gains[:3].sum())
+    assert values.of(order[:3]) >= (1 - 1 / np.e) * best
+    assert values.of(order[:3]) >= 0.95 * best
+
+
+def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    (seen,) = look(scene.gaussians, corner_cameras(1), [target])
+    config = ViewsConfig()
+
+    def value(**changed: float) -> float:
+        base = {"visible": 1.0, "share": 0.2, "inside": 1.0, "alpha": 1.0} | changed
+        arrays = {name: np.array([number]) for name, number in base.items()}
+        return float(worth(replace(seen, **arrays), config)[0])
+
+    shares = [value(share=share) for share in (0.0, 0.01, 0.05, 0.1, 0.3)]
+    assert shares == sorted(shares)
+    assert shares[0] == 0
+    assert shares[-1] == pytest.approx(1)
+    assert value(share=0.6) == pytest.approx(1)
+    assert value(share=0.8) < 0.6
+    assert value(share=1.0) == 0
+    for name, less in (("visible", 0.5), ("inside", 0.5), ("alpha", 0.5)):
+        assert value(**{name: less}) < value()
+
+
+def test_frames_that_would_show_most_are_taken_first() -> None:
+    _, target = cube_in_room()
+    middle = corner_cameras(6)
+    outward = middle.centers / np.linalg.norm(middle.centers, axis=1, keepdims=True)
+    behind = looking_cameras(middle.centers, outward, UP, 40.0, 64, 48)
+    both = replace(
+        middle,
+        **{
+            name: np.concatenate([getattr(behind, name), getattr(middle, name)])
+            for name in ("cam_from_world", "Ks", "widths", "heights")
+        },
+    )
+    assert frames_on(both, [target], 6).tolist() == list(range(6, 12))
+    assert frames_on(both, [target], 99).tolist() == list(range(12))
+
+
+def test_uniform_frames_are_evenly_spread_and_need_no_target() -> None:
+    scene, target = cube_in_room()
+    config = ViewsConfig(method="uniform", count=4)
+    blank, judged = choose_views(scene, [], config), choose_views(scene, [target], config)
+    assert [each.frame for each in blank.chosen] == [0, 4, 7, 11]
+    assert [each.frame for each in judged.chosen] == [0, 4, 7, 11]
+    assert all(each.sights == () and each.covered is None and each.gain is None for each in blank.chosen)
+    assert judged.chosen[-1].covered is not None
+    # All that any of them sees, as well as any sees it: but for the cube's lower face.
+    assert judged.chosen[-1].covered > 0.8
+
+
+def test_more_candidates_never_leave_less_to_choose_from_than_are_asked_for() -> None:
+    scene, target = cube_in_room()
+    for source in ("frames", "shells", "both"):
+        chosen = choose_views(scene, [target], replace(SHELLS, source=source))  # type: ignore[arg-type]
+        assert len(chosen) == 6
+        assert chosen.judged <= 16
+        names = [each.name for each in chosen.chosen]
+        assert len(set(names)) == 6
+        covered = [each.covered for each in chosen.chosen]
+        assert covered == sorted(covered)  # type: ignore[type-var]
+        assert all((each.frame is None) == each.name.startswith("around cube") for each in chosen.chosen)
+
+
+def test_up_is_the_scenes_or_what_its_cameras_agree_on() -> None:
+    scene, _ = cube_in_room()
+    assert up_of(scene) is scene.up
+    unknown = up_of(replace(scene, up=None))
+    assert unknown is not None
+    assert unknown @ UP > 0.99
+    assert up_of(replace(scene, up=None, views=None)) is None
+
+
+def test_a_splat_without_cameras_has_views_around_its_target() -> None:
+    scene, target = cube_in_room()
+    bare = replace(scene, views=None, up=None)
+    assert len(choose_views(bare, [target], replace(SHELLS, source="both"))) == 6
+
+
+def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    with pytest.raises(InputError, match="nothing to look at"):
+        choose_views(scene, [], SHELLS)
+    with pytest.raises(InputError, match="'cube' has Gaussians beyond the 200 of the splat"):
+        choose_views(replace(scene, gaussians=scene.gaussians.select(np.arange(200))), [target], SHELLS)
+    with pytest.raises(InputError, match="has no Gaussians to look at"):
+        target_of("nothing", scene.gaussians, np.zeros(0, np.int64))
+    bare = replace(scene, views=None)
+    with pytest.raises(InputError, match="no cameras of its own; take source=shells"):
+        choose_views(bare, [target], replace(SHELLS, source="frames"))
+    with pytest.raises(InputError, match="no cameras to take evenly"):
+        choose_views(bare, [target], replace(SHELLS, method="uniform"))
+    with pytest.raises(InputError, match="scene room has no Gaussians"):
+        choose_views(replace(scene, gaussians=None), [target], SHELLS)
+    # A cube in a closed box that leaves no place to see it from.
+    closed, rows = room(cube((0.3, 0.2, 0.8), half=CUBE + 0.3, step=0.06))
+    assert closed.gaussians is not None
+    with pytest.raises(InputError, match="no room for a camera around cube"):
+        choose_views(closed, [target_of("cube", closed.gaussians, rows)], SHELLS)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"count": 0},
+        {"count": 9, "candidates": 8},
+        {"width": 0},
+        {"fov": 0.5},
+        {"judged_side": 4},
+        {"least_share": 0.7},
+        {"cover_weight": -1.0},
+        {"spread_weight": float("inf")},
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="expected"):
+        ViewsConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_single_gaussians_and_unequal_pictures_can_be_looked_at() -> None:
+    scene, _ = cube_in_room()
+    assert scene.gaussians is not None
+    point = target_of("point", scene.gaussians, np.array([7]))
+    chosen = choose_views(scene, [point], replace(SHELLS, candidates=8, count=2, width=31, height=77))
+    assert (chosen.cameras.widths == 31).all()
+    assert (chosen.cameras.heights == 77).all()
+
+
+def test_pictures_and_the_sheet_are_of_the_chosen_cameras() -> None:
+    scene, target = cube_in_room()
+    chosen = choose_views(scene, [target], replace(SHELLS, count=3))
+    pictures = view_pictures(scene, chosen)
+    assert [picture.shape for picture in pictures] == [(120, 160, 3)] * 3
+    assert all(picture.std() > 10 for picture in pictures)
+    sheet_ = view_sheet(scene, chosen, pictures, [box_of("cube", 0, target.rows)], columns=2)
+    assert sheet_.shape[1] > 900
+
+
+def test_opacity_zero_and_huge_gaussians_break_nothing() -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    g = scene.gaussians
+    scales, opacities = g.scales.copy(), g.opacities.copy()
+    scales[-3:], opacities[-50:] = 1e4, 0.0
+    odd = Gaussians(means=g.means, quats=g.quats, scales=scales, opacities=opacities, sh=g.sh)
+    chosen = choose_views(replace(scene, gaussians=odd), [target], SHELLS)
+    assert all(np.isfinite(each.gain) for each in chosen.chosen)  # type: ignore[arg-type]
