@@ -2,9 +2,10 @@
 
 Each command owns a `@dataclass(frozen=True, slots=True, kw_only=True)` whose fields carry `metadata={"help": …}`;
 that text is what `gsencoder COMMAND --help` shows. Further metadata: `required=True` (the command cannot run without
-it) and `metavar` (the word that stands for the value in the help). A field whose type is a dataclass is a section,
-and its options are written `section.name=value`. A field whose type is a union of dataclasses is a choice: every
-member has a field `name: Literal["…"]`, and a folder of YAML files, one a member, makes it `section=member`.
+it), `metavar` (the word that stands for the value in the help) and `secret=True` (the value is never shown or
+written). A field whose type is a dataclass is a section, and its options are written `section.name=value`. A field
+whose type is a union of dataclasses is a choice: every member has a field `name: Literal["…"]`, and a folder of YAML
+files, one a member, makes it `section=member`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,6 +29,9 @@ from gsencoder.options import (
 )
 
 T = TypeVar("T")
+
+HIDDEN = "(not shown)"
+"""What stands for the value of a secret option wherever settings are shown or written."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,7 +139,12 @@ def settings(config: object) -> dict[str, Any]:
 
     def plain(value: Any) -> Any:
         if is_dataclass(value) and not isinstance(value, type):
-            return {item.name: plain(getattr(value, item.name)) for item in fields(value)}
+            return {
+                item.name: HIDDEN
+                if item.metadata.get("secret") and getattr(value, item.name)
+                else plain(getattr(value, item.name))
+                for item in fields(value)
+            }
         if isinstance(value, (list, tuple)):
             return [plain(item) for item in value]
         if isinstance(value, Mapping):

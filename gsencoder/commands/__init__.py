@@ -42,6 +42,7 @@ COMMANDS = {
         Command(name="export", config="ExportConfig", help="an encoder as one ONNX file that takes raw Gaussians"),
         Command(name="localize", config="LocalizeCommandConfig", help="boxes, scores and pictures for words"),
         Command(name="views", config="ViewsCommandConfig", help="the views that show best what a word found"),
+        Command(name="ask", config="AskCommandConfig", help="a vision-language model's answer from such views"),
         Command(name="evaluate", config="EvaluateConfig", help="a paper's metric on labelled scenes"),
         Command(name="tradeoff", config="TradeoffConfig", help="what each accuracy knob costs and gives, measured"),
         Command(name="inspect", config="InspectConfig", help="what is in a splat file, and what is wrong with it"),

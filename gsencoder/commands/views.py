@@ -13,7 +13,7 @@ from gsencoder.config import CommonConfig
 from gsencoder.data.archive import write_archive
 from gsencoder.errors import InputError
 from gsencoder.fusion.store import load_features
-from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
+from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize
 from gsencoder.infer.tokens import Fit, feature_tokens, token_blends
 from gsencoder.infer.view_pictures import told, view_pictures, view_sheet
 from gsencoder.infer.view_targets import targets_of
@@ -74,7 +74,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
         if not targets:
             raise InputError(f"views: none of {', '.join(words)} was found in scene {scene.name}")
         boxes = [box for box in found.boxes if box.rank < config.boxes]
-        summary.results.update(boxes=[row for row in localization_to_json(found) if row["rank"] < config.boxes])
+        summary.results.update(boxes=[box_to_json(box) for box in boxes])
     with summary.step("choose"):
         views = choose_views(scene, targets, config.views)
     out = config.out or Path("outputs") / scene.name / "views"

@@ -219,25 +219,27 @@ def _boxes_of(
 
 
 def localization_to_json(localization: Localization) -> list[dict[str, Any]]:
-    """The boxes as JSON values, best first within each word, in world coordinates with the origin added back.
+    """The boxes as JSON values, best first within each word; see `box_to_json`."""
+    return [box_to_json(box) for box in localization.boxes]
 
-    Each has query, rank, score, aabb_min, aabb_max, center, count (of its Gaussians) and obb: center, rotation (rows of
+
+def box_to_json(box: Box) -> dict[str, Any]:
+    """A box as JSON values, in world coordinates with the origin added back.
+
+    It has query, rank, score, aabb_min, aabb_max, center, count (of its Gaussians) and obb: center, rotation (rows of
     the matrix whose columns are the box's axes) and size.
     """
-    return [
-        {
-            "query": box.query,
-            "rank": box.rank,
-            "score": box.score,
-            "aabb_min": box.aabb_min.tolist(),
-            "aabb_max": box.aabb_max.tolist(),
-            "center": box.center.tolist(),
-            "count": len(box.rows),
-            "obb": {
-                "center": box.obb_center.tolist(),
-                "rotation": box.obb_rotation.tolist(),
-                "size": box.obb_size.tolist(),
-            },
-        }
-        for box in localization.boxes
-    ]
+    return {
+        "query": box.query,
+        "rank": box.rank,
+        "score": box.score,
+        "aabb_min": box.aabb_min.tolist(),
+        "aabb_max": box.aabb_max.tolist(),
+        "center": box.center.tolist(),
+        "count": len(box.rows),
+        "obb": {
+            "center": box.obb_center.tolist(),
+            "rotation": box.obb_rotation.tolist(),
+            "size": box.obb_size.tolist(),
+        },
+    }

@@ -22,7 +22,7 @@ PAPER, INK, FAINT = (255, 255, 255), (32, 33, 36), (120, 124, 130)
 
 
 @lru_cache(maxsize=8)
-def _font(size: int) -> ImageFont.FreeTypeFont:
+def label_font(size: int) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which matplotlib brings along: Latin, Greek, Cyrillic, mathematical signs."""
     from matplotlib import get_data_path
 
@@ -84,14 +84,14 @@ def color_bar(width: int, low: float, high: float, *, mark: float | None = None)
     draw = ImageDraw.Draw(image)
     ramp = _colors(np.linspace(low, high, width), low, high, "turbo")
     image.paste(Image.fromarray(np.broadcast_to(ramp, (16, width, 3)).copy()), (0, 0))
-    draw.text((2, 20), f"{low:.3g}", fill=INK, font=_font(14))
-    draw.text((width - 2, 20), f"{high:.3g}", fill=INK, font=_font(14), anchor="ra")
+    draw.text((2, 20), f"{low:.3g}", fill=INK, font=label_font(14))
+    draw.text((width - 2, 20), f"{high:.3g}", fill=INK, font=label_font(14), anchor="ra")
     if mark is not None and low < mark < high:
         x = round((mark - low) / (high - low) * (width - 1))
         draw.line([(x, 0), (x, 19)], fill=(0, 0, 0), width=3)
         draw.line([(x, 0), (x, 19)], fill=PAPER, width=1)
         if 50 < x < width - 50:
-            draw.text((x, 20), f"{mark:.3g}", fill=INK, font=_font(14), anchor="ma")
+            draw.text((x, 20), f"{mark:.3g}", fill=INK, font=label_font(14), anchor="ma")
     return np.asarray(image)
 
 
@@ -187,7 +187,7 @@ def _draw_labels(
     draw: ImageDraw.ImageDraw, size: tuple[int, int], labels: Sequence[tuple[np.ndarray, str, tuple[int, int, int]]]
 ) -> None:
     """Labels above their boxes, inside the picture, each moved down until it covers no earlier one."""
-    font = _font(18)
+    font = label_font(18)
     taken: list[tuple[float, float, float, float]] = []
     for at, text, color in labels:
         wide, high = draw.textlength(text, font) + 10, 26
@@ -303,7 +303,7 @@ def contact_sheet(
     for row, height in zip(rows, heights, strict=True):
         for column, i in enumerate(row):
             left = gap + column * (width + gap)
-            draw.text((left, top + 2), _fit(draw, titles[i], width), fill=INK, font=_font(17))
+            draw.text((left, top + 2), _fit(draw, titles[i], width), fill=INK, font=label_font(17))
             sheet.paste(images[i], (left, top + head))
         top += height
     return np.asarray(sheet)
@@ -312,8 +312,8 @@ def contact_sheet(
 def _fit(draw: ImageDraw.ImageDraw, text: str, width: int) -> str:
     """The text, cut with an ellipsis to what a line holds."""
     text = _printable(text, 200)
-    if draw.textlength(text, _font(17)) <= width:
+    if draw.textlength(text, label_font(17)) <= width:
         return text
-    while text and draw.textlength(text + "…", _font(17)) > width:
+    while text and draw.textlength(text + "…", label_font(17)) > width:
         text = text[:-1]
     return text.rstrip() + "…"

@@ -6,24 +6,39 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gsencoder.errors import InputError
+from gsencoder.infer.marks import draw_marks
 from gsencoder.infer.pictures import contact_sheet, draw_boxes
+from gsencoder.infer.view_targets import Target
 from gsencoder.infer.views import Chosen, ViewSet
-from gsencoder.render import BlendConfig
-from gsencoder.render.rgb import RenderedImages
+from gsencoder.render import BlendConfig, blend
+from gsencoder.render.rgb import render_image
 from gsencoder.types import Box, Scene
 
 Picture = UInt8[np.ndarray, "_h _w 3"]
 
 
-def view_pictures(scene: Scene, views: ViewSet, *, config: BlendConfig = BlendConfig()) -> list[Picture]:
+def view_pictures(
+    scene: Scene, views: ViewSet, marked: Sequence[Target] = (), *, config: BlendConfig = BlendConfig()
+) -> list[Picture]:
     """The splat through each chosen camera.
+
+    Args:
+        scene: with Gaussians.
+        views: as chosen.
+        marked: targets that carry numbers.
+        config: accuracy of the renders.
 
     Raises:
         InputError: a scene without Gaussians.
     """
     if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
-    return list(RenderedImages(scene.gaussians, views.cameras, config))
+    pictures = []
+    for view in range(len(views)):
+        b = blend(scene.gaussians, views.cameras, view, config=config)
+        picture = render_image(scene.gaussians, views.cameras, view, blended=b)
+        pictures.append(draw_marks(picture, b, marked))
+    return pictures
 
 
 def view_sheet(
