@@ -102,7 +102,7 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         summary.results.update(row)
     screen = console(config.quiet)
     if server is not None:
-        screen.print(row["answer"])
+        screen.print(printable(row["answer"]))
     screen.print(f"{out}: {len(row['views'])} pictures, {PROMPT}, {REQUEST}" + (f", {ANSWER}" if server else ""))
 
 
@@ -205,6 +205,11 @@ def _ask_many(
         write_bytes(folder / ANSWERS, b"".join(_line(done[asked.id]) for asked in many))
         summary.results.update(questions=len(many), answers=ANSWERS)
     console(config.quiet).print(f"{out}: {len(many)} questions, {ANSWERS}")
+
+
+def printable(text: str) -> str:
+    """Text without the control characters by which a terminal could be told to do other things than to show it."""
+    return "".join(letter if letter.isprintable() or letter == "\n" else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
 def _same(asked: Asked, rows: Mapping[str, Any], depends: Mapping[str, Any], kept: Path) -> bool:

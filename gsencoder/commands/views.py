@@ -14,7 +14,7 @@ from gsencoder.data.archive import write_archive
 from gsencoder.errors import InputError
 from gsencoder.fusion.store import load_features
 from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize
-from gsencoder.infer.tokens import Fit, feature_tokens, token_blends
+from gsencoder.infer.tokens import Fit, feature_tokens, token_blends, tower_grid
 from gsencoder.infer.view_pictures import told, view_pictures, view_sheet
 from gsencoder.infer.view_targets import targets_of
 from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
@@ -56,6 +56,8 @@ class ViewsCommandConfig(CommonConfig):
             raise InputError(f"boxes: expected 1 or more, got {self.boxes}")
         if len(self.grid) not in (0, 2):
             raise InputError(f"grid: expected lines and columns, such as [27,27], got {list(self.grid)}")
+        if self.grid:
+            tower_grid(1, 1, (self.grid[0], self.grid[1]))
 
 
 def run(config: ViewsCommandConfig, summary: Summary) -> None:

@@ -14,6 +14,9 @@ from gsencoder.render import BlendConfig, blend
 from gsencoder.render.rgb import render_image
 from gsencoder.types import Box, Scene
 
+LEAST_TOLD = 0.005
+"""Smaller shares of a picture are not told."""
+
 Picture = UInt8[np.ndarray, "_h _w 3"]
 
 
@@ -63,9 +66,6 @@ def view_sheet(
 
 def told(chosen: Chosen) -> str:
     """A view in a line."""
-    sights = ", ".join(
-        f"{sight.target} {sight.share:.0%} of the picture, {sight.visible:.0%} of it visible"
-        for sight in chosen.sights
-        if sight.share > 0
-    )
-    return f"{chosen.name}: {sights or 'shows none of it'}" if chosen.sights else chosen.name
+    shown = [sight for sight in chosen.sights if sight.share >= LEAST_TOLD]
+    sights = "; ".join(f"{sight.target} {sight.share:.0%} of it, {sight.visible:.0%} seen" for sight in shown)
+    return f"{chosen.name}: {sights or 'nothing of what was found'}" if chosen.sights else chosen.name

@@ -154,6 +154,8 @@ class VlmServer:
         except openai.APITimeoutError as error:
             raise self._refusal(f"was silent for {self._config.timeout:g} s (vlm.timeout)") from error
         except openai.APIConnectionError as error:
+            if text:
+                raise self._refusal(f"the answer broke off after {len(text)} characters: {_cause(error)}") from error
             raise self._refusal(
                 f"no server answers there ({_cause(error)}); start one, or correct vlm.base_url; "
                 "dry_run=true writes the prompt and the pictures without one"
@@ -227,9 +229,11 @@ def _tokens(usage: Any) -> dict[str, int]:
 
 def _cause(error: BaseException) -> str:
     """What went wrong at the bottom, in a line."""
-    body = getattr(error, "body", None)
-    if isinstance(body, dict) and body.get("message"):
-        return " ".join(str(body["message"]).split())[:LONGEST_TOLD]
+    told = getattr(error, "body", None)
+    for name in ("error", "message", "detail"):
+        told = told.get(name, told) if isinstance(told, dict) else told
+    if told:
+        return " ".join(str(told).split())[:LONGEST_TOLD]
     deepest = error
     while deepest.__cause__ is not None or deepest.__context__ is not None:
         deepest = deepest.__cause__ or deepest.__context__  # type: ignore[assignment]

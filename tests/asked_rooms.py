@@ -1,0 +1,34 @@
+"""A folder of features of the room, with words, that tests of views and questions stand on."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rooms import cube, room
+
+from gsencoder.data.text_table import make_text_table, save_text_table
+from gsencoder.fusion.store import WORDS_FILE, save_features
+from gsencoder.types import FeatureSpace, GaussianFeatures
+
+NAMES = ("cube", "crate", "wall", "pen holder")
+ORIGIN = np.array([100.0, -50.0, 7.0])
+
+
+def save_room(folder: Path) -> None:
+    """A cube and two crates in a room, each with features of its name."""
+    scene, rows = room(cube((-0.8, -0.6, 0.8)), cube((-0.9, 0.9, 0.8)))
+    assert scene.gaussians is not None
+    n, one = len(scene.gaussians), len(rows)
+    kinds = np.full(n, 2)
+    kinds[:one], kinds[-2 * one :] = 0, 1
+    embeddings = np.eye(4, 16, dtype=np.float32)
+    space = FeatureSpace(name="names", channels=16, teacher="labels", text_encoder="table")
+    features = GaussianFeatures(
+        features=embeddings[kinds],
+        weights=np.ones(n, np.float32),
+        mean=embeddings[kinds].mean(axis=0),
+        space=space,
+    )
+    folder.mkdir()
+    save_features(folder, replace(scene, origin=ORIGIN), features, {})
+    save_text_table(folder / WORDS_FILE, make_text_table(NAMES, embeddings, "table"))

@@ -1,0 +1,275 @@
+"""What is asked of a VLM's server, and what becomes of each of its faults."""
+
+import base64
+import io
+import json
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from chat_server import Handler, answer, completion, events, serving, silent
+from PIL import Image
+
+from gsencoder.config import HIDDEN, settings
+from gsencoder.errors import InputError
+from gsencoder.infer.prompts import data_url, messages, number_in, prompt_text
+from gsencoder.infer.vlm import KEY_VARIABLE, MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
+
+pytest.importorskip("openai")
+
+KEY = "sk-1234567890"
+BOTH = pytest.mark.parametrize("stream", [True, False])
+
+
+@pytest.fixture(autouse=True)
+def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (URL_VARIABLE, KEY_VARIABLE, MODEL_VARIABLE):
+        monkeypatch.delenv(name, raising=False)
+
+
+def config(url: str, **changed: Any) -> VlmConfig:
+    return VlmConfig(**{"base_url": url, "model": "tiny", "key": KEY, "retries": 0, "timeout": 5.0} | changed)
+
+
+def ask(url: str, **changed: Any) -> Any:
+    chosen = config(url, **changed)
+    picture = np.zeros((8, 8, 3), np.uint8)
+    return VlmServer(chosen).ask(request_body(messages("what?", [picture], side=64, kind="png"), chosen))
+
+
+@BOTH
+def test_an_answer_comes_back_whole_with_what_the_server_says_of_it(stream: bool) -> None:
+    with serving(answer("a red mug")) as server:
+        reply = ask(server.url, stream=stream, max_tokens=17, temperature=0.5)
+    assert reply.text == "a red mug"
+    assert (reply.model, reply.finish) == ("tiny", "stop")
+    assert reply.tokens == ({} if stream else {"prompt": 7, "answer": 2})
+    headers, body = server.requests[0]
+    assert headers["authorization"] == f"Bearer {KEY}"
+    assert (body["model"], body["max_tokens"], body["temperature"], body["stream"]) == ("tiny", 17, 0.5, stream)
+    kinds = [part["type"] for part in body["messages"][0]["content"]]
+    assert kinds == ["image_url", "text"]
+
+
+def refused() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"http://127.0.0.1:{free.getsockname()[1]}/v1"
+
+
+@BOTH
+def test_where_no_server_is_the_error_says_so(stream: bool) -> None:
+    url = refused()
+    with pytest.raises(InputError, match=f"the server at {url}: no server answers there .*refused.*dry_run=true"):
+        ask(url, stream=stream)
+
+
+def status(code: int, message: str) -> Callable[[Handler, Any], None]:
+    return lambda handler, _: handler.reply(code, {"error": {"message": message}})
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("behave", "told"),
+    [
+        (status(500, "out of memory"), "failed 1 times .500: out of memory"),
+        (status(503, "loading"), "failed 1 times .503: loading"),
+        (status(429, "slow down"), "failed 1 times .429: slow down"),
+        (status(400, "too many images"), "refuses the request .400: too many images"),
+        (status(401, "bad key"), "refuses the key .401: bad key.; give vlm.key= or OPENAI_API_KEY"),
+        (status(404, "no model x"), "has no model of that name, .*no model x.; it has tiny"),
+        (lambda handler, _: handler.reply(422, {"detail": "pinned"}), "refuses the request .422: pinned"),
+        (lambda handler, _: handler.raw(200, b"", "application/json"), "broke off, or is no chat|cut off"),
+        (silent(3.0), "was silent for 0.5 s .vlm.timeout"),
+    ],
+)
+def test_each_fault_of_a_server_is_an_error_in_its_own_words(
+    behave: Callable[[Handler, Any], None], told: str, stream: bool
+) -> None:
+    with serving(behave) as server, pytest.raises(InputError, match=told):
+        ask(server.url, stream=stream, timeout=0.5)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"choices": []},
+        {"hello": 1},
+        [],
+        completion(None),
+        completion("  "),
+        completion("half", finish=None),
+    ],
+)
+def test_answers_that_are_none_are_errors(value: Any) -> None:
+    with serving(lambda handler, _: handler.reply(200, value)) as server, pytest.raises(InputError, match="answer"):
+        ask(server.url, stream=False)
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (events("a red ", "mu", finish=None, done=False), "cut off after 8 characters"),
+        (events("a red ", "mu", finish=None), "cut off after 8 characters"),
+        (events(finish="stop"), "the answer is empty .it ended with 'stop'"),
+        (b"data: {not json}\n\n", "broke off, or is no chat completion"),
+        (b"<html>hello</html>", "cut off after 0 characters"),
+        (events("fine") + b'data: {"error": {"message": "GPU fell over"}}\n\n', "GPU fell over|^$"),
+    ],
+)
+def test_streams_that_end_early_are_errors(data: bytes, told: str) -> None:
+    def behave(handler: Handler, _: Any) -> None:
+        handler.raw(200, data, "text/event-stream")
+
+    with serving(behave) as server:
+        if data.endswith(b'over"}}\n\n'):
+            # What follows the end is not waited for.
+            assert ask(server.url).text == "fine"
+        else:
+            with pytest.raises(InputError, match=told):
+                ask(server.url)
+
+
+def test_a_connection_that_breaks_within_a_stream_is_an_error() -> None:
+    def behave(handler: Handler, _: Any) -> None:
+        data = events("a red ", finish=None, done=False)
+        handler.raw(200, data, "text/event-stream", length=len(data) + 1000)
+        handler.connection.shutdown(socket.SHUT_RDWR)
+
+    with serving(behave) as server, pytest.raises(InputError, match="broke off after 6 characters"):
+        ask(server.url)
+
+
+def test_an_answer_that_drips_for_ever_ends() -> None:
+    def behave(handler: Handler, _: Any) -> None:
+        import time
+
+        handler.send_response(200)
+        handler.send_header("Content-Type", "text/event-stream")
+        handler.end_headers()
+        for _ in range(100):
+            handler.wfile.write(events("a", finish=None, done=False))
+            handler.wfile.flush()
+            time.sleep(0.05)
+
+    with serving(behave) as server, pytest.raises(InputError, match="took more than 0.3 s .vlm.longest"):
+        ask(server.url, longest=0.3)
+
+
+def test_a_server_that_fails_at_first_is_asked_again() -> None:
+    calls: list[int] = []
+
+    def behave(handler: Handler, body: Any) -> None:
+        calls.append(1)
+        (status(500, "busy") if len(calls) < 3 else answer("fine"))(handler, body)
+
+    with serving(behave) as server:
+        assert ask(server.url, retries=2).text == "fine"
+    assert len(calls) == 3
+
+
+def test_keys_are_never_told() -> None:
+    echo = serving(lambda handler, _: handler.reply(400, {"error": {"message": f"bad key {KEY}"}}))
+    with echo as server, pytest.raises(InputError) as caught:
+        ask(server.url)
+    assert KEY not in str(caught.value)
+    assert "bad key (key)" in str(caught.value)
+    chosen = config("http://x/v1")
+    assert settings(chosen)["key"] == HIDDEN
+    assert settings(VlmConfig())["key"] == ""
+    assert KEY not in json.dumps(settings(chosen))
+    assert KEY not in json.dumps(request_body([], chosen))
+
+
+def test_what_is_left_out_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=f"say where the model's server is .*{URL_VARIABLE}"):
+        VlmServer(VlmConfig())
+    with pytest.raises(InputError, match=MODEL_VARIABLE):
+        request_body([], VlmConfig())
+    assert request_body([], VlmConfig(), named=False)["model"] == ""
+    with serving(answer("fine")) as server:
+        monkeypatch.setenv(URL_VARIABLE, server.url)
+        monkeypatch.setenv(KEY_VARIABLE, KEY)
+        monkeypatch.setenv(MODEL_VARIABLE, "theirs")
+        chosen = VlmConfig()
+        VlmServer(chosen).ask(request_body([], chosen))
+        headers, body = server.requests[0]
+    assert headers["authorization"] == f"Bearer {KEY}"
+    assert body["model"] == "theirs"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"timeout": 0.0},
+        {"longest": float("nan")},
+        {"retries": -1},
+        {"max_tokens": 0},
+        {"temperature": 3.0},
+        {"image_side": 1},
+        {"base_url": "localhost:8000"},
+    ],
+)
+def test_settings_of_a_server_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="expected"):
+        VlmConfig(**wrong)
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "png"])
+@pytest.mark.parametrize(("shape", "size"), [((30, 40), (40, 30)), ((300, 400), (64, 48)), ((400, 1), (1, 64))])
+def test_pictures_are_sent_no_larger_than_asked(kind: Any, shape: tuple[int, int], size: tuple[int, int]) -> None:
+    picture = np.full((*shape, 3), 200, np.uint8)
+    head, _, data = data_url(picture, side=64, kind=kind).partition(",")
+    assert head == f"data:image/{kind};base64"
+    image = Image.open(io.BytesIO(base64.b64decode(data)))
+    assert image.size == size
+    assert np.abs(np.asarray(image).astype(int) - 200).max() < 3
+
+
+def test_prompts_hold_the_question_and_the_names_of_the_marks() -> None:
+    text = prompt_text("answer", " What's red? ", ["mug", "mug 2"], marked=True)
+    assert "Question: What's red?" in text
+    assert "1 = mug; 2 = mug." in text
+    assert "1 = " not in prompt_text("answer", "x", ["mug"], marked=False)
+    assert "Meant is: the left one" in prompt_text("ground", "the left one", ["mug"], marked=True)
+    caption = prompt_text("caption", "", ["mug 3"], marked=True)
+    assert "The thing is the mug." in caption
+    assert "mark 1" in caption
+
+
+@pytest.mark.parametrize(
+    ("task", "question", "names", "marked", "told"),
+    [
+        ("answer", " ", ["a"], True, "question= is missing"),
+        ("ground", "", ["a"], True, "question= is missing"),
+        ("ground", "x", [], True, "nothing was found"),
+        ("caption", "", [], True, "nothing was found"),
+        ("ground", "x", ["a"], False, "needs the marks"),
+    ],
+)
+def test_prompts_without_what_they_need_are_refused(
+    task: Any, question: str, names: list[str], marked: bool, told: str
+) -> None:
+    with pytest.raises(InputError, match=told):
+        prompt_text(task, question, names, marked=marked)
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        ("2", 2),
+        ("Mark 3.", 3),
+        ("It is number 1, not 2", 1),
+        ("0", 0),
+        ("4", None),
+        ("none", None),
+        ("1.5", None),
+        ("", None),
+        ("the 12th", None),
+        ("02", 2),
+    ],
+)
+def test_the_first_number_of_an_answer_is_the_mark_that_it_means(text: str, number: int | None) -> None:
+    assert number_in(text, 3) == number
