@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gsencoder.commands import COMMANDS
 from gsencoder.compose import choices_of, compose, conf_folder
-from gsencoder.config import CommonConfig, check_required, settings, typed
+from gsencoder.config import HIDDEN, CommonConfig, check_required, settings, typed
 from gsencoder.errors import InputError
 from gsencoder.options import describe, join_list, options_of, split_list
 
@@ -375,3 +375,14 @@ def test_every_setting_is_documented_and_in_the_yaml(name: str) -> None:
 
 def test_every_command_has_its_yaml() -> None:
     assert {f"{name}.yaml" for name in COMMANDS} <= {path.name for path in conf_folder().glob("*.yaml")}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _WithSecret:
+    key: str = field(default="", metadata={"help": "a key", "secret": True})
+    name: str = field(default="", metadata={"help": "a name"})
+
+
+def test_secrets_are_never_shown() -> None:
+    assert settings(_WithSecret(key="s", name="n")) == {"key": HIDDEN, "name": "n"}
+    assert settings(_WithSecret()) == {"key": "", "name": ""}

@@ -1,5 +1,7 @@
 """Where a camera can stand: what is known to be empty, how far away surfaces are, what a ray meets."""
 
+from copy import copy
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Integer
@@ -23,6 +25,7 @@ CELL = 2.0
 """Edge of the cells in which rays are followed, in spacings of the splat: surfaces have no holes in such cells."""
 SPACING_SAMPLE = 5000
 """Gaussians that tell the spacing."""
+CELLS = 1 << 20
 MOST_STEPS = 512
 """Rays are followed for so many cells."""
 
@@ -35,19 +38,11 @@ class FreeSpace:
         watchers: the cameras that tell what is empty; None where there are none.
     """
 
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        watchers: Cameras | None,
-        config: BlendConfig = BlendConfig(),
-        *,
-        apart: Integer[np.ndarray, " n"] | None = None,
-    ) -> None:
+    def __init__(self, gaussians: Gaussians, watchers: Cameras | None, config: BlendConfig = BlendConfig()) -> None:
         """Args:
         gaussians: the splat.
         watchers: cameras that saw it, in the same world; a depth map is rendered for each.
         config: accuracy of the depth maps.
-        apart: Gaussians that rays go through.
         """
         from scipy.spatial import cKDTree
 
@@ -59,11 +54,12 @@ class FreeSpace:
         distances = self._tree.query(asked, k=[min(NEIGHBOUR + 1, len(means))])[0]
         # Of a single Gaussian, and of many in one place, the size is known.
         self.cell = CELL * (float(np.median(distances)) or float(np.median(self._solid.scales)))
-        self._low = np.floor(means.min(axis=0) / self.cell)
-        self._sizes = (np.floor(means.max(axis=0) / self.cell) - self._low + 1).astype(np.int64)
-        met = np.ones(len(gaussians), bool)
-        met[apart if apart is not None else []] = False
-        self._occupied = np.unique(self._codes(means[met[solid] if solid.any() else met]))
+        # Floaters may be any distance away: what is beyond the middle's million cells on a side is met by no ray.
+        self._low = np.floor(np.median(means, axis=0) / self.cell) - CELLS // 2
+        self._met, self._cell_of = np.arange(len(gaussians)), self._codes(means)
+        if solid.any():
+            self._met = self._met[solid]
+        self._occupied = np.unique(self._cell_of[self._cell_of >= 0])
         self.watchers = watchers.resized(WATCHED_SIDE) if watchers is not None and len(watchers) else None
         self._depths: list[Float32[np.ndarray, "h w"]] = []
         if self.watchers is not None:
@@ -77,11 +73,18 @@ class FreeSpace:
             self._depths = parallel(depth_map, range(len(small)))
 
     def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-        """The cell of each point as a number; −1 outside the splat."""
+        """The cell of each point as a number; −1 far outside the splat."""
         cells = np.floor(points / self.cell) - self._low
-        inside = ((cells >= 0) & (cells < self._sizes)).all(axis=1)
+        inside = ((cells >= 0) & (cells < CELLS)).all(axis=1)
         x, y, z = np.where(inside[:, None], cells, 0).astype(np.int64).T
-        return np.where(inside, (x * self._sizes[1] + y) * self._sizes[2] + z, -1)
+        return np.where(inside, (x * CELLS + y) * CELLS + z, -1)
+
+    def without(self, rows: Integer[np.ndarray, " n"]) -> "FreeSpace":
+        """The same space, in which rays go through these Gaussians."""
+        other = copy(self)
+        codes = self._cell_of[~np.isin(self._met, rows)]
+        other._occupied = np.unique(codes[codes >= 0])
+        return other
 
     def occupied(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether a Gaussian lies in the cell of each point."""

@@ -6,6 +6,7 @@ around them. Each of these sums has diminishing returns, so that the greedy choi
 (Nemhauser, Wolsey and Fisher 1978).
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,7 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning
 from gsencoder.evenly import evenly
 from gsencoder.infer.free_space import FreeSpace
 from gsencoder.infer.view_candidates import frames_on, shell_cameras, up_of
@@ -22,7 +23,7 @@ from gsencoder.infer.view_targets import Target, check_targets
 from gsencoder.types import Cameras, Scene
 
 WATCHERS = 12
-"""So many of the scene's cameras tell what is empty around a target."""
+"""So many of the scene's cameras tell what is empty around the targets."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,18 +198,20 @@ def _candidates(
         names += [scene.views.names[view] for view in taken]
         frames += taken.tolist()
     if config.source != "frames":
+        free = FreeSpace(scene.gaussians, None if own is None else _watchers(own, targets), JUDGED)
         for target, room in zip(targets, _shared_out(config.candidates - len(frames), len(targets)), strict=True):
-            watchers = None if own is None else own.select(frames_on(own, [target], WATCHERS))
             around = shell_cameras(
                 scene.gaussians,
                 target,
                 room,
-                FreeSpace(scene.gaussians, watchers, JUDGED, apart=target.rows),
+                free.without(target.rows),
                 up=up_of(scene),
                 width=config.width,
                 height=config.height,
                 fov_degrees=config.fov,
             )
+            if not len(around):
+                warnings.warn(f"views: there is no room for a camera around {target.name}", SceneWarning, stacklevel=3)
             parts.append(around)
             names += [f"around {target.name} {number:02d}" for number in range(len(around))]
             frames += [None] * len(around)
@@ -219,6 +222,12 @@ def _candidates(
             "take source=frames"
         )
     return cameras, names, frames
+
+
+def _watchers(cameras: Cameras, targets: Sequence[Target]) -> Cameras:
+    """The cameras that see most of each target, as many for each."""
+    each = max(1, WATCHERS // len(targets))
+    return cameras.select(np.unique(np.concatenate([frames_on(cameras, [target], each) for target in targets])))
 
 
 def _shared_out(total: int, parts: int) -> list[int]:

@@ -12,7 +12,7 @@ from gsencoder.types import Gaussians
 def free() -> FreeSpace:
     scene, rows = room()
     assert scene.gaussians is not None
-    return FreeSpace(scene.gaussians, corner_cameras(), apart=rows)
+    return FreeSpace(scene.gaussians, corner_cameras()).without(rows)
 
 
 def test_points_in_the_room_are_seen_empty_and_those_beyond_its_walls_are_not(
@@ -112,3 +112,11 @@ def test_faint_gaussians_are_no_obstacle_unless_there_are_no_others() -> None:
     ray = (np.zeros((1, 3)) + 0.01, np.array([[1.0, 0, 0]]), np.array([3.0]))
     assert FreeSpace(both, None).first_hit(*ray)[0] > 0.8
     assert FreeSpace(faint, None).first_hit(*ray)[0] < 0.6
+
+
+def test_floaters_far_away_change_nothing_in_the_room() -> None:
+    wall = sheet((1.0, 0, 0), (1, 2), (1.0, 1.0))
+    far = FreeSpace(splat(np.concatenate([wall, [[1e9, -1e9, 1e9]]])), None)
+    near = FreeSpace(splat(wall), None)
+    ray = (np.zeros((1, 3)) + 0.01, np.array([[1.0, 0, 0]]), np.array([3.0]))
+    assert far.first_hit(*ray) == pytest.approx(near.first_hit(*ray), abs=2 * near.cell)

@@ -8,7 +8,7 @@ import pytest
 from rooms import CUBE, HALF, HEIGHT, UP, corner_cameras, cube, room, sheet, splat
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.free_space import FreeSpace
 from gsencoder.infer.view_candidates import frames_on, shell_cameras, up_of
 from gsencoder.infer.view_judge import look
@@ -61,7 +61,7 @@ def test_targets_are_the_best_boxes_of_each_word_with_the_ball_that_holds_them()
 def test_cameras_on_shells_look_at_the_target_from_free_places_that_were_seen() -> None:
     scene, target = cube_in_room()
     assert scene.gaussians is not None
-    free = FreeSpace(scene.gaussians, corner_cameras(), apart=target.rows)
+    free = FreeSpace(scene.gaussians, corner_cameras()).without(target.rows)
     around = shell_cameras(scene.gaussians, target, 16, free, up=UP)
     assert len(around) == 16
     centers = around.centers
@@ -264,8 +264,14 @@ def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
     # A cube in a closed box that leaves no place to see it from.
     closed, rows = room(cube((0.3, 0.2, 0.8), half=CUBE + 0.3, step=0.06))
     assert closed.gaussians is not None
-    with pytest.raises(InputError, match="no room for a camera around cube"):
+    with (
+        pytest.warns(SceneWarning, match="no room for a camera around cube"),
+        pytest.raises(InputError, match="no room for a camera around cube"),
+    ):
         choose_views(closed, [target_of("cube", closed.gaussians, rows)], SHELLS)
+    with pytest.warns(SceneWarning, match="no room for a camera around cube"):
+        frames = choose_views(closed, [target_of("cube", closed.gaussians, rows)], replace(SHELLS, source="both"))
+    assert all(each.frame is not None for each in frames.chosen)
 
 
 @pytest.mark.parametrize(
