@@ -353,6 +353,13 @@ def test_every_member_of_every_choice_composes(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+def test_no_option_has_the_name_of_a_folder_of_settings(name: str) -> None:
+    # Hydra would take its value for a file of that folder.
+    folders = {path.name for path in conf_folder().iterdir() if path.is_dir()}
+    assert not folders & {option.key for option in options_of(COMMANDS[name].load()[0])}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_setting_is_documented_and_in_the_yaml(name: str) -> None:
     from omegaconf import OmegaConf
 

@@ -60,7 +60,7 @@ class AskCommandConfig(CommonConfig):
     resume: bool = field(default=True, metadata={"help": "keep the answers of a run that was cut off"})
     ask: AskConfig = field(default_factory=AskConfig)
     vlm: VlmConfig = field(default_factory=VlmConfig)
-    views: ViewsConfig = field(default_factory=ViewsConfig)
+    choose: ViewsConfig = field(default_factory=ViewsConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
     def __post_init__(self) -> None:
@@ -91,7 +91,7 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         space=config.space or None,
         config=config.ask,
         localization=config.localize,
-        views=config.views,
+        views=config.choose,
     )
     out = config.out or Path("outputs") / scene.name / ("answers" if many else "answer")
     if many:
@@ -223,7 +223,7 @@ def _depends_on(config: AskCommandConfig) -> dict[str, Any]:
     patience = ("key", "timeout", "longest", "retries", "stream")
     vlm = {name: value for name, value in given["vlm"].items() if name not in patience}
     named = {name: os.environ.get(name, "") for name in (URL_VARIABLE, MODEL_VARIABLE)}
-    others = {name: given[name] for name in ("words", "space", "dry_run", "ask", "views", "localize")}
+    others = {name: given[name] for name in ("words", "space", "dry_run", "ask", "choose", "localize")}
     return {"features": str(Path(config.paths[0]).resolve()), "vlm": vlm, **named, **others}
 
 

@@ -46,7 +46,7 @@ class ViewsCommandConfig(CommonConfig):
     fit: Fit = field(
         default="stretch", metadata={"help": "how the tower's preprocessing brings a picture to its own shape"}
     )
-    views: ViewsConfig = field(default_factory=ViewsConfig)
+    choose: ViewsConfig = field(default_factory=ViewsConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
         scene = load_features(folder)
     boxes: list[Box] = []
     targets: Sequence[Any] = ()
-    if config.query or config.queries or config.views.method == "greedy":
+    if config.query or config.queries or config.choose.method == "greedy":
         with summary.step("localize"):
             words = asked_words(config.query, config.queries)
             found = localize(scene, words, words_of(folder, config.words), config.localize, space=config.space or None)
@@ -78,7 +78,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
         boxes = [box for box in found.boxes if box.rank < config.boxes]
         summary.results.update(boxes=[box_to_json(box) for box in boxes])
     with summary.step("choose"):
-        views = choose_views(scene, targets, config.views)
+        views = choose_views(scene, targets, config.choose)
     out = config.out or Path("outputs") / scene.name / "views"
     rows = views_to_json(scene, views)
     summary.results.update(views=rows, judged=views.judged)

@@ -30,7 +30,7 @@ from gsencoder.infer.questions import read_answers, read_questions
 
 pytest.importorskip("openai")
 
-QUICK = ("views.source=frames", "views.candidates=4", "views.count=2", "quiet=true")
+QUICK = ("choose.source=frames", "choose.candidates=4", "choose.count=2", "quiet=true")
 KEY = "sk-never-to-be-written"
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from gsencoder import cli
 from gsencoder.data.archive import open_archive
 
-QUICK = ("views.candidates=8", "views.count=4", "views.width=120", "views.height=90", "quiet=true")
+QUICK = ("choose.candidates=8", "choose.count=4", "choose.width=120", "choose.height=90", "quiet=true")
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_several_words_and_boxes_are_looked_at_together(features: Path, tmp_path
 
 def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
     out = tmp_path / "views"
-    assert cli.main(["views", str(features), "views.method=uniform", f"out={out}", *QUICK]) == 0
+    assert cli.main(["views", str(features), "choose.method=uniform", f"out={out}", *QUICK]) == 0
     rows = json.loads((out / "views.json").read_text())
     assert [row["frame"] for row in rows] == [0, 4, 7, 11]
     assert all(row["sights"] == [] for row in rows)
@@ -74,8 +74,8 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
         (("query=cube", "grid=[0,3]"), "grid: expected lines and columns of 1 or more"),
         (("query=zebra",), "not among the 4 words"),
         (("query=pen holder",), "none of pen holder was found"),
-        (("query=cube", "views.count=99"), "count: expected 1 to candidates"),
-        (("query=cube", "views.source=nowhere"), "views.source: expected one of both, frames, shells"),
+        (("query=cube", "choose.count=99"), "count: expected 1 to candidates"),
+        (("query=cube", "choose.source=nowhere"), "choose.source: expected one of both, frames, shells"),
         (("query=cube", "space=other"), "other"),
     ],
 )
