@@ -9,10 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from gsencoder.commands.asked import words_of
-from gsencoder.commands.views import views_to_json
+from gsencoder.commands.views import views_to_json, write_pictures
 from gsencoder.config import CommonConfig, settings
 from gsencoder.errors import InputError, SceneWarning, about
 from gsencoder.fusion.store import WORDS_FILE, load_features
@@ -20,7 +18,6 @@ from gsencoder.infer.ask import AskConfig, Asker, Prompt, Question, meant, promp
 from gsencoder.infer.localize import LocalizeConfig, box_to_json
 from gsencoder.infer.prompts import Task
 from gsencoder.infer.questions import Asked, read_answers, read_questions
-from gsencoder.infer.view_pictures import view_sheet
 from gsencoder.infer.views import ViewsConfig
 from gsencoder.infer.vlm import MODEL_VARIABLE, URL_VARIABLE, Reply, VlmConfig, VlmServer, request_body
 from gsencoder.outputs import output_folder, write_bytes, write_json
@@ -29,7 +26,7 @@ from gsencoder.summary import Summary, plain
 from gsencoder.types import Scene
 from gsencoder.work_folder import WorkFolder
 
-ANSWER, ANSWERS, PROMPT, REQUEST, SHEET = "answer.json", "answers.jsonl", "prompt.txt", "request.json", "sheet.png"
+ANSWER, ANSWERS, PROMPT, REQUEST = "answer.json", "answers.jsonl", "prompt.txt", "request.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,10 +118,7 @@ def _ask_one(
     views = views_to_json(scene, prompt.views)
     body = request_body(prompt_messages(prompt, config.vlm), config.vlm, named=server is not None)
     with summary.step("write"):
-        for picture, row in zip(prompt.pictures, views, strict=True):
-            Image.fromarray(picture).save(folder / row["picture"])
-        sheet = view_sheet(scene, prompt.views, prompt.pictures, prompt.boxes)
-        Image.fromarray(sheet).save(folder / SHEET)
+        write_pictures(folder, scene, prompt.views, views, prompt.pictures, prompt.boxes)
         write_bytes(folder / PROMPT, prompt.text.encode() + b"\n")
         write_json(folder / REQUEST, body)
     row = {

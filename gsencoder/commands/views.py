@@ -1,6 +1,6 @@
 """`gsencoder views FEATURES query=…`: the views that show best what was found, rendered, and why they were chosen."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,10 @@ from gsencoder.data.archive import write_archive
 from gsencoder.errors import InputError
 from gsencoder.fusion.store import load_features
 from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize
+from gsencoder.infer.pictures import Picture
 from gsencoder.infer.tokens import Fit, feature_tokens, token_blends, tower_grid
 from gsencoder.infer.view_pictures import told, view_pictures, view_sheet
-from gsencoder.infer.view_targets import targets_of
+from gsencoder.infer.view_targets import Target, best_boxes, targets_of
 from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
 from gsencoder.outputs import output_folder, write_json
 from gsencoder.progress import console
@@ -65,8 +66,8 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     folder = Path(config.paths[0])
     with summary.step("load"):
         scene = load_features(folder)
-    boxes: list[Box] = []
-    targets: Sequence[Any] = ()
+    boxes: tuple[Box, ...] = ()
+    targets: tuple[Target, ...] = ()
     if config.query or config.queries or config.choose.method == "greedy":
         with summary.step("localize"):
             words = asked_words(config.query, config.queries)
@@ -75,7 +76,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
             targets = targets_of(scene.gaussians, found, config.boxes)
         if not targets:
             raise InputError(f"views: none of {', '.join(words)} was found in scene {scene.name}")
-        boxes = [box for box in found.boxes if box.rank < config.boxes]
+        boxes = best_boxes(found, config.boxes)
         summary.results.update(boxes=[box_to_json(box) for box in boxes])
     with summary.step("choose"):
         views = choose_views(scene, targets, config.choose)
@@ -85,9 +86,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
         with summary.step("render"):
             pictures = view_pictures(scene, views)
-            for picture, row in zip(pictures, rows, strict=True):
-                Image.fromarray(picture).save(target / row["picture"])
-            Image.fromarray(view_sheet(scene, views, pictures, boxes)).save(target / SHEET)
+            write_pictures(target, scene, views, rows, pictures, boxes)
         write_json(target / VIEWS, rows)
         if config.grid:
             with summary.step("tokens"):
@@ -122,6 +121,20 @@ def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def write_pictures(
+    folder: Path,
+    scene: Scene,
+    views: ViewSet,
+    rows: Sequence[Mapping[str, Any]],
+    pictures: Sequence[Picture],
+    boxes: Sequence[Box],
+) -> None:
+    """Each picture under the name that its row gives it, and the sheet of all."""
+    for picture, row in zip(pictures, rows, strict=True):
+        Image.fromarray(picture).save(folder / row["picture"])
+    Image.fromarray(view_sheet(scene, views, pictures, boxes)).save(folder / SHEET)
 
 
 def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:

@@ -3,7 +3,7 @@
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, get_args
 
 import numpy as np
@@ -12,9 +12,10 @@ from jaxtyping import Float64
 from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.localize import LocalizeConfig, localize
-from gsencoder.infer.prompts import Picture, Task, messages, number_in, prompt_text
+from gsencoder.infer.pictures import Picture
+from gsencoder.infer.prompts import Task, messages, number_in, prompt_text
 from gsencoder.infer.view_pictures import view_pictures
-from gsencoder.infer.view_targets import Target, target_of, targets_of
+from gsencoder.infer.view_targets import Target, best_boxes, target_of, targets_of
 from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
 from gsencoder.infer.vlm import VlmConfig
 from gsencoder.types import Box, Scene
@@ -161,7 +162,7 @@ class Asker:
             if question.task != "answer":
                 raise InputError(f"task={question.task}: {told}; give query= or aabb=")
             warnings.warn(f"{told}: evenly spread frames are shown", SceneWarning, stacklevel=4)
-            config = ViewsConfig(method="uniform", count=config.count, candidates=config.candidates)
+            config = replace(config, method="uniform")
         return targets, boxes, choose_views(self._scene, targets, config)
 
     def _targets(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...]]:
@@ -184,7 +185,7 @@ class Asker:
         targets = targets_of(gaussians, found, boxes)
         if question.task == "caption":
             targets = targets[:1]
-        return targets, tuple(box for box in found.boxes if box.rank < boxes)[: len(targets)]
+        return targets, best_boxes(found, boxes)[: len(targets)]
 
 
 def _corners(

@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 
 from gsencoder.infer.boxes_ply import word_color
-from gsencoder.infer.pictures import label_font
+from gsencoder.infer.pictures import ink_on, label_font
 from gsencoder.infer.view_targets import Target
 from gsencoder.render import Blend
 
@@ -42,7 +42,5 @@ def draw_marks(
         y, x = shown[np.linalg.norm(shown - shown.mean(axis=0), axis=1).argmin()] + 0.5
         color = word_color(number)
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=color, outline=(255, 255, 255), width=2)
-        bright = float(np.dot(color, [0.299, 0.587, 0.114])) > 140
-        ink = (0, 0, 0) if bright else (255, 255, 255)
-        draw.text((x, y), str(number + 1), fill=ink, font=label_font(round(1.3 * radius)), anchor="mm")
+        draw.text((x, y), str(number + 1), fill=ink_on(color), font=label_font(round(1.3 * radius)), anchor="mm")
     return np.asarray(image)

@@ -15,6 +15,8 @@ from gsencoder.errors import InputError
 from gsencoder.infer.boxes_ply import EDGES, box_corners, word_color
 from gsencoder.types import Box
 
+Picture = UInt8[np.ndarray, "_h _w 3"]
+
 LEGIBLE_WIDTH = 640
 """Smaller pictures are enlarged by a whole factor before anything is written on them."""
 NEAR = 0.05
@@ -178,6 +180,12 @@ def _clip_to_picture(segment: Float64[np.ndarray, "2 2"], width: int, height: in
     return np.stack([segment[0] + first * step, segment[0] + last * step]) if first <= last else None
 
 
+def ink_on(color: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Black or white, whichever is legible on a colour."""
+    bright = float(np.dot(color, [0.299, 0.587, 0.114])) > 140
+    return (0, 0, 0) if bright else (255, 255, 255)
+
+
 def _printable(text: str, longest: int = 28) -> str:
     clean = "".join(character if character.isprintable() else " " for character in text)
     return clean if len(clean) <= longest else clean[: longest - 1] + "…"
@@ -200,8 +208,7 @@ def _draw_labels(
         y = min(y, size[1] - high)
         taken.append((x, y, x + wide, y + high))
         draw.rectangle([x, y, x + wide, y + high], fill=color)
-        bright = float(np.dot(color, [0.299, 0.587, 0.114])) > 140
-        draw.text((x + 5, y + high / 2), text, fill=(0, 0, 0) if bright else (255, 255, 255), font=font, anchor="lm")
+        draw.text((x + 5, y + high / 2), text, fill=ink_on(color), font=font, anchor="lm")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -278,7 +285,7 @@ def depth_picture(
 
 
 def contact_sheet(
-    pictures: Sequence[UInt8[np.ndarray, "_h _w 3"]],
+    pictures: Sequence[Picture],
     titles: Sequence[str],
     *,
     columns: int,

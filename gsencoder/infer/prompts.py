@@ -7,15 +7,13 @@ import re
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import numpy as np
-from jaxtyping import UInt8
 from PIL import Image
 
 from gsencoder.errors import InputError
+from gsencoder.infer.pictures import Picture
 
 Task = Literal["answer", "ground", "caption"]
 ImageFormat = Literal["jpeg", "png"]
-Picture = UInt8[np.ndarray, "_h _w 3"]
 
 SETTING = (
     "The pictures show one place from several viewpoints. They are rendered from a 3D reconstruction: blurred or black "

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float32, Float64
 
 from gsencoder.evenly import evenly
+from gsencoder.infer.free_space import in_picture
 from gsencoder.infer.view_targets import Target
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.threads import parallel
@@ -134,21 +135,12 @@ class _Watched:
         return _Seen(
             visible=min(float(shown[solid].sum()) / whole, 1.0) if whole > FAINT else 0.0,
             share=float(shown.mean()),
-            inside=_inside(self._alone.means, small, view),
+            inside=float(in_picture(small, view, self._alone.means.astype(np.float64))[3].mean()),
             alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
             blur=float(mine @ pixels / mine.sum()) if mine.sum() > 0 else 0.0,
             target=target,
             context=context,
         )
-
-
-def _inside(means: Float32[np.ndarray, "n 3"], cameras: Cameras, view: int) -> float:
-    pose, K = cameras.cam_from_world[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
-    at = means @ pose[:3, :3].T + pose[:3, 3]
-    z = np.maximum(at[:, 2], 1e-9)
-    x, y = (at[:, axis] / z * K[axis, axis] + K[axis, 2] for axis in (0, 1))
-    held = (at[:, 2] > 0) & (x >= 0) & (x < cameras.widths[view]) & (y >= 0) & (y < cameras.heights[view])
-    return float(held.mean())
 
 
 def _around(alone: torch.Tensor, alpha: torch.Tensor) -> float:

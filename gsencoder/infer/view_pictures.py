@@ -2,12 +2,9 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from jaxtyping import UInt8
-
 from gsencoder.errors import InputError
 from gsencoder.infer.marks import draw_marks
-from gsencoder.infer.pictures import contact_sheet, draw_boxes
+from gsencoder.infer.pictures import Picture, contact_sheet, draw_boxes
 from gsencoder.infer.view_targets import Target
 from gsencoder.infer.views import Chosen, ViewSet
 from gsencoder.render import BlendConfig, blend
@@ -16,8 +13,6 @@ from gsencoder.types import Box, Scene
 
 LEAST_TOLD = 0.005
 """Smaller shares of a picture are not told."""
-
-Picture = UInt8[np.ndarray, "_h _w 3"]
 
 
 def view_pictures(

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Integer
 
 from gsencoder.errors import InputError
-from gsencoder.types import Gaussians, Localization
+from gsencoder.types import Box, Gaussians, Localization
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,6 +43,11 @@ def target_of(name: str, gaussians: Gaussians, rows: Integer[np.ndarray, " n"]) 
     return Target(name=name, rows=np.asarray(rows), center=center, radius=radius)
 
 
+def best_boxes(found: Localization, per_word: int) -> tuple[Box, ...]:
+    """So many boxes of each word, best first within it."""
+    return tuple(box for box in found.boxes if box.rank < per_word)
+
+
 def targets_of(gaussians: Gaussians, found: Localization, per_word: int = 1) -> tuple[Target, ...]:
     """The best boxes of each word as targets; words without a box give none.
 
@@ -51,7 +56,7 @@ def targets_of(gaussians: Gaussians, found: Localization, per_word: int = 1) -> 
         found: what was asked and found.
         per_word: boxes taken of each word, best first.
     """
-    boxes = [box for box in found.boxes if box.rank < per_word]
+    boxes = best_boxes(found, per_word)
     names = [box.query if box.rank == 0 else f"{box.query} {box.rank + 1}" for box in boxes]
     return tuple(target_of(name, gaussians, box.rows) for name, box in zip(names, boxes, strict=True))
 
