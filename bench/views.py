@@ -1,15 +1,17 @@
 """Views chosen of the objects of labelled scenes: held against instance masks, and against full-size renders.
 
-    python bench/views.py SCENE … [--candidates 16,32,64] [--weights 0.3,0.1,0.2]
+    python bench/views.py SCENE … [--candidates 16,32,64] [--weights 0.3,0.1,0.2] [--furniture]
 
 Objects are found by their names in features of the labels teacher. Among the scene's own frames, 8 chosen ones are
 held against the 8 with most pixels of the object by its instance mask, and against 8 that are evenly spread. Views
-around objects are rendered at full size with all accuracy. Seconds are of choosing, from the loaded scene on.
+around objects are rendered at full size with all accuracy. Seconds are of choosing, from the loaded scene on. With
+--furniture the objects are named pieces of 20 cm or more in every direction that are part of the room.
 """
 
 import argparse
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,14 +37,27 @@ COUNT = 8
 WORDS = "clip_vitb32_names.npz"
 
 
-def objects_of(path: str) -> tuple[Scene, list[tuple[Target, SceneObject]]]:
-    """A scene with Gaussians, and what was found of its small objects beside the labels."""
+def furniture(objects: Sequence[SceneObject]) -> list[SceneObject]:
+    """Named pieces of the room itself that many frames show well and that are no surfaces."""
+    return [
+        one
+        for one in objects
+        if not one.placed
+        and one.name
+        and one.views >= COUNT
+        and one.max_pixels >= 1500
+        and (one.aabb_max - one.aabb_min).min() >= 0.2
+    ]
+
+
+def objects_of(path: str, large: bool) -> tuple[Scene, list[tuple[Target, SceneObject]]]:
+    """A scene with Gaussians, and what was found of its objects beside the labels."""
     words = load_text_table(find_file(WORDS, "words"))
     scene = with_gaussians(load_scene(path))
     assert scene.gaussians is not None
     features = fuse(scene, build_teacher(LabelsConfig(words=WORDS), scene, words)).features
     scene = replace(scene, features={features.space.name: features})
-    asked = asked_objects(scene.objects)
+    asked = furniture(scene.objects) if large else asked_objects(scene.objects)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)
         found = localize(scene, list(dict.fromkeys(one.name for one in asked if one.name)), words)
@@ -81,6 +96,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--candidates", default="16,32,64")
     parser.add_argument("--weights", default="")
+    parser.add_argument("--furniture", action="store_true")
     chosen = parser.parse_args()
     settings = {}
     if chosen.weights:
@@ -93,7 +109,7 @@ def main() -> None:
     covered: dict[int, list[float]] = {count: [] for count in counts}
     failed: dict[int, list[str]] = {count: [] for count in counts}
     for path in chosen.scenes:
-        scene, pairs = objects_of(path)
+        scene, pairs = objects_of(path, chosen.furniture)
         for target, one in pairs:
             pixels = pixels_of(scene, one)
             best = np.sort(pixels)[::-1][:COUNT].sum()
