@@ -168,9 +168,12 @@ class Cameras:
             heights=self.heights[rows],
         )
 
-    def resized(self, longest: int) -> "Cameras":
-        """The same fields of view in pictures whose longer side has so many pixels."""
+    def resized(self, longest: int, *, enlarge: bool = True) -> "Cameras":
+        """The same fields of view in pictures whose longer side has so many pixels; without `enlarge`, at most so
+        many."""
         factors = longest / np.maximum(self.widths, self.heights)
+        if not enlarge:
+            factors = np.minimum(factors, 1)
         sizes = np.maximum(1, np.stack((self.widths, self.heights), axis=1) * factors[:, None] + 0.5).astype(np.int32)
         scale = np.ones((len(self), 3))
         scale[:, 0], scale[:, 1] = sizes[:, 0] / self.widths, sizes[:, 1] / self.heights

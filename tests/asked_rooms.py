@@ -14,10 +14,13 @@ NAMES = ("cube", "crate", "wall", "pen holder")
 ORIGIN = np.array([100.0, -50.0, 7.0])
 
 
-def save_room(folder: Path) -> None:
-    """A cube and two crates in a room, each with features of its name."""
+def save_room(folder: Path, names: tuple[str, ...] = ()) -> None:
+    """A cube and two crates in a room, each with features of its name; `names` are its frames'."""
     scene, rows = room(cube((-0.8, -0.6, 0.8)), cube((-0.9, 0.9, 0.8)))
     assert scene.gaussians is not None
+    if names:
+        assert scene.views is not None
+        scene = replace(scene, views=replace(scene.views, names=names))
     n, one = len(scene.gaussians), len(rows)
     kinds = np.full(n, 2)
     kinds[:one], kinds[-2 * one :] = 0, 1

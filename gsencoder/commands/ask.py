@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.commands.asked import words_of
-from gsencoder.commands.views import views_to_json, write_pictures
+from gsencoder.commands.views import shown_scene, views_to_json, write_pictures
 from gsencoder.config import CommonConfig, settings
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.errors import InputError, SceneWarning, about
-from gsencoder.fusion.store import WORDS_FILE, load_features
+from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.infer.ask import AskConfig, Asker, Prompt, Question, meant, prompt_messages
 from gsencoder.infer.localize import LocalizeConfig, box_to_json
 from gsencoder.infer.prompts import Task
@@ -53,11 +54,15 @@ class AskCommandConfig(CommonConfig):
     )
     words: str = field(default="", metadata={"help": "text table; empty = the one beside the features"})
     space: str = field(default="", metadata={"help": "which features, where the folder holds several"})
+    photos: str = field(
+        default="", metadata={"help": "the scene that was fused: frames are shown as its photographs, not as renders"}
+    )
     dry_run: bool = field(default=False, metadata={"help": "write the prompt and the pictures, and ask nobody"})
     resume: bool = field(default=True, metadata={"help": "keep the answers of a run that was cut off"})
     ask: AskConfig = field(default_factory=AskConfig)
     vlm: VlmConfig = field(default_factory=VlmConfig)
     choose: ViewsConfig = field(default_factory=ViewsConfig)
+    data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
     def __post_init__(self) -> None:
@@ -80,7 +85,7 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
     request_body([], config.vlm, named=server is not None)
     many = read_questions(Path(config.questions)) if config.questions else ()
     with summary.step("load"):
-        scene = load_features(folder)
+        scene = shown_scene(folder, config.photos, config.data)
         table = words_of(folder, config.words) if config.words or (folder / WORDS_FILE).is_file() else None
     asker = Asker(
         scene,
@@ -217,7 +222,9 @@ def _depends_on(config: AskCommandConfig) -> dict[str, Any]:
     patience = ("key", "timeout", "longest", "retries", "stream")
     vlm = {name: value for name, value in given["vlm"].items() if name not in patience}
     named = {name: os.environ.get(name, "") for name in (URL_VARIABLE, MODEL_VARIABLE)}
-    others = {name: given[name] for name in ("words", "space", "dry_run", "ask", "choose", "localize")}
+    others = {
+        name: given[name] for name in ("words", "space", "photos", "dry_run", "ask", "choose", "data", "localize")
+    }
     return {"features": str(Path(config.paths[0]).resolve()), "vlm": vlm, **named, **others}
 
 

@@ -11,12 +11,14 @@ from PIL import Image
 from gsencoder.commands.asked import asked_words, words_of
 from gsencoder.config import CommonConfig
 from gsencoder.data.archive import write_archive
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.errors import InputError
 from gsencoder.fusion.store import load_features
 from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize
+from gsencoder.infer.photographs import with_photographs
 from gsencoder.infer.pictures import Picture
 from gsencoder.infer.tokens import Fit, feature_tokens, token_blends, tower_grid
-from gsencoder.infer.view_pictures import told, view_pictures, view_sheet
+from gsencoder.infer.view_pictures import picture_kinds, told, view_pictures, view_sheet
 from gsencoder.infer.view_targets import Target, best_boxes, targets_of
 from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
 from gsencoder.outputs import output_folder, write_json
@@ -39,6 +41,9 @@ class ViewsCommandConfig(CommonConfig):
     queries: str = field(default="", metadata={"help": "a text file with one query a line"})
     words: str = field(default="", metadata={"help": "text table; empty = the one beside the features"})
     space: str = field(default="", metadata={"help": "which features, where the folder holds several"})
+    photos: str = field(
+        default="", metadata={"help": "the scene that was fused: frames are shown as its photographs, not as renders"}
+    )
     boxes: int = field(default=1, metadata={"help": "boxes of each word that are looked at, best first"})
     grid: tuple[int, ...] = field(
         default=(),
@@ -48,6 +53,7 @@ class ViewsCommandConfig(CommonConfig):
         default="stretch", metadata={"help": "how the tower's preprocessing brings a picture to its own shape"}
     )
     choose: ViewsConfig = field(default_factory=ViewsConfig)
+    data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
     def __post_init__(self) -> None:
@@ -65,7 +71,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     """Finds the words, chooses views of them, renders these, and writes what was chosen and why."""
     folder = Path(config.paths[0])
     with summary.step("load"):
-        scene = load_features(folder)
+        scene = shown_scene(folder, config.photos, config.data)
     boxes: tuple[Box, ...] = ()
     targets: tuple[Target, ...] = ()
     if config.query or config.queries or config.choose.method == "greedy":
@@ -97,17 +103,24 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     screen.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))
 
 
+def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
+    """The scene of a folder of features, with photographs where a scene that has them is given."""
+    scene = load_features(folder)
+    return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
+
+
 def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
     """What was chosen and why, best first: names and pictures, sights, gains, and cameras in world coordinates with the
     origin added back (cam_from_world and K as OpenCV has them)."""
     rows = []
-    for number, each in enumerate(views.chosen):
+    for number, (each, kind) in enumerate(zip(views.chosen, picture_kinds(scene, views), strict=True)):
         pose = views.cameras.cam_from_world[number].astype(np.float64)
         pose[:3, 3] -= pose[:3, :3] @ scene.origin
         rows.append(
             {
                 "name": each.name,
                 "picture": f"view_{number:02d}.png",
+                "kind": kind,
                 "frame": each.frame,
                 "gain": each.gain,
                 "covered": each.covered,

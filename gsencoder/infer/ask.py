@@ -14,7 +14,7 @@ from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.pictures import Picture
 from gsencoder.infer.prompts import Task, messages, number_in, prompt_text
-from gsencoder.infer.view_pictures import view_pictures
+from gsencoder.infer.view_pictures import picture_kinds, view_pictures
 from gsencoder.infer.view_targets import Target, best_boxes, target_of, targets_of
 from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
 from gsencoder.infer.vlm import VlmConfig
@@ -117,7 +117,7 @@ class Asker:
         views: ViewsConfig = ViewsConfig(),
     ) -> None:
         """Args:
-        scene: Gaussians, features and cameras.
+        scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
         table: words that lead into the features; None where there are none.
         space: which features are asked.
         config: see there.
@@ -150,7 +150,10 @@ class Asker:
         if marked is None:
             marked = question.task == "ground" or len(targets) > 1
         marked = marked and bool(targets)
-        text = prompt_text(question.task, question.text, [target.name for target in targets], marked=marked)
+        kinds = picture_kinds(self._scene, views)
+        text = prompt_text(
+            question.task, question.text, [target.name for target in targets], marked=marked, kinds=kinds
+        )
         pictures = view_pictures(self._scene, views, targets if marked else ())
         return Prompt(text=text, pictures=pictures, views=views, targets=targets, boxes=boxes, words=words)
 

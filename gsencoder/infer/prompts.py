@@ -4,21 +4,26 @@ captioning), as messages of OpenAI's chat protocol."""
 import base64
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Literal
 
 from PIL import Image
 
 from gsencoder.errors import InputError
+from gsencoder.infer.photographs import resized_picture
 from gsencoder.infer.pictures import Picture
+from gsencoder.infer.view_pictures import PictureKind
 
 Task = Literal["answer", "ground", "caption"]
 ImageFormat = Literal["jpeg", "png"]
 
-SETTING = (
-    "The pictures show one place from several viewpoints. They are rendered from a 3D reconstruction: blurred or black "
-    "parts were not seen well and mean nothing."
-)
+SETTING = "The pictures show one place from several viewpoints."
+SHOWN_BY = {
+    "photograph": "They are photographs.",
+    "render": "They are rendered from a 3D reconstruction: blurred or black parts were not seen well and mean nothing.",
+    "both": "Some are photographs. The others are rendered from a 3D reconstruction: blurred or black parts of these "
+    "were not seen well and mean nothing.",
+}
 ROLES = {
     "answer": "Answer the question about the place in a few words. Say 'unknown' if the pictures do not tell.",
     "ground": "Numbered marks stand on things. Answer with the number of the one that is meant, and nothing else; "
@@ -29,7 +34,9 @@ ROLES = {
 MARKED = "It carries the mark {number} in the pictures."
 
 
-def prompt_text(task: Task, question: str, names: Sequence[str], *, marked: bool) -> str:
+def prompt_text(
+    task: Task, question: str, names: Sequence[str], *, marked: bool, kinds: Collection[PictureKind]
+) -> str:
     """What is asked, in words.
 
     Args:
@@ -37,6 +44,7 @@ def prompt_text(task: Task, question: str, names: Sequence[str], *, marked: bool
         question: the user's; a caption needs none.
         names: of what was looked for and found, in the order of their marks.
         marked: whether the pictures carry marks.
+        kinds: of the pictures.
 
     Raises:
         InputError: no question for a task that needs one; nothing to ground or caption.
@@ -48,7 +56,8 @@ def prompt_text(task: Task, question: str, names: Sequence[str], *, marked: bool
         raise InputError(f"task={task}: nothing was found that could be meant; give query= or aabb=")
     if task == "ground" and not marked:
         raise InputError("task=ground: needs the marks; leave out marks=false")
-    lines = [SETTING, ROLES[task]]
+    shown_by = "both" if len(set(kinds)) > 1 else next(iter(kinds))
+    lines = [f"{SETTING} {SHOWN_BY[shown_by]}", ROLES[task]]
     if task == "caption":
         lines.append(f"The thing is the {_bare(names[0])}.")
         if marked:
@@ -83,13 +92,12 @@ def messages(text: str, pictures: Sequence[Picture], *, side: int, kind: ImageFo
 
 def data_url(picture: Picture, *, side: int, kind: ImageFormat) -> str:
     """A picture as the protocol carries it."""
-    image = Image.fromarray(picture)
-    if max(image.size) > side:
-        factor = side / max(image.size)
-        size = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
-        image = image.resize(size, Image.Resampling.LANCZOS)
+    height, width = picture.shape[:2]
+    if max(width, height) > side:
+        factor = side / max(width, height)
+        picture = resized_picture(picture, (max(1, round(width * factor)), max(1, round(height * factor))))
     held = io.BytesIO()
-    image.save(held, format=kind, **({"quality": 92} if kind == "jpeg" else {}))
+    Image.fromarray(picture).save(held, format=kind, **({"quality": 92} if kind == "jpeg" else {}))
     return f"data:image/{kind};base64,{base64.b64encode(held.getvalue()).decode()}"
 
 

@@ -1,9 +1,11 @@
 """Chosen views as pictures: plain ones to show to a VLM, and a sheet for people that says why."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 from gsencoder.errors import InputError
 from gsencoder.infer.marks import draw_marks
+from gsencoder.infer.photographs import resized_picture
 from gsencoder.infer.pictures import Picture, contact_sheet, draw_boxes
 from gsencoder.infer.view_targets import Target
 from gsencoder.infer.views import Chosen, ViewSet
@@ -11,17 +13,24 @@ from gsencoder.render import BlendConfig, blend
 from gsencoder.render.rgb import render_image
 from gsencoder.types import Box, Scene
 
+PictureKind = Literal["photograph", "render"]
 LEAST_TOLD = 0.005
 """Smaller shares of a picture are not told."""
+
+
+def picture_kinds(scene: Scene, views: ViewSet) -> tuple[PictureKind, ...]:
+    """What shows each chosen view: the photograph, where it is a frame of a scene that has photographs, or a render."""
+    taken = scene.views is not None and scene.views.images is not None
+    return tuple("photograph" if taken and each.frame is not None else "render" for each in views.chosen)
 
 
 def view_pictures(
     scene: Scene, views: ViewSet, marked: Sequence[Target] = (), *, config: BlendConfig = BlendConfig()
 ) -> list[Picture]:
-    """The splat through each chosen camera.
+    """What each chosen camera shows, by `picture_kinds`.
 
     Args:
-        scene: with Gaussians.
+        scene: with Gaussians, and with photographs where frames are to be shown as these.
         views: as chosen.
         marked: targets that carry numbers.
         config: accuracy of the renders.
@@ -32,11 +41,24 @@ def view_pictures(
     if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
     pictures = []
-    for view in range(len(views)):
+    for view, kind in enumerate(picture_kinds(scene, views)):
+        photograph = _photograph(scene, views, view) if kind == "photograph" else None
+        if photograph is not None and not marked:
+            pictures.append(photograph)
+            continue
         b = blend(scene.gaussians, views.cameras, view, config=config)
-        picture = render_image(scene.gaussians, views.cameras, view, blended=b)
+        picture = render_image(scene.gaussians, views.cameras, view, blended=b) if photograph is None else photograph
         pictures.append(draw_marks(picture, b, marked))
     return pictures
+
+
+def _photograph(scene: Scene, views: ViewSet, view: int) -> Picture:
+    frame = views.chosen[view].frame
+    assert scene.views is not None
+    assert scene.views.images is not None
+    assert frame is not None
+    size = int(views.cameras.widths[view]), int(views.cameras.heights[view])
+    return resized_picture(scene.views.images[frame], size)
 
 
 def view_sheet(

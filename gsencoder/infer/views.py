@@ -41,6 +41,9 @@ class ViewsConfig:
     width: int = field(default=640, metadata={"help": "of the pictures around targets, pixels"})
     height: int = field(default=480, metadata={"help": "of the pictures around targets, pixels"})
     fov: float = field(default=60.0, metadata={"help": "their horizontal field of view, degrees"})
+    frame_side: int = field(
+        default=1024, metadata={"help": "frames are shown no larger than this, longer side, pixels"}
+    )
     judged_side: int = field(default=160, metadata={"help": "longer side of the renders that candidates are judged by"})
     least_share: float = field(default=0.05, metadata={"help": "a target should fill this much of the picture …"})
     most_share: float = field(default=0.6, metadata={"help": "… and no more than this"})
@@ -55,6 +58,8 @@ class ViewsConfig:
             raise InputError(
                 f"width, height, fov: expected pixels and 1 to 170 degrees, got {self.width}, {self.height}, {self.fov}"
             )
+        if self.frame_side < 1:
+            raise InputError(f"frame_side: expected 1 pixel or more, got {self.frame_side}")
         if not 8 <= self.judged_side <= 4096:
             raise InputError(f"judged_side: expected 8 to 4096 pixels, got {self.judged_side}")
         if not 0 < self.least_share < self.most_share < 1:
@@ -178,7 +183,11 @@ def _uniform(scene: Scene, config: ViewsConfig) -> tuple[Cameras, list[str], lis
     if scene.views is None:
         raise InputError(f"views: scene {scene.name} has no cameras to take evenly; take method=greedy source=shells")
     chosen = evenly(len(scene.views), config.count)
-    return scene.views.cameras.select(chosen), [scene.views.names[view] for view in chosen], chosen.tolist()
+    return (
+        _shown(scene.views.cameras.select(chosen), config),
+        [scene.views.names[view] for view in chosen],
+        chosen.tolist(),
+    )
 
 
 def _candidates(
@@ -194,7 +203,7 @@ def _candidates(
     if config.source != "shells" and own is not None and scene.views is not None:
         room = config.candidates if config.source == "frames" else config.candidates // 2
         taken = frames_on(own, targets, room)
-        parts.append(own.select(taken))
+        parts.append(_shown(own.select(taken), config))
         names += [scene.views.names[view] for view in taken]
         frames += taken.tolist()
     if config.source != "frames":
@@ -222,6 +231,11 @@ def _candidates(
             "take source=frames"
         )
     return cameras, names, frames
+
+
+def _shown(frames: Cameras, config: ViewsConfig) -> Cameras:
+    """Frames at the size of their pictures: photographs have far more pixels than anyone looks at."""
+    return frames.resized(config.frame_side, enlarge=False)
 
 
 def _watchers(cameras: Cameras, targets: Sequence[Target]) -> Cameras:

@@ -15,9 +15,12 @@ from PIL import Image
 from gsencoder.config import HIDDEN, settings
 from gsencoder.errors import InputError
 from gsencoder.infer.prompts import data_url, messages, number_in, prompt_text
+from gsencoder.infer.view_pictures import PictureKind
 from gsencoder.infer.vlm import KEY_VARIABLE, MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
 
 pytest.importorskip("openai")
+
+RENDERS: tuple[PictureKind, ...] = ("render",)
 
 KEY = "sk-1234567890"
 BOTH = pytest.mark.parametrize("stream", [True, False])
@@ -229,14 +232,25 @@ def test_pictures_are_sent_no_larger_than_asked(kind: Any, shape: tuple[int, int
 
 
 def test_prompts_hold_the_question_and_the_names_of_the_marks() -> None:
-    text = prompt_text("answer", " What's red? ", ["mug", "mug 2"], marked=True)
+    text = prompt_text("answer", " What's red? ", ["mug", "mug 2"], marked=True, kinds=RENDERS)
     assert "Question: What's red?" in text
     assert "1 = mug; 2 = mug." in text
-    assert "1 = " not in prompt_text("answer", "x", ["mug"], marked=False)
-    assert "Meant is: the left one" in prompt_text("ground", "the left one", ["mug"], marked=True)
-    caption = prompt_text("caption", "", ["mug 3"], marked=True)
+    assert "1 = " not in prompt_text("answer", "x", ["mug"], marked=False, kinds=RENDERS)
+    assert "Meant is: the left one" in prompt_text("ground", "the left one", ["mug"], marked=True, kinds=RENDERS)
+    caption = prompt_text("caption", "", ["mug 3"], marked=True, kinds=RENDERS)
     assert "The thing is the mug." in caption
     assert "mark 1" in caption
+
+
+def test_prompts_say_what_the_pictures_are() -> None:
+    told = {
+        kinds: prompt_text("answer", "x", [], marked=False, kinds=kinds).splitlines()[0]
+        for kinds in (("render",) * 2, ("photograph",) * 2, ("render", "photograph"))
+    }
+    assert "They are rendered" in told[("render",) * 2]
+    assert "They are photographs" in told[("photograph",) * 2]
+    assert "Some are photographs" in told[("render", "photograph")]
+    assert "black" not in told[("photograph",) * 2]
 
 
 @pytest.mark.parametrize(
@@ -253,7 +267,7 @@ def test_prompts_without_what_they_need_are_refused(
     task: Any, question: str, names: list[str], marked: bool, told: str
 ) -> None:
     with pytest.raises(InputError, match=told):
-        prompt_text(task, question, names, marked=marked)
+        prompt_text(task, question, names, marked=marked, kinds=RENDERS)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,91 @@
+"""Photographs for the frames of a scene whose features were kept without them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from gsencoder.errors import InputError
+from gsencoder.types import Cameras, Scene
+
+ANGLE, PLACE = 0.01, 1e-3
+"""How far two readings of one camera may be from each other: radians or parts of a focal length, and parts of the
+distance between cameras."""
+TOLD = 3
+
+
+class Photographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
+    """Pictures of a scene in the order and the sizes of other cameras, read on access."""
+
+    def __init__(self, images: Sequence[np.ndarray], rows: Sequence[int], cameras: Cameras) -> None:
+        self._images, self._rows, self._cameras = images, rows, cameras
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return Photographs(self._images, self._rows[index], self._cameras.select(index))
+        size = int(self._cameras.widths[index]), int(self._cameras.heights[index])
+        return resized_picture(self._images[self._rows[index]], size)
+
+
+def resized_picture(picture: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture of another width and height."""
+    image = Image.fromarray(picture)
+    return picture if image.size == size else np.asarray(image.resize(size, Image.Resampling.LANCZOS))
+
+
+def with_photographs(scene: Scene, taken: Scene) -> Scene:
+    """A scene whose frames have the photographs that another reading of it has.
+
+    Args:
+        scene: with cameras; their names say which photograph is whose.
+        taken: the same scene with its photographs, and perhaps more of them, in whatever size.
+
+    Raises:
+        InputError: cameras or photographs are missing, or the cameras of a name are not the same.
+    """
+    if scene.views is None or not len(scene.views):
+        raise InputError(f"photos: the features of {scene.name} have no cameras that photographs could belong to")
+    if taken.views is None or taken.views.images is None:
+        raise InputError(f"photos: scene {taken.name} has no photographs")
+    place = {name: row for row, name in enumerate(taken.views.names)}
+    missing = [name for name in scene.views.names if name not in place]
+    if missing:
+        raise InputError(
+            f"photos: scene {taken.name} has no photograph of {len(missing)} of {len(scene.views)} frames: "
+            f"{_first(missing)}"
+        )
+    rows = [place[name] for name in scene.views.names]
+    own, other = scene.views.cameras, taken.views.cameras.select(rows)
+    apart = [scene.views.names[view] for view in np.flatnonzero(_differ(own, other, taken.origin - scene.origin))]
+    if apart:
+        raise InputError(
+            f"photos: the cameras of scene {taken.name} are not those of the features: {len(apart)} of "
+            f"{len(scene.views)} differ, {_first(apart)}; give the scene that the features were made from"
+        )
+    return replace(scene, views=replace(scene.views, images=Photographs(taken.views.images, rows, own)))
+
+
+def _differ(own: Cameras, other: Cameras, offset: np.ndarray) -> np.ndarray:
+    """Which cameras of two lists are not the same, whatever the sizes of their pictures."""
+    sizes = [np.stack((each.widths, each.heights), axis=1) for each in (own, other)]
+    fields = [
+        each.Ks[:, :2].astype(np.float64) / size[:, :, None] for each, size in zip((own, other), sizes, strict=True)
+    ]
+    turned = np.abs(own.cam_from_world[:, :3, :3] - other.cam_from_world[:, :3, :3]).max(axis=(1, 2))
+    centers = own.centers
+    away = np.linalg.norm(other.centers + offset - centers, axis=1)
+    # Single precision keeps positions to a ten-millionth of their distance from the origin.
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    room = PLACE * spread + 1e-5 * np.abs(centers).max()
+    bent = np.abs(fields[0] - fields[1]).max(axis=(1, 2))
+    return np.asarray((turned > ANGLE) | (away > room) | (bent > ANGLE))
+
+
+def _first(names: Sequence[str]) -> str:
+    return ", ".join(names[:TOLD]) + (" …" if len(names) > TOLD else "")
