@@ -28,8 +28,9 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.free_space import FreeSpace
 from gsencoder.infer.localize import localize
 from gsencoder.infer.view_judge import look
+from gsencoder.infer.view_set import ViewsConfig, ViewSet
 from gsencoder.infer.view_targets import Target, targets_of
-from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
+from gsencoder.infer.views import choose_views
 from gsencoder.render import BlendConfig
 from gsencoder.types import Scene, SceneObject
 
@@ -81,7 +82,7 @@ def measured(scene: Scene, target: Target, chosen: ViewSet) -> dict[str, np.ndar
     assert scene.gaussians is not None
     assert scene.views is not None
     (seen,) = look(scene.gaussians, chosen.cameras, [target], side=640, config=BlendConfig())
-    free = FreeSpace(scene.gaussians, scene.views.cameras)
+    free = FreeSpace(scene.gaussians).seen_by(scene.views.cameras)
     centers = chosen.cameras.centers
     return {
         "visible": seen.visible >= 0.9,

@@ -19,7 +19,7 @@ from gsencoder.infer.ask import AskConfig, Asker, Prompt, Question, meant, promp
 from gsencoder.infer.localize import LocalizeConfig, box_to_json
 from gsencoder.infer.prompts import Task
 from gsencoder.infer.questions import Asked, read_answers, read_questions
-from gsencoder.infer.views import ViewsConfig
+from gsencoder.infer.view_set import ViewsConfig
 from gsencoder.infer.vlm import MODEL_VARIABLE, URL_VARIABLE, Reply, VlmConfig, VlmServer, request_body
 from gsencoder.outputs import output_folder, write_bytes, write_json
 from gsencoder.progress import Progress, console

@@ -19,8 +19,9 @@ from gsencoder.infer.photographs import with_photographs
 from gsencoder.infer.pictures import Picture
 from gsencoder.infer.tokens import Fit, feature_tokens, token_blends, tower_grid
 from gsencoder.infer.view_pictures import picture_kinds, told, view_pictures, view_sheet
+from gsencoder.infer.view_set import ViewsConfig, ViewSet
 from gsencoder.infer.view_targets import Target, best_boxes, targets_of
-from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
+from gsencoder.infer.views import choose_views
 from gsencoder.outputs import output_folder, write_json
 from gsencoder.progress import console
 from gsencoder.summary import Summary

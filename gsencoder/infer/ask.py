@@ -15,8 +15,9 @@ from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.pictures import Picture
 from gsencoder.infer.prompts import Task, messages, number_in, prompt_text
 from gsencoder.infer.view_pictures import picture_kinds, view_pictures
+from gsencoder.infer.view_set import ViewsConfig, ViewSet
 from gsencoder.infer.view_targets import Target, best_boxes, target_of, targets_of
-from gsencoder.infer.views import ViewsConfig, ViewSet, choose_views
+from gsencoder.infer.views import choose_views
 from gsencoder.infer.vlm import VlmConfig
 from gsencoder.types import Box, Scene
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Integer
 from gsencoder.data.spacing import NEIGHBOUR
 from gsencoder.evenly import evenly
 from gsencoder.geometry import covariances, transform
+from gsencoder.infer.patches import SIGMAS, patches
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.threads import parallel
 from gsencoder.types import Cameras, Gaussians
@@ -18,9 +19,7 @@ OPAQUE = 0.3
 WATCHED_SIDE = 96
 """Longer side of the depth maps that tell what is empty, pixels."""
 NEAREST = 8
-"""So many Gaussians are asked how far away their surface is."""
-SIGMAS = 2.0
-"""A surface ends so many standard deviations from a Gaussian's centre."""
+"""So many patches are asked how far away their surface is."""
 CELL = 2.0
 """Edge of the cells in which rays are followed, in spacings of the splat: surfaces have no holes in such cells."""
 SPACING_SAMPLE = 5000
@@ -38,39 +37,49 @@ class FreeSpace:
         watchers: the cameras that tell what is empty; None where there are none.
     """
 
-    def __init__(self, gaussians: Gaussians, watchers: Cameras | None, config: BlendConfig = BlendConfig()) -> None:
+    def __init__(self, gaussians: Gaussians) -> None:
         """Args:
         gaussians: the splat.
-        watchers: cameras that saw it, in the same world; a depth map is rendered for each.
-        config: accuracy of the depth maps.
         """
         from scipy.spatial import cKDTree
 
-        solid = gaussians.opacities >= OPAQUE
-        self._solid = gaussians.select(solid) if solid.any() else gaussians
-        means = self._solid.means.astype(np.float64)
-        self._tree = cKDTree(means)
+        solid = np.flatnonzero(gaussians.opacities >= OPAQUE)
+        if not len(solid):
+            solid = np.arange(len(gaussians))
+        self._gaussians, self._quats = gaussians, gaussians.quats[solid]
+        means = gaussians.means[solid].astype(np.float64)
         asked = means[evenly(len(means), SPACING_SAMPLE)]
-        distances = self._tree.query(asked, k=[min(NEIGHBOUR + 1, len(means))])[0]
+        distances = cKDTree(means).query(asked, k=[min(NEIGHBOUR + 1, len(means))])[0]
         # Of a single Gaussian, and of many in one place, the size is known.
-        self.cell = CELL * (float(np.median(distances)) or float(np.median(self._solid.scales)))
+        self.cell = CELL * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))
+        self._patches = patches(gaussians.select(solid), self.cell)
+        self._tree = cKDTree(self._patches.centers)
         # Floaters may be any distance away: what is beyond the middle's million cells on a side is met by no ray.
         self._low = np.floor(np.median(means, axis=0) / self.cell) - CELLS // 2
-        self._met, self._cell_of = np.arange(len(gaussians)), self._codes(means)
-        if solid.any():
-            self._met = self._met[solid]
+        self._met, self._cell_of = solid[self._patches.rows], self._codes(self._patches.centers)
         self._occupied = np.unique(self._cell_of[self._cell_of >= 0])
-        self.watchers = watchers.resized(WATCHED_SIDE) if watchers is not None and len(watchers) else None
+        self.watchers: Cameras | None = None
         self._depths: list[Float32[np.ndarray, "h w"]] = []
-        if self.watchers is not None:
-            small = self.watchers
 
-            def depth_map(view: int) -> Float32[np.ndarray, "h w"]:
-                b = blend(gaussians, small, view, config=config)
-                # Rays that end nowhere have looked through nothing that is known.
-                return torch.where(b.alpha >= 0.5, b.depth, 0.0).reshape(b.shape).float().numpy()
+    def seen_by(self, cameras: Cameras, config: BlendConfig = BlendConfig()) -> "FreeSpace":
+        """The same space, of which cameras tell what they looked through.
 
-            self._depths = parallel(depth_map, range(len(small)))
+        Args:
+            cameras: in the same world; a depth map is rendered for each. None of them: nobody tells.
+            config: accuracy of the depth maps.
+        """
+        if not len(cameras):
+            return self
+        other = copy(self)
+        small = other.watchers = cameras.resized(WATCHED_SIDE)
+
+        def depth_map(view: int) -> Float32[np.ndarray, "h w"]:
+            b = blend(self._gaussians, small, view, config=config)
+            # Rays that end nowhere have looked through nothing that is known.
+            return torch.where(b.alpha >= 0.5, b.depth, 0.0).reshape(b.shape).float().numpy()
+
+        other._depths = parallel(depth_map, range(len(small)))
+        return other
 
     def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
         """The cell of each point as a number; −1 far outside the splat."""
@@ -114,17 +123,18 @@ class FreeSpace:
         return np.where(hit.any(axis=1), along[hit.argmax(axis=1)], np.inf)
 
     def clearance(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        """World units from each point to the nearest surface, less than zero inside a Gaussian; never too much.
+        """World units from each point to the nearest surface, less than zero inside a Gaussian.
 
-        A surface lies two standard deviations from the centre of a Gaussian. The plane that touches it there, across
-        the line from the centre to the point, is no farther away than the surface.
+        A surface lies two standard deviations from the centre of a patch. The plane that touches it there, across
+        the line from the centre to the point, is no farther away than the surface; of the nearest patches.
         """
-        count = min(NEAREST, len(self._solid))
-        distances, rows = self._tree.query(points, k=[*range(1, count + 1)])
-        offsets = points[:, None] - self._solid.means[rows]
+        parts = self._patches
+        count = min(NEAREST, len(parts.rows))
+        distances, near = self._tree.query(points, k=[*range(1, count + 1)])
+        offsets = points[:, None] - parts.centers[near]
         directions = offsets / np.maximum(distances, 1e-12)[..., None]
-        shapes = (torch.from_numpy(part[rows]).double() for part in (self._solid.quats, self._solid.scales))
-        spread = covariances(*shapes)
+        quats, scales = self._quats[parts.rows[near]], parts.scales[near]
+        spread = covariances(torch.from_numpy(quats).double(), torch.from_numpy(scales).double())
         reach = SIGMAS * np.sqrt(np.einsum("nki,nkij,nkj->nk", directions, spread.numpy(), directions))
         return np.asarray((distances - reach).min(axis=1))
 

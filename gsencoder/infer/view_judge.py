@@ -37,7 +37,8 @@ class Looks:
         share: of the picture that the target fills, by weight.
         inside: share of the target's Gaussians whose means lie in the picture.
         alpha: mean opacity of the render over the target and around it.
-        blur: standard deviation, in pixels, of the Gaussians that make up the target in the picture, on average.
+        blur: standard deviation of the Gaussians that make up the target in the picture, on average, as a share of
+            the picture's longer side.
         target: the weight of each Gaussian of the target (a sample) in small pixels.
         context: the same of Gaussians around it.
     """
@@ -81,11 +82,11 @@ def look(
 
     # Whole views share the threads out better than parts of small ones.
     found = parallel(one, range(len(cameras)))
-    return tuple(_together([each[place] for each in found], cameras, small) for place in range(len(targets)))
+    return tuple(_together([each[place] for each in found]) for place in range(len(targets)))
 
 
 class _Seen(NamedTuple):
-    """What one camera sees of one target; see `Looks`. The blur is in small pixels."""
+    """What one camera sees of one target; see `Looks`."""
 
     visible: float
     share: float
@@ -96,10 +97,9 @@ class _Seen(NamedTuple):
     context: Float32[np.ndarray, " m"]
 
 
-def _together(seen: Sequence[_Seen], cameras: Cameras, small: Cameras) -> Looks:
+def _together(seen: Sequence[_Seen]) -> Looks:
     """All cameras' sight of one target."""
     values = {name: np.array([getattr(each, name) for each in seen], np.float64) for name in _Seen._fields[:5]}
-    values["blur"] = values["blur"] * cameras.Ks[:, 0, 0] / small.Ks[:, 0, 0]
     target, context = (np.stack([getattr(each, name) for each in seen]) for name in ("target", "context"))
     return Looks(**values, target=target, context=context)
 
@@ -137,7 +137,7 @@ class _Watched:
             share=float(shown.mean()),
             inside=float(in_picture(small, view, self._alone.means.astype(np.float64))[3].mean()),
             alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
-            blur=float(mine @ pixels / mine.sum()) if mine.sum() > 0 else 0.0,
+            blur=float(mine @ pixels / mine.sum()) / max(b.shape) if mine.sum() > 0 else 0.0,
             target=target,
             context=context,
         )

@@ -7,8 +7,8 @@ from gsencoder.errors import InputError
 from gsencoder.infer.marks import draw_marks
 from gsencoder.infer.photographs import resized_picture
 from gsencoder.infer.pictures import Picture, contact_sheet, draw_boxes
+from gsencoder.infer.view_set import Chosen, ViewSet
 from gsencoder.infer.view_targets import Target
-from gsencoder.infer.views import Chosen, ViewSet
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.rgb import render_image
 from gsencoder.types import Box, Scene

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from rooms import HALF, HEIGHT, STEP, corner_cameras, room, sheet, splat
 
-from gsencoder.infer.free_space import SIGMAS, FreeSpace
+from gsencoder.infer.free_space import FreeSpace
+from gsencoder.infer.patches import SIGMAS
 from gsencoder.types import Gaussians
 
 
@@ -12,7 +13,7 @@ from gsencoder.types import Gaussians
 def free() -> FreeSpace:
     scene, rows = room()
     assert scene.gaussians is not None
-    return FreeSpace(scene.gaussians, corner_cameras()).without(rows)
+    return FreeSpace(scene.gaussians).seen_by(corner_cameras()).without(rows)
 
 
 def test_points_in_the_room_are_seen_empty_and_those_beyond_its_walls_are_not(
@@ -34,7 +35,7 @@ def test_the_inside_of_a_closed_thing_is_not_seen_empty(free: FreeSpace) -> None
 def test_nobody_knows_what_is_empty_without_cameras() -> None:
     scene, _ = room()
     assert scene.gaussians is not None
-    blind = FreeSpace(scene.gaussians, None)
+    blind = FreeSpace(scene.gaussians)
     assert blind.watchers is None
     assert not blind.seen_empty(np.zeros((3, 3))).any()
 
@@ -52,12 +53,12 @@ def test_clearance_from_a_wall_is_at_most_the_distance_less_two_standard_deviati
     away = np.array([0.5, 0.2, 0.1])
     at = np.array([[1 - d, *wall.means[600, 1:]] for d in away])
     exact = away - SIGMAS * float(flat.scales[0, 0])
-    one = FreeSpace(flat.select(np.array([600])), None).clearance(at)
+    one = FreeSpace(flat.select(np.array([600]))).clearance(at)
     np.testing.assert_allclose(one, exact, atol=1e-6)
-    all_of_it = FreeSpace(flat, None).clearance(at)
+    all_of_it = FreeSpace(flat).clearance(at)
     assert (all_of_it <= exact + 1e-9).all()
     assert (all_of_it >= exact - 0.4 * STEP).all()
-    assert FreeSpace(flat, None).clearance(wall.means[600:601].astype(np.float64))[0] <= 0
+    assert FreeSpace(flat).clearance(wall.means[600:601].astype(np.float64))[0] <= 0
 
 
 def test_rays_end_at_walls_and_go_through_what_is_set_apart(free: FreeSpace) -> None:
@@ -71,14 +72,14 @@ def test_rays_end_at_walls_and_go_through_what_is_set_apart(free: FreeSpace) -> 
     assert free.first_hit(start, np.array([[1.0, 0, 0]]), np.array([0.5]))[0] == np.inf
     scene, _ = room()
     assert scene.gaussians is not None
-    assert FreeSpace(scene.gaussians, None).first_hit(start, np.array([[1.0, 0, 0]]), np.array([0.5]))[0] < 0.25
+    assert FreeSpace(scene.gaussians).first_hit(start, np.array([[1.0, 0, 0]]), np.array([0.5]))[0] < 0.25
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 500.0)])
 def test_what_is_free_does_not_depend_on_the_unit_or_the_place(scale: float, shift: float) -> None:
     wall = sheet((1.0, 0, 0), (1, 2), (1.0, 1.0))
-    moved = FreeSpace(splat(wall * scale + shift, 0.6 * STEP * scale), None)
-    here = FreeSpace(splat(wall), None)
+    moved = FreeSpace(splat(wall * scale + shift, 0.6 * STEP * scale))
+    here = FreeSpace(splat(wall))
     start, along = np.array([[0.03, 0.01, 0.02]]), np.array([[1.0, 0, 0]])
     assert moved.cell == pytest.approx(here.cell * scale, rel=1e-2)
     far = moved.first_hit(start * scale + shift, along, np.array([5.0 * scale]))[0]
@@ -88,7 +89,7 @@ def test_what_is_free_does_not_depend_on_the_unit_or_the_place(scale: float, shi
 @pytest.mark.parametrize("count", [1, 2, 50])
 def test_few_gaussians_and_many_in_one_place_have_a_free_space(count: int) -> None:
     together = splat(np.zeros((count, 3)), 0.1)
-    free = FreeSpace(together, None)
+    free = FreeSpace(together)
     assert free.cell == pytest.approx(0.2)
     np.testing.assert_allclose(free.clearance(np.array([[1.0, 0, 0]])), [0.8], atol=1e-6)
     assert free.first_hit(np.array([[-1.0, 0, 0]]), np.array([[1.0, 0, 0]]), np.array([3.0]))[0] < 1.01
@@ -110,13 +111,13 @@ def test_faint_gaussians_are_no_obstacle_unless_there_are_no_others() -> None:
         }
     )
     ray = (np.zeros((1, 3)) + 0.01, np.array([[1.0, 0, 0]]), np.array([3.0]))
-    assert FreeSpace(both, None).first_hit(*ray)[0] > 0.8
-    assert FreeSpace(faint, None).first_hit(*ray)[0] < 0.6
+    assert FreeSpace(both).first_hit(*ray)[0] > 0.8
+    assert FreeSpace(faint).first_hit(*ray)[0] < 0.6
 
 
 def test_floaters_far_away_change_nothing_in_the_room() -> None:
     wall = sheet((1.0, 0, 0), (1, 2), (1.0, 1.0))
-    far = FreeSpace(splat(np.concatenate([wall, [[1e9, -1e9, 1e9]]])), None)
-    near = FreeSpace(splat(wall), None)
+    far = FreeSpace(splat(np.concatenate([wall, [[1e9, -1e9, 1e9]]])))
+    near = FreeSpace(splat(wall))
     ray = (np.zeros((1, 3)) + 0.01, np.array([[1.0, 0, 0]]), np.array([3.0]))
     assert far.first_hit(*ray) == pytest.approx(near.first_hit(*ray), abs=2 * near.cell)

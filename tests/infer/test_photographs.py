@@ -12,8 +12,9 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.errors import InputError
 from gsencoder.infer.photographs import with_photographs
 from gsencoder.infer.view_pictures import picture_kinds, view_pictures
+from gsencoder.infer.view_set import ViewsConfig
 from gsencoder.infer.view_targets import target_of
-from gsencoder.infer.views import ViewsConfig, choose_views
+from gsencoder.infer.views import choose_views
 from gsencoder.render.rgb import render_image
 from gsencoder.types import Scene
 

@@ -10,12 +10,15 @@ from rooms import CUBE, HALF, HEIGHT, UP, corner_cameras, cube, room, sheet, spl
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.free_space import FreeSpace
-from gsencoder.infer.view_candidates import frames_on, shell_cameras, up_of
+from gsencoder.infer.view_frames import frames_on
 from gsencoder.infer.view_judge import look
 from gsencoder.infer.view_pictures import view_pictures, view_sheet
+from gsencoder.infer.view_set import ViewsConfig
+from gsencoder.infer.view_shells import shell_cameras, up_of
 from gsencoder.infer.view_targets import Target, target_of, targets_of
-from gsencoder.infer.views import Values, ViewsConfig, choose_views, worth
-from gsencoder.types import Box, Gaussians, Localization, Scene
+from gsencoder.infer.view_worth import BLURRED, Values, worth
+from gsencoder.infer.views import choose_views
+from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
 
 SHELLS = ViewsConfig(source="shells", candidates=16, count=6, width=160, height=120)
 
@@ -61,7 +64,7 @@ def test_targets_are_the_best_boxes_of_each_word_with_the_ball_that_holds_them()
 def test_cameras_on_shells_look_at_the_target_from_free_places_that_were_seen() -> None:
     scene, target = cube_in_room()
     assert scene.gaussians is not None
-    free = FreeSpace(scene.gaussians, corner_cameras()).without(target.rows)
+    free = FreeSpace(scene.gaussians).seen_by(corner_cameras()).without(target.rows)
     around = shell_cameras(scene.gaussians, target, 16, free, up=UP)
     assert len(around) == 16
     centers = around.centers
@@ -88,7 +91,7 @@ def test_a_target_by_itself_is_seen_whole_and_fills_what_it_should() -> None:
     # At least the means' square, at most that with two standard deviations on every side.
     least, most = ((side * 200 / 2) ** 2 / (160 * 120) for side in (0.4, 0.4 + 4 * 0.012))
     assert least < seen.share[0] < most
-    assert seen.blur[0] == pytest.approx(200 * 0.012 / 2, rel=1e-3)
+    assert seen.blur[0] == pytest.approx(200 * 0.012 / 2 / 160, rel=1e-3)
     assert 0.2 < seen.alpha[0] < 0.4
     assert seen.target.shape == (1, len(plate))
     assert seen.context.shape == (1, 0)
@@ -174,7 +177,7 @@ def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
     config = ViewsConfig()
 
     def value(**changed: float) -> float:
-        base = {"visible": 1.0, "share": 0.2, "inside": 1.0, "alpha": 1.0} | changed
+        base = {"visible": 1.0, "share": 0.2, "inside": 1.0, "alpha": 1.0, "blur": 0.0} | changed
         arrays = {name: np.array([number]) for name, number in base.items()}
         return float(worth(replace(seen, **arrays), config)[0])
 
@@ -185,24 +188,110 @@ def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
     assert value(share=0.6) == pytest.approx(1)
     assert value(share=0.8) < 0.6
     assert value(share=1.0) == 0
+    assert value(blur=BLURRED) == pytest.approx(value() / 2)
     for name, less in (("visible", 0.5), ("inside", 0.5), ("alpha", 0.5)):
         assert value(**{name: less}) < value()
 
 
 def test_frames_that_would_show_most_are_taken_first() -> None:
-    _, target = cube_in_room()
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    free = FreeSpace(scene.gaussians).without(target.rows)
     middle = corner_cameras(6)
     outward = middle.centers / np.linalg.norm(middle.centers, axis=1, keepdims=True)
     behind = looking_cameras(middle.centers, outward, UP, 40.0, 64, 48)
-    both = replace(
-        middle,
-        **{
-            name: np.concatenate([getattr(behind, name), getattr(middle, name)])
-            for name in ("cam_from_world", "Ks", "widths", "heights")
-        },
+    both = joined(behind, middle)
+    assert frames_on(both, scene.gaussians, [target], 6, [free]).tolist() == list(range(6, 12))
+    assert frames_on(both, scene.gaussians, [target], 99, [free]).tolist() == list(range(12))
+
+
+def joined(*parts: Cameras) -> Cameras:
+    names = ("cam_from_world", "Ks", "widths", "heights")
+    return Cameras(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def around(center: np.ndarray, distances: np.ndarray, turns: np.ndarray, height: float = 0.4) -> Cameras:
+    """Cameras that look at a point from a circle about it."""
+    away = np.stack([distances * np.cos(turns), distances * np.sin(turns), np.full(len(turns), height)], axis=1)
+    toward = -away / np.linalg.norm(away, axis=1, keepdims=True)
+    return looking_cameras(center + away, toward, UP, 40.0, 64, 48)
+
+
+def test_frames_that_look_at_a_wall_are_taken_last_however_near_the_target_is_behind_it() -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    # Next door, nearer to the cube than the cameras of the room are, and pointed at it.
+    next_door = around(np.array([0.3, 0.2, 0.8]), np.full(20, 2.4), np.linspace(-0.4, 0.4, 20))
+    cameras = joined(next_door, corner_cameras())
+    free = FreeSpace(scene.gaussians).without(target.rows)
+    assert (frames_on(cameras, scene.gaussians, [target], 6, [free]) >= 20).all()
+    assert scene.views is not None
+    names = tuple(f"{number:02d}" for number in range(len(cameras)))
+    both = replace(scene, views=replace(scene.views, cameras=cameras, names=names))
+    for source in ("frames", "both"):
+        chosen = choose_views(both, [target], replace(SHELLS, source=source))  # type: ignore[arg-type]
+        assert all(each.sights[0].visible > 0.5 for each in chosen.chosen)
+
+
+def test_frames_of_a_film_are_taken_from_all_along_it() -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    film = around(np.array([0.3, 0.2, 0.8]), 1.0 + 0.3 * np.abs(turns - np.pi) / np.pi, turns)
+    free = FreeSpace(scene.gaussians).without(target.rows)
+    taken = frames_on(film, scene.gaussians, [target], 16, [free])
+    assert len(taken) == 16
+    assert len(np.unique(taken)) == 16
+    # The nearest stand together on one side.
+    assert np.ptp(turns[taken]) > 0.8
+
+
+def test_targets_take_turns_at_the_frames() -> None:
+    scene, target = cube_in_room(cube((-1.2, -1.2, 0.5), half=0.5))
+    assert scene.gaussians is not None
+    large = target_of("crate", scene.gaussians, np.arange(len(scene.gaussians) - 5000, len(scene.gaussians)))
+    at = np.linspace(0, 6, 20)
+    cameras = joined(around(large.center, np.full(20, 1.2), at), around(target.center, np.full(20, 1.2), at))
+    free = FreeSpace(scene.gaussians)
+    spaces = [free.without(each.rows) for each in (large, target)]
+    taken = frames_on(cameras, scene.gaussians, [large, target], 8, spaces)
+    assert len(taken) == 8
+    for each, space in zip((large, target), spaces, strict=True):
+        (best,) = frames_on(cameras, scene.gaussians, [each], 1, [space])
+        assert best in taken
+
+
+def test_views_that_add_nothing_are_left_out_and_that_is_said() -> None:
+    scene, target = cube_in_room()
+    assert scene.views is not None
+    middle = corner_cameras(3)
+    away = looking_cameras(
+        middle.centers, middle.centers / np.linalg.norm(middle.centers, axis=1, keepdims=True), UP, 40.0, 64, 48
     )
-    assert frames_on(both, [target], 6).tolist() == list(range(6, 12))
-    assert frames_on(both, [target], 99).tolist() == list(range(12))
+    names = tuple("abcdef")
+    half = replace(scene, views=replace(scene.views, cameras=joined(away, middle), names=names))
+    with pytest.warns(SceneWarning, match="views: 3 of 6 in scene room: no other shows more"):
+        chosen = choose_views(half, [target], replace(SHELLS, source="frames"))
+    assert sorted(each.name for each in chosen.chosen) == ["d", "e", "f"]
+
+
+def test_clearance_of_each_view_is_told() -> None:
+    scene, target = cube_in_room()
+    chosen = choose_views(scene, [target], SHELLS)
+    inner = np.array([HALF, HALF, HEIGHT])
+    for center, each in zip(chosen.cameras.centers, chosen.chosen, strict=True):
+        walls_ = np.minimum(inner - center, center + np.array([HALF, HALF, 0])).min()
+        assert each.clearance is not None
+        assert 0 < each.clearance <= walls_
+
+
+def test_uniform_views_of_a_splat_without_cameras_go_around_it() -> None:
+    scene, _ = cube_in_room()
+    bare = replace(scene, views=None)
+    chosen = choose_views(bare, [], ViewsConfig(method="uniform", count=40, width=64, height=48))
+    assert len(chosen) == 40
+    assert all(each.frame is None and each.name.startswith("orbit") for each in chosen.chosen)
+    assert (chosen.cameras.widths == 64).all()
 
 
 def test_uniform_frames_are_evenly_spread_and_need_no_target() -> None:
@@ -255,10 +344,8 @@ def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match="has no Gaussians to look at"):
         target_of("nothing", scene.gaussians, np.zeros(0, np.int64))
     bare = replace(scene, views=None)
-    with pytest.raises(InputError, match="no cameras of its own; take source=shells"):
+    with pytest.raises(InputError, match="no cameras of its own; take choose.source=shells"):
         choose_views(bare, [target], replace(SHELLS, source="frames"))
-    with pytest.raises(InputError, match="no cameras to take evenly"):
-        choose_views(bare, [target], replace(SHELLS, method="uniform"))
     with pytest.raises(InputError, match="scene room has no Gaussians"):
         choose_views(replace(scene, gaussians=None), [target], SHELLS)
     # A cube in a closed box that leaves no place to see it from.
@@ -269,7 +356,11 @@ def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
         pytest.raises(InputError, match="no room for a camera around cube"),
     ):
         choose_views(closed, [target_of("cube", closed.gaussians, rows)], SHELLS)
-    with pytest.warns(SceneWarning, match="no room for a camera around cube"):
+    with (
+        pytest.warns(SceneWarning, match="no room for a camera around cube"),
+        pytest.warns(SceneWarning, match="no view shows more than 0% of cube"),
+        pytest.warns(SceneWarning, match="views: 1 of 6 in scene room: no other shows more"),
+    ):
         frames = choose_views(closed, [target_of("cube", closed.gaussians, rows)], replace(SHELLS, source="both"))
     assert all(each.frame is not None for each in frames.chosen)
 
@@ -296,7 +387,7 @@ def test_single_gaussians_and_unequal_pictures_can_be_looked_at() -> None:
     scene, _ = cube_in_room()
     assert scene.gaussians is not None
     point = target_of("point", scene.gaussians, np.array([7]))
-    chosen = choose_views(scene, [point], replace(SHELLS, candidates=8, count=2, width=31, height=77))
+    chosen = choose_views(scene, [point], replace(SHELLS, candidates=8, count=1, width=31, height=77))
     assert (chosen.cameras.widths == 31).all()
     assert (chosen.cameras.heights == 77).all()
 

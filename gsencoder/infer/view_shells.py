@@ -1,10 +1,9 @@
-"""Cameras that could look at a target: on shells around it, or those that the scene has."""
+"""Cameras that could look at a target, on shells around it."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from gsencoder.data.orbits import looking_cameras, spiral_directions
 from gsencoder.evenly import evenly
@@ -15,13 +14,15 @@ from gsencoder.types import Cameras, Gaussians, Scene
 TRIED = 8
 """So many times as many directions are tried as cameras are wanted."""
 SHARES = (0.30, 0.18, 0.10)
-"""Shares of the picture that targets are to fill, direction by direction."""
+"""Shares of the picture that targets are to fill, direction by direction …"""
+ROOM = 1.5
+"""… but so many times the least share, and less than the largest by as much: outlines are counted in cells."""
 LARGEST_SHARE, THIN_SHARE = 0.5, 0.08
 """A camera comes no nearer than the first; what is long and thin may leave the picture to fill the second."""
 FILLED = 0.9
 """What fits into the picture keeps within so much of it."""
 CLEARANCE = 0.2
-"""Cameras keep off surfaces by this share of their distance to the target."""
+"""Cameras keep off surfaces by this share of their distance to the target, or of its radius where that is less."""
 OUTLINE = 16
 """Cells along a target's radius in which its outline is counted."""
 BESIDE = 1.5
@@ -40,6 +41,7 @@ def shell_cameras(
     width: int = 640,
     height: int = 480,
     fov_degrees: float = 60.0,
+    between: tuple[float, float] = (0.0, 1.0),
 ) -> Cameras:
     """Cameras around a target from which nothing stands between: SplatDistill sec. 3.4, "viewpoints around".
 
@@ -57,13 +59,14 @@ def shell_cameras(
         width: of the pictures, pixels.
         height: of the pictures, pixels.
         fov_degrees: horizontal field of view.
+        between: shares of the picture that the target is to fill at least, and at most.
 
     Returns:
         Cameras relative to the scene's origin; none where there is no room.
     """
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
     outward, vertical = spiral_directions(TRIED * count, up)
-    wanted, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height)
+    wanted, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height, between)
     # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
     begins = reach + 2 * free.cell
     starts = target.center + begins[:, None] * outward
@@ -111,11 +114,13 @@ def _distances(
     focal: float,
     width: int,
     height: int,
+    between: tuple[float, float],
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Along each direction how far a camera should be, how far at least, and how far the target itself reaches."""
     rows = target.rows[evenly(len(target.rows), SAMPLE)]
     offsets = gaussians.means[rows].astype(np.float64) - target.center
     # A Gaussian fills a cell of its own size.
+    shares = np.clip(SHARES, between[0] * ROOM, between[1] / ROOM)
     cell = max(target.radius / OUTLINE, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
     wanted, least, reach = (np.empty(len(outward)) for _ in range(3))
     for index, direction in enumerate(outward):
@@ -127,32 +132,13 @@ def _distances(
         # Distance at which an area fills a share of the picture: area · focal² / distance² = share · pixels.
         fills = [
             focal * math.sqrt(area / (share * width * height))
-            for share in (SHARES[index % len(SHARES)], LARGEST_SHARE, THIN_SHARE)
+            for share in (shares[index % len(shares)], LARGEST_SHARE, THIN_SHARE)
         ]
         wide, high = np.abs(plane).max(axis=0)
         framed = 2 * focal / FILLED * max(wide / width, high / height)
         wanted[index] = reach[index] + max(fills[0], min(framed, fills[2]))
         least[index] = reach[index] + fills[1]
     return wanted, least, reach
-
-
-def frames_on(cameras: Cameras, targets: Sequence[Target], count: int) -> Int64[np.ndarray, " n"]:
-    """The frames that would show most of the targets if nothing stood between, ascending; at most so many.
-
-    What a frame would show of a target is the share of its picture that the target's ball fills.
-    """
-    worth = np.zeros(len(cameras))
-    for target in targets:
-        pose = cameras.cam_from_world.astype(np.float64)
-        at = pose[:, :3, :3] @ target.center + pose[:, :3, 3]
-        z = np.maximum(at[:, 2], 1e-9)
-        x, y = (at[:, axis] / z * cameras.Ks[:, axis, axis] + cameras.Ks[:, axis, 2] for axis in (0, 1))
-        radius = np.minimum(target.radius * cameras.Ks[:, 0, 0] / z, cameras.widths + cameras.heights)
-        overlap = np.ones(len(cameras))
-        for place, size in ((x, cameras.widths), (y, cameras.heights)):
-            overlap *= np.clip(np.minimum(place + radius, size) - np.maximum(place - radius, 0), 0, None) / size
-        worth = np.maximum(worth, np.where(at[:, 2] > -target.radius, overlap, 0))
-    return np.sort(np.argsort(-worth, kind="stable")[:count])
 
 
 def up_of(scene: Scene) -> Float64[np.ndarray, "3"] | None:
