@@ -22,6 +22,7 @@ import gsencoder
 from gsencoder.commands import COMMANDS, Command
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.options import near
+from gsencoder.progress import printable
 
 FLAGS = {
     "--help": "show this help (-h)",
@@ -61,8 +62,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         _report("interrupted", "", debug)
         return 130
     except Stopped as stop:
-        _report("stopped", signal.Signals(stop.number).name, debug)
-        return 128 + stop.number
+        return _stopped(stop, debug)
+    except SystemError as error:
+        # A signal that arrives within a compiled function comes out wrapped.
+        inner = error.__cause__ or error.__context__
+        if not isinstance(inner, Stopped):
+            raise
+        return _stopped(inner, debug)
     except BrokenPipeError:
         _discard_stdout()
         return 1
@@ -74,6 +80,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
+def _stopped(stop: Stopped, debug: bool) -> int:
+    _report("stopped", signal.Signals(stop.number).name, debug)
+    return 128 + stop.number
+
+
 def _report(kind: str, message: str, debug: bool) -> None:
     if debug:
         traceback.print_exc()
@@ -81,7 +92,7 @@ def _report(kind: str, message: str, debug: bool) -> None:
 
 
 def _one_line(message: str) -> str:
-    return " ".join(message.split())
+    return printable(" ".join(message.split()))
 
 
 def _discard_stdout() -> None:

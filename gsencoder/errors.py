@@ -27,7 +27,7 @@ def about(what: object) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise error if str(what) in str(error) else InputError(f"{what}: {error}") from error
+        raise error if str(what) in str(error) else type(error)(f"{what}: {error}") from error
 
 
 @contextmanager

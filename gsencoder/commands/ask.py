@@ -4,8 +4,10 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,8 @@ from gsencoder.commands.asked import words_of
 from gsencoder.commands.views import shown_scene, views_to_json, write_pictures
 from gsencoder.config import CommonConfig, settings
 from gsencoder.data.scenes import SceneConfig
+from gsencoder.data.splats import fingerprint
+from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError, SceneWarning, about
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.infer.ask import AskConfig, Asker, Prompt, Question, meant, prompt_messages
@@ -20,9 +24,10 @@ from gsencoder.infer.localize import LocalizeConfig, box_to_json
 from gsencoder.infer.prompts import Task
 from gsencoder.infer.questions import Asked, read_answers, read_questions
 from gsencoder.infer.view_set import ViewsConfig
-from gsencoder.infer.vlm import MODEL_VARIABLE, URL_VARIABLE, Reply, VlmConfig, VlmServer, request_body
+from gsencoder.infer.vlm import MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
+from gsencoder.infer.vlm_reply import Reply, ServerError
 from gsencoder.outputs import output_folder, write_bytes, write_json
-from gsencoder.progress import Progress, console
+from gsencoder.progress import Progress, console, printable
 from gsencoder.summary import Summary, plain
 from gsencoder.types import Scene
 from gsencoder.work_folder import WorkFolder
@@ -83,7 +88,7 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
     folder = Path(config.paths[0])
     server = None if config.dry_run else VlmServer(config.vlm)
     request_body([], config.vlm, named=server is not None)
-    many = read_questions(Path(config.questions)) if config.questions else ()
+    many = read_questions(Path(config.questions), config.task) if config.questions else ()
     with summary.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
         table = words_of(folder, config.words) if config.words or (folder / WORDS_FILE).is_file() else None
@@ -94,17 +99,18 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         config=config.ask,
         localization=config.localize,
         views=config.choose,
+        side=config.vlm.image_side,
     )
     out = config.out or Path("outputs") / scene.name / ("answers" if many else "answer")
     if many:
-        _ask_many(out, many, scene, asker, server, config, summary)
+        _ask_many(out, many, scene, asker, server, config, summary, _depends_on(config, scene, table))
         return
     with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
         row = _ask_one(target, config.asked(), scene, asker, server, config, summary)
         summary.results.update(row)
     screen = console(config.quiet)
     if server is not None:
-        screen.print(printable(row["answer"]))
+        screen.print(printable(row["answer"]), soft_wrap=True)
     screen.print(f"{out}: {len(row['views'])} pictures, {PROMPT}, {REQUEST}" + (f", {ANSWER}" if server else ""))
 
 
@@ -130,7 +136,7 @@ def _ask_one(
         "question": question.text,
         "task": question.task,
         "words": list(prompt.words),
-        "targets": [target.name for target in prompt.targets],
+        "targets": targets_to_json(question, prompt),
         "views": views,
     }
     if server is not None:
@@ -139,6 +145,14 @@ def _ask_one(
         row |= _told(question, prompt, reply)
         write_json(folder / ANSWER, row)
     return row
+
+
+def targets_to_json(question: Question, prompt: Prompt) -> list[dict[str, Any]]:
+    """What the pictures are of, in the order of the marks, in world coordinates: boxes that words found, or the one
+    that was given."""
+    if prompt.boxes:
+        return [box_to_json(box) for box in prompt.boxes]
+    return [{"aabb_min": list(question.aabb[:3]), "aabb_max": list(question.aabb[3:])} for _ in prompt.targets]
 
 
 def _told(question: Question, prompt: Prompt, reply: Reply) -> dict[str, Any]:
@@ -151,9 +165,7 @@ def _told(question: Question, prompt: Prompt, reply: Reply) -> dict[str, Any]:
     }
     if question.task == "ground":
         told["mark"] = meant(prompt, reply.text)
-        told["box"] = None
-        if told["mark"] and prompt.boxes:
-            told["box"] = box_to_json(prompt.boxes[told["mark"] - 1])
+        told["box"] = targets_to_json(question, prompt)[told["mark"] - 1] if told["mark"] else None
     if reply.finish == "length":
         warnings.warn("the answer ends where vlm.max_tokens cut it off", SceneWarning, stacklevel=2)
     return told
@@ -167,12 +179,14 @@ def _ask_many(
     server: VlmServer | None,
     config: AskCommandConfig,
     summary: Summary,
+    depends: Mapping[str, Any],
 ) -> None:
     """Asks question by question; each answer is on the disk before the next question, in a folder beside out= that
-    stays where the run is cut off."""
+    stays where the run is cut off. A question that cannot be answered does not keep the others from it."""
     real = Path(os.path.realpath(out))
     track = Progress(quiet=config.quiet)
-    depends = _depends_on(config)
+    digests = {asked.id: asked.digest(depends) for asked in many}
+    failed: list[str] = []
     with (
         WorkFolder(real.with_name(f"{real.name}.answers")) as kept,
         output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
@@ -180,52 +194,83 @@ def _ask_many(
         kept.take(anew=not config.resume)
         file = kept.path / ANSWERS
         rows = read_answers(file)
-        done = {asked.id: rows[asked.id] for asked in many if _same(asked, rows, depends, kept.path)}
+        done = {
+            name: rows[name]
+            for name, digest in digests.items()
+            if name in rows and rows[name].get("digest") == digest and (kept.path / digest).is_dir()
+        }
         # Lines of other settings, and one that was cut off, go before new ones come.
         write_bytes(file, b"".join(_line(row) for row in done.values()))
-        for number, asked in enumerate(track(many, "asking"), start=1):
+        for asked in track(many, "asking"):
             if asked.id in done:
                 continue
-            place = kept.path / f"{number:05d}"
-            place.mkdir(exist_ok=True)
+            place = kept.path / digests[asked.id]
+            if place.exists():
+                shutil.rmtree(place)
+            place.mkdir()
             try:
-                with about(f"question {asked.id}"):
+                with about(f"question {asked.id[:40]}"), warnings_about(f"question {asked.id[:40]}") as told:
                     row = _ask_one(place, asked.question, scene, asker, server, config, summary)
-            except InputError as error:
+            except ServerError as error:
                 raise InputError(f"{error}; {len(done)} of {len(many)} answers are kept in {file}") from error
-            row = {"id": asked.id, "digest": asked.digest(depends), "folder": place.name, **row}
+            except InputError as error:
+                failed.append(str(error))
+                continue
+            row = {"id": asked.id, "digest": digests[asked.id], "warnings": told, **row}
             with file.open("ab") as stream:
                 stream.write(_line(row))
                 stream.flush()
                 os.fsync(stream.fileno())
             done[asked.id] = row
-        for row in done.values():
-            shutil.copytree(kept.path / row["folder"], folder / row["folder"])
-        write_bytes(folder / ANSWERS, b"".join(_line(done[asked.id]) for asked in many))
+        if failed:
+            raise InputError(
+                f"{len(failed)} of {len(many)} questions have no answer: {failed[0]}{' …' if len(failed) > 1 else ''}; "
+                f"the other answers are kept in {file}; mend or remove those lines, and run this again"
+            )
+        lines = []
+        for number, asked in enumerate(many, start=1):
+            place = folder / f"{number:05d}"
+            shutil.copytree(kept.path / digests[asked.id], place)
+            lines.append(_line(done[asked.id] | {"folder": place.name}))
+        write_bytes(folder / ANSWERS, b"".join(lines))
         summary.results.update(questions=len(many), answers=ANSWERS)
     console(config.quiet).print(f"{out}: {len(many)} questions, {ANSWERS}")
 
 
-def printable(text: str) -> str:
-    """Text without the control characters by which a terminal could be told to do other things than to show it."""
-    return "".join(letter if letter.isprintable() or letter == "\n" else "\N{REPLACEMENT CHARACTER}" for letter in text)
+@contextmanager
+def warnings_about(what: str) -> Iterator[list[str]]:
+    """Scene warnings of the block say what they are about; it gives their texts, too."""
+    told: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            yield told
+        finally:
+            told += [str(each.message) for each in caught if issubclass(each.category, SceneWarning)]
+    for each in caught:
+        if issubclass(each.category, SceneWarning):
+            warnings.warn(f"{what}: {each.message}", SceneWarning, stacklevel=3)
+        else:
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
 
 
-def _same(asked: Asked, rows: Mapping[str, Any], depends: Mapping[str, Any], kept: Path) -> bool:
-    row = rows.get(asked.id)
-    return bool(row and row.get("digest") == asked.digest(depends) and (kept / str(row.get("folder"))).is_dir())
-
-
-def _depends_on(config: AskCommandConfig) -> dict[str, Any]:
-    """The settings that make an answer what it is."""
+def _depends_on(config: AskCommandConfig, scene: Scene, table: TextTable | None) -> dict[str, Any]:
+    """What makes an answer what it is: the settings, and what the folders hold."""
     given = settings(config)
     patience = ("key", "timeout", "longest", "retries", "stream")
     vlm = {name: value for name, value in given["vlm"].items() if name not in patience}
     named = {name: os.environ.get(name, "") for name in (URL_VARIABLE, MODEL_VARIABLE)}
-    others = {
-        name: given[name] for name in ("words", "space", "photos", "dry_run", "ask", "choose", "data", "localize")
-    }
-    return {"features": str(Path(config.paths[0]).resolve()), "vlm": vlm, **named, **others}
+    others = {name: given[name] for name in ("space", "photos", "dry_run", "ask", "choose", "data", "localize")}
+    held = sha256()
+    if scene.gaussians is not None:
+        held.update(fingerprint(scene.gaussians).encode())
+    for name, features in sorted(scene.features.items()):
+        held.update(name.encode() + features.features.tobytes() + features.mean.tobytes())
+    if scene.views is not None:
+        held.update(scene.views.cameras.cam_from_world.tobytes())
+    if table is not None:
+        held.update("\n".join(table.names).encode() + table.embeddings.tobytes())
+    return {"scene": held.hexdigest(), "vlm": vlm, **named, **others}
 
 
 def _line(row: Mapping[str, Any]) -> bytes:

@@ -92,7 +92,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     summary.results.update(views=rows, judged=views.judged)
     with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
         with summary.step("render"):
-            pictures = view_pictures(scene, views)
+            pictures, _ = view_pictures(scene, views)
             write_pictures(target, scene, views, rows, pictures, boxes)
         write_json(target / VIEWS, rows)
         if config.grid:

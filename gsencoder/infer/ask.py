@@ -1,6 +1,5 @@
 """A question about a scene, from words to what a VLM is sent: what to look for, which views, which prompt."""
 
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,7 +12,8 @@ from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.pictures import Picture
-from gsencoder.infer.prompts import Task, messages, number_in, prompt_text
+from gsencoder.infer.prompts import Task, check_question, messages, number_in, prompt_text
+from gsencoder.infer.question_words import words_in
 from gsencoder.infer.view_pictures import picture_kinds, view_pictures
 from gsencoder.infer.view_set import ViewsConfig, ViewSet
 from gsencoder.infer.view_targets import Target, best_boxes, target_of, targets_of
@@ -21,8 +21,8 @@ from gsencoder.infer.views import choose_views
 from gsencoder.infer.vlm import VlmConfig
 from gsencoder.types import Box, Scene
 
-LONGEST_NAME = 3
-"""Names of so many words are looked for in a question."""
+SAME = 0.5
+"""What shares more of its Gaussians with what was found before, as intersection over union, is the same thing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +50,7 @@ class Question:
             raise InputError(f"aabb: the lower corner is not below the upper one: {list(self.aabb)}")
         if self.aabb and self.query:
             raise InputError("aabb and query: give one of them")
+        check_question(self.task, self.text)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +60,7 @@ class AskConfig:
     boxes: int = field(default=3, metadata={"help": "boxes of each word that are looked at, best first"})
     marks: bool | None = field(
         default=None,
-        metadata={"help": "numbered marks on what was found; left out: if the task is ground, or several were found"},
+        metadata={"help": "numbered marks on what was found; left out: for ground and caption"},
     )
 
     def __post_init__(self) -> None:
@@ -73,11 +74,12 @@ class Prompt:
 
     Attributes:
         text: the words.
-        pictures: as they are sent, but for their size.
+        pictures: as they are sent.
         views: where they were taken, and why.
         targets: what they are of, in the order of their marks.
         boxes: the boxes of the targets, where words found them.
         words: that were looked for.
+        marks: the numbers that the pictures carry.
     """
 
     text: str
@@ -86,22 +88,7 @@ class Prompt:
     targets: tuple[Target, ...]
     boxes: tuple[Box, ...]
     words: tuple[str, ...]
-
-
-def words_in(text: str, table: TextTable) -> tuple[str, ...]:
-    """The names of a table that a text holds, in its order; of names within names the longest."""
-    tokens = re.findall(r"[^\W_]+(?:['’-][^\W_]+)*", text)
-    found: list[str] = []
-    start = 0
-    while start < len(tokens):
-        for length in range(min(LONGEST_NAME, len(tokens) - start), 0, -1):
-            row = table.find(" ".join(tokens[start : start + length]))
-            if row is not None:
-                found.append(table.names[row])
-                start += length - 1
-                break
-        start += 1
-    return tuple(dict.fromkeys(found))
+    marks: frozenset[int]
 
 
 class Asker:
@@ -116,6 +103,7 @@ class Asker:
         config: AskConfig = AskConfig(),
         localization: LocalizeConfig = LocalizeConfig(),
         views: ViewsConfig = ViewsConfig(),
+        side: int = 768,
     ) -> None:
         """Args:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
@@ -124,8 +112,9 @@ class Asker:
         config: see there.
         localization: how words become boxes.
         views: how views are chosen.
+        side: longer pictures are made smaller, pixels.
         """
-        self._scene, self._table, self._space = scene, table, space
+        self._scene, self._table, self._space, self._side = scene, table, space, side
         self._config, self._localization, self._views = config, localization, views
         self._kept: dict[Any, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
 
@@ -147,27 +136,33 @@ class Asker:
         if key not in self._kept:
             self._kept[key] = self._look(words, question)
         targets, boxes, views = self._kept[key]
+        if not targets and self._views.method == "greedy":
+            told = self._nothing(words)
+            if question.task != "answer":
+                raise InputError(f"task={question.task}: {told}; give query= or aabb=")
+            warnings.warn(f"{told}: evenly spread views are shown", SceneWarning, stacklevel=2)
         marked = self._config.marks
         if marked is None:
-            marked = question.task == "ground" or len(targets) > 1
-        marked = marked and bool(targets)
+            marked = question.task in ("ground", "caption")
+        pictures, marks = view_pictures(self._scene, views, targets if marked else ())
+        # A thing in a box that was given has no name.
+        names = [box.query for box in boxes] or ["" for _ in targets]
         kinds = picture_kinds(self._scene, views)
-        text = prompt_text(
-            question.task, question.text, [target.name for target in targets], marked=marked, kinds=kinds
-        )
-        pictures = view_pictures(self._scene, views, targets if marked else ())
-        return Prompt(text=text, pictures=pictures, views=views, targets=targets, boxes=boxes, words=words)
+        text = prompt_text(question.task, question.text, names, marks=marks, kinds=kinds)
+        return Prompt(text=text, pictures=pictures, views=views, targets=targets, boxes=boxes, words=words, marks=marks)
+
+    def _nothing(self, words: Sequence[str]) -> str:
+        return f"nothing was found of {', '.join(words)}" if words else "the question names nothing to look for"
 
     def _look(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]:
         targets, boxes = self._targets(words, question)
         config = self._views
-        if not targets and config.method == "greedy":
-            told = f"nothing was found of {', '.join(words)}" if words else "the question names nothing to look for"
-            if question.task != "answer":
-                raise InputError(f"task={question.task}: {told}; give query= or aabb=")
-            warnings.warn(f"{told}: evenly spread frames are shown", SceneWarning, stacklevel=4)
+        if not targets:
             config = replace(config, method="uniform")
-        return targets, boxes, choose_views(self._scene, targets, config)
+        views = choose_views(self._scene, targets, config)
+        # Marks are drawn on pictures of the size that is sent, or their numbers would shrink.
+        small = views.cameras.resized(self._side, enlarge=False)
+        return targets, boxes, replace(views, cameras=small)
 
     def _targets(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...]]:
         gaussians = self._scene.gaussians
@@ -186,10 +181,19 @@ class Asker:
         found = localize(self._scene, words, self._table, self._localization, space=self._space)
         # A caption is of one thing.
         boxes = self._config.boxes if question.task != "caption" else 1
-        targets = targets_of(gaussians, found, boxes)
-        if question.task == "caption":
-            targets = targets[:1]
-        return targets, best_boxes(found, boxes)[: len(targets)]
+        targets, kept = _distinct(targets_of(gaussians, found, boxes), best_boxes(found, boxes))
+        return (targets[:1], kept[:1]) if question.task == "caption" else (targets, kept)
+
+
+def _distinct(targets: Sequence[Target], boxes: Sequence[Box]) -> tuple[tuple[Target, ...], tuple[Box, ...]]:
+    """What several words found is one thing: that of the first word."""
+    kept: list[int] = []
+    for index, box in enumerate(boxes):
+        same = (np.intersect1d(box.rows, boxes[other].rows, assume_unique=True).size for other in kept)
+        sizes = (len(box.rows) + len(boxes[other].rows) for other in kept)
+        if all(shared <= SAME * (size - shared) for shared, size in zip(same, sizes, strict=True)):
+            kept.append(index)
+    return tuple(targets[index] for index in kept), tuple(boxes[index] for index in kept)
 
 
 def _corners(
@@ -204,13 +208,16 @@ def prompt_messages(prompt: Prompt, config: VlmConfig) -> list[dict[str, Any]]:
 
 
 def meant(prompt: Prompt, text: str) -> int | None:
-    """Which target an answer to task=ground means, from 1; 0 for none.
+    """Which target an answer to task=ground means, from 1; 0 for none of them, None where it names no mark.
 
     Warns:
-        SceneWarning: the answer names no mark.
+        SceneWarning: the answer names no mark, several, or one that no picture carries.
     """
     number = number_in(text, len(prompt.targets))
-    if number is None:
+    if number is None or (number and number not in prompt.marks):
         told = " ".join(text.split())[:80]
-        warnings.warn(f"the answer names none of the {len(prompt.targets)} marks: {told!r}", SceneWarning, stacklevel=2)
+        warnings.warn(
+            f"the answer does not name one of the {len(prompt.marks)} marks: {told!r}", SceneWarning, stacklevel=2
+        )
+        return None
     return number

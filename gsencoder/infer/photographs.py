@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, listed
 from gsencoder.types import Cameras, Scene
 
 ANGLE, PLACE = 0.01, 1e-3
@@ -58,7 +58,7 @@ def with_photographs(scene: Scene, taken: Scene) -> Scene:
     if missing:
         raise InputError(
             f"photos: scene {taken.name} has no photograph of {len(missing)} of {len(scene.views)} frames: "
-            f"{_first(missing)}"
+            f"{listed(missing, TOLD)}"
         )
     rows = [place[name] for name in scene.views.names]
     own, other = scene.views.cameras, taken.views.cameras.select(rows)
@@ -66,7 +66,7 @@ def with_photographs(scene: Scene, taken: Scene) -> Scene:
     if apart:
         raise InputError(
             f"photos: the cameras of scene {taken.name} are not those of the features: {len(apart)} of "
-            f"{len(scene.views)} differ, {_first(apart)}; give the scene that the features were made from"
+            f"{len(scene.views)} differ, {listed(apart, TOLD)}; give the scene that the features were made from"
         )
     return replace(scene, views=replace(scene.views, images=Photographs(taken.views.images, rows, own)))
 
@@ -85,7 +85,3 @@ def _differ(own: Cameras, other: Cameras, offset: np.ndarray) -> np.ndarray:
     room = PLACE * spread + 1e-5 * np.abs(centers).max()
     bent = np.abs(fields[0] - fields[1]).max(axis=(1, 2))
     return np.asarray((turned > ANGLE) | (away > room) | (bent > ANGLE))
-
-
-def _first(names: Sequence[str]) -> str:
-    return ", ".join(names[:TOLD]) + (" …" if len(names) > TOLD else "")

@@ -31,48 +31,62 @@ ROLES = {
     "caption": "Describe the thing in one or two sentences: what it is, how it looks, and where it stands in relation "
     "to what is near it.",
 }
-MARKED = "It carries the mark {number} in the pictures."
+MARKED = "It carries the mark 1 in the pictures."
+PLACED = "It stands in the middle of most of the pictures."
+THOUGHT = re.compile(r"^.*</think>", re.DOTALL)
+NEITHER = re.compile(r"\W*(none|neither|no (mark|number)|not any)\b", re.IGNORECASE)
+ALONE = re.compile(r"(?<![\d.,/-])\d{1,6}(?!\d|[.,/-]\d)")
+CALLED = re.compile(r"(?:\bmark|\bmarked|\bnumber|\bno\.?|#)[\s:#*]*(\d{1,6})(?!\d|[.,/-]\d)", re.IGNORECASE)
+NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
 def prompt_text(
-    task: Task, question: str, names: Sequence[str], *, marked: bool, kinds: Collection[PictureKind]
+    task: Task, question: str, names: Sequence[str], *, marks: Collection[int], kinds: Collection[PictureKind]
 ) -> str:
     """What is asked, in words.
 
     Args:
         task: see the module.
         question: the user's; a caption needs none.
-        names: of what was looked for and found, in the order of their marks.
-        marked: whether the pictures carry marks.
+        names: of what was looked for and found, in the order of their marks; empty where a thing has no name.
+        marks: the numbers, from 1, that the pictures carry.
         kinds: of the pictures.
 
     Raises:
         InputError: no question for a task that needs one; nothing to ground or caption.
     """
     question = question.strip()
-    if not question and task != "caption":
-        raise InputError("question= is missing: what to ask about the scene")
+    check_question(task, question)
     if task != "answer" and not names:
         raise InputError(f"task={task}: nothing was found that could be meant; give query= or aabb=")
-    if task == "ground" and not marked:
-        raise InputError("task=ground: needs the marks; leave out marks=false")
+    if task == "ground" and not marks:
+        raise InputError("task=ground: needs marks, and no picture carries one")
     shown_by = "both" if len(set(kinds)) > 1 else next(iter(kinds))
     lines = [f"{SETTING} {SHOWN_BY[shown_by]}", ROLES[task]]
     if task == "caption":
-        lines.append(f"The thing is the {_bare(names[0])}.")
-        if marked:
-            lines.append(MARKED.format(number=1))
-    elif marked:
-        told = (f"{number} = {_bare(name)}" for number, name in enumerate(names, start=1))
+        if names[0]:
+            lines.append(f"The thing is the {names[0]}.")
+        lines.append(MARKED if 1 in marks else PLACED)
+    elif marks:
+        told = (f"{number} = {names[number - 1] or 'a thing'}" for number in sorted(marks))
         lines.append(f"Marks: {'; '.join(told)}.")
     if question:
         lines.append(f"Question: {question}" if task == "answer" else f"Meant is: {question}")
     return "\n".join(lines)
 
 
-def _bare(name: str) -> str:
-    """A target's name without the rank that tells it from others of its word."""
-    return re.sub(r" \d+$", "", name)
+def check_question(task: Task, question: str) -> None:
+    """Complains where a task needs a question and there is none, or one that cannot be sent.
+
+    Raises:
+        InputError: see above.
+    """
+    if not question.strip() and task != "caption":
+        raise InputError("question= is missing: what to ask about the scene")
+    try:
+        question.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"question: holds what is no character, at {error.start}") from None
 
 
 def messages(text: str, pictures: Sequence[Picture], *, side: int, kind: ImageFormat) -> list[dict[str, Any]]:
@@ -102,8 +116,16 @@ def data_url(picture: Picture, *, side: int, kind: ImageFormat) -> str:
 
 
 def number_in(text: str, count: int) -> int | None:
-    """The mark that an answer names: the first whole number in it, 0 for none of them; None where it names no mark."""
-    found = re.search(r"(?<![\d.])\d+(?![\d]|\.\d)", text)
-    if found is None or int(found[0]) > count:
-        return None
-    return int(found[0])
+    """The mark that an answer names, of marks 1 to `count`; 0 for none of them; None where it names no mark or several.
+
+    Numbers that are called marks come before others; what a model thought before it answered is left out.
+    """
+    said = THOUGHT.sub("", text).strip()
+    if NEITHER.match(said):
+        return 0
+    for pattern in (CALLED, ALONE):
+        numbers = {number for number in map(int, pattern.findall(said)) if number <= count}
+        if numbers:
+            return numbers.pop() if len(numbers) == 1 else None
+    word = re.sub(r"\W", "", said).lower()
+    return NUMBERS.index(word) if word in NUMBERS[: count + 1] else None

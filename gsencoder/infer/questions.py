@@ -9,6 +9,7 @@ from typing import Any
 
 from gsencoder.errors import InputError, about
 from gsencoder.infer.ask import Question
+from gsencoder.infer.prompts import Task
 
 LARGEST_FILE = 1 << 26
 """Bytes of a file of questions."""
@@ -33,9 +34,13 @@ class Asked:
         return sha256(json.dumps([asked, settings], sort_keys=True).encode()).hexdigest()[:16]
 
 
-def read_questions(path: Path) -> tuple[Asked, ...]:
+def read_questions(path: Path, task: Task = "answer") -> tuple[Asked, ...]:
     """Reads lines such as {"id": "7", "question": "What is on the table?", "query": "table"}; id, task, query and aabb
     may be left out, empty lines are skipped.
+
+    Args:
+        path: of the file.
+        task: of lines that name none.
 
     Raises:
         InputError: no such file, a line that is no such object, an id that comes twice, or no questions.
@@ -45,23 +50,23 @@ def read_questions(path: Path) -> tuple[Asked, ...]:
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise InputError(f"questions: {path} holds more than {LARGEST_FILE:,} bytes")
-        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+        lines = path.read_bytes().decode("utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"questions: {path} cannot be read as text: {error}") from error
     found: dict[str, Asked] = {}
     for number, line in enumerate(lines, start=1):
         if line.strip():
             with about(f"{path}: line {number}"):
-                asked = _asked(line, str(number))
+                asked = _asked(line, str(number), task)
                 if asked.id in found:
-                    raise InputError(f"id {asked.id!r} comes twice")
+                    raise InputError(f"id {asked.id[:40]!r} comes twice")
                 found[asked.id] = asked
     if not found:
         raise InputError(f"questions: {path} holds none")
     return tuple(found.values())
 
 
-def _asked(line: str, number: str) -> Asked:
+def _asked(line: str, number: str, task: Task) -> Asked:
     try:
         row = json.loads(line)
     except (ValueError, RecursionError) as error:
@@ -85,13 +90,17 @@ def _asked(line: str, number: str) -> Asked:
     )
     if not numbers:
         raise InputError(f"aabb: expected six numbers, got {str(corners)[:40]!r}")
+    try:
+        aabb = tuple(float(value) for value in corners)
+    except OverflowError as error:
+        raise InputError(f"aabb: expected six numbers, got {str(corners)[:40]!r}") from error
     return Asked(
         id=str(name),
         question=Question(
             text=text,
-            task=row.get("task", "answer"),
+            task=row.get("task", task),
             query=tuple(word.strip() for word in words),
-            aabb=tuple(float(value) for value in corners),
+            aabb=aabb,
         ),
     )
 

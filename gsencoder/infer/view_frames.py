@@ -14,7 +14,7 @@ RAYS = 12
 """Rays by which a frame is judged before any render."""
 AT_ONCE = 32
 """Frames that are judged by rays together."""
-HIDDEN = 0.02
+STOPPED = 0.02
 """What a frame counts in which all rays are stopped: rays may err."""
 FURTHER, LEAST_SHOWN = 4, 0.25
 """Half of the frames are spread over so many times as many, of those that show this share of what the best shows."""
@@ -55,7 +55,7 @@ def _ranked(
     def judge(views: Int64[np.ndarray, " n"]) -> None:
         for start in range(0, len(views), AT_ONCE):
             block = views[start : start + AT_ONCE]
-            shown[block] = filled[block] * (HIDDEN + (1 - HIDDEN) * _open(cameras, block, points, free))
+            shown[block] = filled[block] * (STOPPED + (1 - STOPPED) * _open(cameras, block, points, free))
 
     order = np.argsort(-filled, kind="stable")
     for start in range(0, len(order), AT_ONCE):

@@ -26,8 +26,8 @@ def picture_kinds(scene: Scene, views: ViewSet) -> tuple[PictureKind, ...]:
 
 def view_pictures(
     scene: Scene, views: ViewSet, marked: Sequence[Target] = (), *, config: BlendConfig = BlendConfig()
-) -> list[Picture]:
-    """What each chosen camera shows, by `picture_kinds`.
+) -> tuple[list[Picture], frozenset[int]]:
+    """What each chosen camera shows, by `picture_kinds`, and the numbers of the marks that any of the pictures carries.
 
     Args:
         scene: with Gaussians, and with photographs where frames are to be shown as these.
@@ -40,7 +40,8 @@ def view_pictures(
     """
     if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
-    pictures = []
+    pictures: list[Picture] = []
+    numbers: frozenset[int] = frozenset()
     for view, kind in enumerate(picture_kinds(scene, views)):
         photograph = _photograph(scene, views, view) if kind == "photograph" else None
         if photograph is not None and not marked:
@@ -48,8 +49,10 @@ def view_pictures(
             continue
         b = blend(scene.gaussians, views.cameras, view, config=config)
         picture = render_image(scene.gaussians, views.cameras, view, blended=b) if photograph is None else photograph
-        pictures.append(draw_marks(picture, b, marked))
-    return pictures
+        picture, drawn = draw_marks(picture, b, marked)
+        pictures.append(picture)
+        numbers |= drawn
+    return pictures, numbers
 
 
 def _photograph(scene: Scene, views: ViewSet, view: int) -> Picture:

@@ -2,12 +2,16 @@
 server, a cloud."""
 
 import os
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+import traceback
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
 from gsencoder.errors import InputError
+from gsencoder.infer.vlm_reply import Heard, Reply, ServerError, cause
 
 URL_VARIABLE, KEY_VARIABLE, MODEL_VARIABLE = "OPENAI_BASE_URL", "OPENAI_API_KEY", "GSENCODER_VLM_MODEL"
 LONGEST_TOLD = 300
@@ -31,11 +35,16 @@ class VlmConfig:
     )
     model: str = field(default="", metadata={"help": f"the model's name on the server; empty = {MODEL_VARIABLE}"})
     timeout: float = field(default=60.0, metadata={"help": "seconds that the server may be silent"})
-    longest: float = field(default=600.0, metadata={"help": "seconds that an answer may take in all"})
+    longest: float = field(default=600.0, metadata={"help": "seconds that an answer may take in all, retries included"})
     retries: int = field(default=2, metadata={"help": "times that a busy or failing server is asked again"})
     stream: bool = field(default=True, metadata={"help": "take the answer word by word"})
     max_tokens: int = field(default=512, metadata={"help": "tokens of the answer"})
-    temperature: float = field(default=0.0, metadata={"help": "0 = the likeliest answer"})
+    limit_by: Literal["max_tokens", "max_completion_tokens"] = field(
+        default="max_tokens", metadata={"help": "the name that the server has for max_tokens"}
+    )
+    temperature: float | None = field(
+        default=0.0, metadata={"help": "0 = the likeliest answer; empty = the server's, where it takes no other"}
+    )
     image_side: int = field(default=768, metadata={"help": "longer side of the pictures that are sent, pixels"})
     image_format: Literal["jpeg", "png"] = field(
         default="jpeg", metadata={"help": "of the pictures that are sent; png is exact and larger"}
@@ -49,31 +58,12 @@ class VlmConfig:
             raise InputError(f"retries: expected 0 to 100, got {self.retries}")
         if self.max_tokens < 1:
             raise InputError(f"max_tokens: expected 1 or more, got {self.max_tokens}")
-        if not 0 <= self.temperature <= 2:
+        if self.temperature is not None and not 0 <= self.temperature <= 2:
             raise InputError(f"temperature: expected 0 to 2, got {self.temperature}")
         if not 16 <= self.image_side <= 8192:
             raise InputError(f"image_side: expected 16 to 8192 pixels, got {self.image_side}")
-        if self.base_url and not self.base_url.startswith(("http://", "https://")):
-            raise InputError(f"base_url: expected http://… or https://…, got {self.base_url[:80]!r}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reply:
-    """What a model said.
-
-    Attributes:
-        text: the answer.
-        model: as the server names it.
-        finish: why it ended: "stop", "length" (max_tokens), …
-        tokens: of prompt and answer, where the server counts them.
-        seconds: from the request to the end of the answer.
-    """
-
-    text: str
-    model: str
-    finish: str
-    tokens: dict[str, int]
-    seconds: float
+        if self.base_url:
+            check_url(self.base_url, "base_url")
 
 
 def request_body(messages: Sequence[Message], config: VlmConfig, *, named: bool = True) -> dict[str, Any]:
@@ -90,13 +80,34 @@ def request_body(messages: Sequence[Message], config: VlmConfig, *, named: bool 
     model = config.model or os.environ.get(MODEL_VARIABLE, "")
     if named and not model:
         raise InputError(f"vlm.model: name the model that the server has, here or in {MODEL_VARIABLE}")
-    return {
-        "model": model,
-        "messages": list(messages),
-        "max_tokens": config.max_tokens,
-        "temperature": config.temperature,
-        "stream": config.stream,
-    }
+    body: dict[str, Any] = {"model": model, "messages": list(messages), config.limit_by: config.max_tokens}
+    if config.temperature is not None:
+        body["temperature"] = config.temperature
+    body["stream"] = config.stream
+    if config.stream:
+        # Without it some servers count no tokens.
+        body["stream_options"] = {"include_usage": True}
+    return body
+
+
+def check_url(url: str, name: str) -> None:
+    """Complains about what is no server's address, or holds what belongs in the key.
+
+    Raises:
+        InputError: which never repeats the address where it may hold a key.
+    """
+    try:
+        parts = urlsplit(url)
+        secret = parts.username is not None or parts.password is not None or bool(parts.query or parts.fragment)
+        good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        secret, good = "@" in url or "?" in url, False
+    if secret:
+        raise InputError(
+            f"{name}: holds a name, a password, or what follows a ?; keys belong in vlm.key or {KEY_VARIABLE}"
+        )
+    if not good or not url.isprintable() or " " in url:
+        raise InputError(f"{name}: expected http://… or https://…, got {url[:80]!r}")
 
 
 class VlmServer:
@@ -111,7 +122,7 @@ class VlmServer:
         config: see there; what it leaves empty comes from the environment.
 
         Raises:
-            InputError: no address, or the openai package is missing.
+            InputError: no address or a wrong one, a key that cannot be sent, or the openai package is missing.
         """
         try:
             import openai
@@ -125,12 +136,20 @@ class VlmServer:
                 f"vlm.base_url: say where the model's server is (http://localhost:8000/v1), here or in {URL_VARIABLE}; "
                 "dry_run=true writes the prompt and the pictures without one"
             )
+        check_url(self.url, "base_url" if config.base_url else URL_VARIABLE)
         self._config = config
-        self._key = config.key or os.environ.get(KEY_VARIABLE, "")
-        # Servers at home take any key, but the client must have one.
-        self._client = openai.OpenAI(
-            base_url=self.url, api_key=self._key or "none", timeout=config.timeout, max_retries=config.retries
-        )
+        # A key that was read from a file ends with a line break.
+        self._key = (config.key or os.environ.get(KEY_VARIABLE, "")).strip()
+        if not (self._key.isascii() and self._key.isprintable()):
+            raise InputError(f"vlm.key (or {KEY_VARIABLE}): holds characters that no key has")
+        try:
+            # Servers at home take any key, but the client must have one.
+            self._client = openai.OpenAI(
+                base_url=self.url, api_key=self._key or "none", timeout=config.timeout, max_retries=config.retries
+            )
+        except Exception as error:  # settings of proxies and certificates raise whatever they like
+            told = self._clean(cause(error))
+            raise InputError(f"vlm: no connection can be set up ({told}){_proxies()}") from self._shown(error)
 
     def ask(self, body: Mapping[str, Any]) -> Reply:
         """One answer.
@@ -139,66 +158,81 @@ class VlmServer:
             body: of `request_body`.
 
         Raises:
-            InputError: whatever keeps the server from a whole answer, in its own words where it has any.
+            ServerError: the server cannot be reached, fails, or breaks off.
+            InputError: it refuses this question, or gives no whole answer to it; in its own words where it has any.
         """
+        begun = time.monotonic()
+        heard, failed = Heard(), list[BaseException]()
+
+        def listen() -> None:
+            try:
+                self._listen(body, heard)
+            except BaseException as error:
+                failed.append(error)
+
+        # A connection that stays alive without a word is told from an answer by the clock alone, and from outside.
+        listener = threading.Thread(target=listen, daemon=True)
+        listener.start()
+        listener.join(self._config.longest)
+        if listener.is_alive():
+            raise self._fault(f"the answer took more than {self._config.longest:g} s (vlm.longest)", ServerError)
+        if failed:
+            raise self._failure(failed[0], heard) from self._shown(failed[0])
+        if not heard.parts:
+            raise self._fault("sent nothing that is a chat completion; such addresses mostly end in /v1", ServerError)
+        if not heard.finish:
+            raise self._fault(f"the answer was cut off after {len(heard.text)} characters", ServerError)
+        wrong = heard.wrong()
+        if wrong:
+            raise self._fault(wrong, InputError)
+        return Reply(
+            text=self._clean(heard.text, longest=None),
+            model=heard.model or str(body["model"]),
+            finish=heard.finish,
+            tokens=heard.tokens or {},
+            seconds=time.monotonic() - begun,
+        )
+
+    def _listen(self, body: Mapping[str, Any], heard: Heard) -> None:
+        found = self._client.chat.completions.create(**body)
+        if not body["stream"]:
+            heard.hear(found)
+            return
+        with found as stream:
+            for chunk in stream:
+                heard.hear(chunk)
+
+    def _failure(self, error: BaseException, heard: Heard) -> InputError:
+        """What went wrong, for people."""
         import openai
 
-        begun = time.monotonic()
-        text, model, finish, tokens = "", str(body["model"]), "", dict[str, int]()
-        try:
-            for part in self._streamed(body, begun) if body["stream"] else self._at_once(body):
-                text += part.text
-                model, finish, tokens = part.model or model, part.finish or finish, part.tokens or tokens
-        except InputError:
-            raise
-        except openai.APITimeoutError as error:
-            raise self._refusal(f"was silent for {self._config.timeout:g} s (vlm.timeout)") from error
-        except openai.APIConnectionError as error:
-            if text:
-                raise self._refusal(f"the answer broke off after {len(text)} characters: {_cause(error)}") from error
-            raise self._refusal(
-                f"no server answers there ({_cause(error)}); start one, or correct vlm.base_url; "
-                "dry_run=true writes the prompt and the pictures without one"
-            ) from error
-        except openai.APIStatusError as error:
-            raise self._refusal(self._status(error)) from error
-        except Exception as error:  # transport and parsing raise classes of the client's own dependencies
-            after = f" after {len(text)} characters" if text else ""
-            raise self._refusal(f"the answer broke off{after}, or is no chat completion: {_cause(error)}") from error
-        if not finish:
-            raise self._refusal(f"the answer was cut off after {len(text)} characters")
-        if not text.strip():
-            raise self._refusal(f"the answer is empty (it ended with {finish!r})")
-        return Reply(text=text, model=model, finish=finish, tokens=tokens, seconds=time.monotonic() - begun)
+        if isinstance(error, openai.APITimeoutError):
+            times = f", {self._config.retries + 1} times" if self._config.retries and not heard.parts else ""
+            return self._fault(f"was silent for {self._config.timeout:g} s{times} (vlm.timeout)", ServerError)
+        told = cause(error)
+        if isinstance(error, openai.APIStatusError):
+            return self._status(error.status_code, told)
+        after = f" after {len(heard.text)} characters" if heard.text else ""
+        if isinstance(error, openai.APIConnectionError) and not heard.parts:
+            return self._fault(
+                f"no server answers there ({told}){_proxies()}; start one, or correct vlm.base_url; "
+                "dry_run=true writes the prompt and the pictures without one",
+                ServerError,
+            )
+        if isinstance(error, openai.APIConnectionError):
+            return self._fault(f"the answer broke off{after}: {told}", ServerError)
+        return self._fault(f"the answer broke off{after}, or is no chat completion: {told}", ServerError)
 
-    def _at_once(self, body: Mapping[str, Any]) -> Iterator["_Part"]:
-        found = self._client.chat.completions.create(**body)
-        if not getattr(found, "choices", None):
-            raise ValueError(f"no choices in {str(found)[:LONGEST_TOLD]!r}")
-        choice = found.choices[0]
-        text = choice.message.content or ""
-        yield _Part(text, found.model or "", choice.finish_reason or "", _tokens(found.usage))
-
-    def _streamed(self, body: Mapping[str, Any], begun: float) -> Iterator["_Part"]:
-        with self._client.chat.completions.create(**body) as stream:
-            for chunk in stream:
-                if time.monotonic() - begun > self._config.longest:
-                    raise self._refusal(f"the answer took more than {self._config.longest:g} s (vlm.longest)")
-                tokens = _tokens(getattr(chunk, "usage", None))
-                # The last chunk of some servers counts tokens and has no choice.
-                choice = chunk.choices[0] if chunk.choices else None
-                text = choice.delta.content or "" if choice is not None and choice.delta is not None else ""
-                yield _Part(text, chunk.model or "", (choice.finish_reason or "") if choice is not None else "", tokens)
-
-    def _status(self, error: Any) -> str:
-        told = _cause(error)
-        if error.status_code in (401, 403):
-            return f"refuses the key ({error.status_code}: {told}); give vlm.key= or {KEY_VARIABLE}"
-        if error.status_code == 404:
-            return f"has no model of that name, or no chat at this address ({told}){self._models()}"
-        if error.status_code == 429 or error.status_code >= 500:
-            return f"failed {self._config.retries + 1} times ({error.status_code}: {told})"
-        return f"refuses the request ({error.status_code}: {told})"
+    def _status(self, code: int, told: str) -> InputError:
+        if code in (401, 403):
+            return self._fault(f"refuses the key ({code}: {told}); give vlm.key= or {KEY_VARIABLE}", ServerError)
+        if code == 404:
+            return self._fault(
+                f"has no model of that name, or no chat at this address ({told}){self._models()}", ServerError
+            )
+        if code == 429 or code >= 500:
+            return self._fault(f"failed {self._config.retries + 1} times ({code}: {told})", ServerError)
+        return self._fault(f"refuses the request ({code}: {told})", InputError)
 
     def _models(self) -> str:
         """The names that the server has, where it tells."""
@@ -208,33 +242,21 @@ class VlmServer:
             return ""
         return f"; it has {', '.join(names[:8])}" if names else ""
 
-    def _refusal(self, told: str) -> InputError:
-        message = f"the server at {self.url}: {told}"
-        # A server may repeat what it was sent.
-        return InputError(message.replace(self._key, "(key)") if len(self._key) >= LEAST_KEY else message)
+    def _fault(self, told: str, kind: type[InputError]) -> InputError:
+        return kind(f"the server at {self.url}: {self._clean(told)}")
+
+    def _clean(self, text: str, longest: int | None = LONGEST_TOLD) -> str:
+        """What a server says, without the key, which it may repeat."""
+        clean = text.replace(self._key, "(key)") if len(self._key) >= LEAST_KEY else text
+        return clean[:longest]
+
+    def _shown(self, error: BaseException) -> BaseException | None:
+        """An error as the cause of ours, unless a traceback of it could show the key."""
+        return None if self._key and self._key in "".join(traceback.format_exception(error)) else error
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    text: str
-    model: str
-    finish: str
-    tokens: dict[str, int]
-
-
-def _tokens(usage: Any) -> dict[str, int]:
-    names = {"prompt": "prompt_tokens", "answer": "completion_tokens"}
-    return {} if usage is None else {name: int(getattr(usage, key, 0) or 0) for name, key in names.items()}
-
-
-def _cause(error: BaseException) -> str:
-    """What went wrong at the bottom, in a line."""
-    told = getattr(error, "body", None)
-    for name in ("error", "message", "detail"):
-        told = told.get(name, told) if isinstance(told, dict) else told
-    if told:
-        return " ".join(str(told).split())[:LONGEST_TOLD]
-    deepest = error
-    while deepest.__cause__ is not None or deepest.__context__ is not None:
-        deepest = deepest.__cause__ or deepest.__context__  # type: ignore[assignment]
-    return (" ".join(str(deepest).split()) or type(deepest).__name__)[:LONGEST_TOLD]
+def _proxies() -> str:
+    """Which variables lead elsewhere."""
+    names = ("all_proxy", "http_proxy", "https_proxy")
+    found = [name for each in names for name in (each, each.upper()) if os.environ.get(name)]
+    return f"; {' and '.join(found)} lead through a proxy (NO_PROXY names exceptions)" if found else ""

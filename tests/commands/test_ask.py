@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -22,11 +23,11 @@ from PIL import Image
 from tiny_vlm import save_tiny_vlm
 
 from gsencoder import cli
-from gsencoder.commands.ask import printable
 from gsencoder.data.text_table import make_text_table
 from gsencoder.errors import InputError
-from gsencoder.infer.ask import words_in
+from gsencoder.infer.question_words import words_in
 from gsencoder.infer.questions import read_answers, read_questions
+from gsencoder.progress import printable
 
 pytest.importorskip("openai")
 
@@ -109,7 +110,7 @@ def test_grounding_gives_the_box_of_the_mark_that_is_named(features: Path, tmp_p
     assert row["mark"] is None
     assert row["box"] is None
     (warning,) = json.loads((out / "summary.json").read_text())["warnings"]
-    assert "names none of the 2 marks" in warning
+    assert "does not name one of the 2 marks" in warning
 
 
 def test_a_caption_is_of_one_box_that_words_or_corners_give(features: Path, tmp_path: Path) -> None:
@@ -119,22 +120,62 @@ def test_a_caption_is_of_one_box_that_words_or_corners_give(features: Path, tmp_
         low, high = (ORIGIN + np.array(corner) for corner in ((0.1, 0.0, 0.6), (0.5, 0.4, 1.0)))
         corners = ",".join(map(str, (*low, *high)))
         assert ask(features, tmp_path / "corners", "task=caption", f"aabb=[{corners}]", url) == 0
-    assert json.loads((tmp_path / "words" / "answer.json").read_text())["targets"] == ["crate"]
-    assert json.loads((tmp_path / "corners" / "answer.json").read_text())["targets"] == ["thing in the box"]
+    (found,) = json.loads((tmp_path / "words" / "answer.json").read_text())["targets"]
+    assert (found["query"], found["rank"]) == ("crate", 0)
+    (given,) = json.loads((tmp_path / "corners" / "answer.json").read_text())["targets"]
+    np.testing.assert_allclose([*given["aabb_min"], *given["aabb_max"]], [*low, *high])
+    prompt = (tmp_path / "words" / "prompt.txt").read_text()
+    assert "The thing is the crate.\nIt carries the mark 1" in prompt
+    assert "The thing is" not in (tmp_path / "corners" / "prompt.txt").read_text()
+    assert "It carries the mark 1" in (tmp_path / "corners" / "prompt.txt").read_text()
 
 
 def test_a_question_that_names_nothing_is_shown_even_frames_and_says_so(features: Path, tmp_path: Path) -> None:
     assert ask(features, tmp_path / "dry", "question=How large is this place?", "dry_run=true") == 0
     summary = json.loads((tmp_path / "dry" / "summary.json").read_text())
-    assert any("evenly spread frames are shown" in line for line in summary["warnings"])
+    assert any("evenly spread views are shown" in line for line in summary["warnings"])
     assert [view["frame"] for view in summary["results"]["views"]] == [0, 11]
 
 
 def test_words_of_a_question_are_found_with_the_longest_name_first() -> None:
     table = make_text_table(["pen", "pen holder", "mug", "box"], np.eye(4, dtype=np.float32), "t")
-    assert words_in("Is the mug's pen-holder near BOXES, or a pen?", table) == ("pen holder", "box", "pen")
+    assert words_in("Is the mug's pen-holder near BOXES, or a pen?", table) == ("mug", "pen holder", "box", "pen")
     assert words_in("What is the mug on?", table) == ("mug",)
+    assert words_in("A mug-like pen, holder of ink", table) == ("mug", "pen")
     assert words_in("", table) == ()
+    assert words_in("How far?", table) == ()
+
+
+def test_words_that_only_look_like_names_are_not_looked_for() -> None:
+    names = [
+        "can",
+        "chair",
+        "orange",
+        "watch",
+        "table",
+        "lamp",
+        "table lamp",
+        "caf\u00e9",
+        "\u0915\u0941\u0930\u094d\u0938\u0940",
+        "big red dining room table",
+    ]
+    table = make_text_table(names, np.eye(len(names), dtype=np.float32), "t")
+    for text, words in (
+        ("Can you tell me how many chairs there are?", ("chair",)),
+        ("Is there a can on the chair?", ("can", "chair")),
+        ("Which one can I watch from?", ()),
+        ("Whose watch is it?", ("watch",)),
+        ("Is there a table, lamp or chair?", ("table", "lamp", "chair")),
+        ("Where is the table lamp?", ("table lamp",)),
+        ("What is on the orange chair?", ("chair",)),
+        ("Is there an orange on the chair?", ("orange", "chair")),
+        ("Is it orange? Chair or table?", ("orange", "chair", "table")),
+        ("the big red dining room table", ("big red dining room table",)),
+        ("a chair\u2019s leg", ("chair",)),
+        ("the cafe\u0301", ("caf\u00e9",)),
+        ("\u0915\u0941\u0930\u094d\u0938\u0940 ?", ("\u0915\u0941\u0930\u094d\u0938\u0940",)),
+    ):
+        assert words_in(text, table) == words, text
 
 
 @pytest.mark.parametrize(
@@ -150,7 +191,7 @@ def test_words_of_a_question_are_found_with_the_longest_name_first() -> None:
         (("question=x", "aabb=[0,0,0,1,1,1]", "dry_run=true"), "no Gaussian of scene room is in the box"),
         (("question=x", "aabb=[0,0,0,1,1,1]", "query=cube", "dry_run=true"), "give one of them"),
         (("question=x", "questions=q.jsonl", "dry_run=true"), "the file says what is asked"),
-        (("question=the cube", "task=ground", "ask.marks=false", "dry_run=true"), "needs the marks"),
+        (("question=the cube", "task=ground", "ask.marks=false", "dry_run=true"), "needs marks"),
     ],
 )
 def test_what_cannot_be_asked_ends_in_one_line(
@@ -211,6 +252,106 @@ def test_a_batch_that_a_fault_ends_keeps_its_answers_and_goes_on(
     assert not (tmp_path / "answers.answers").exists()
 
 
+def crate_refused(handler: Handler, body: Any) -> None:
+    text = body["messages"][0]["content"][-1]["text"]
+    if "crate" in text:
+        handler.reply(400, {"error": {"message": "no crates"}})
+    else:
+        answer("about " + text.rpartition("Question: ")[2])(handler, body)
+
+
+def test_a_question_that_is_refused_keeps_no_other_from_its_answer(
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cube, crate, wall = ({"id": name, "question": f"Where is the {name}?"} for name in ("cube", "crate", "wall"))
+    lost = {"id": "lost", "task": "ground", "question": "the far one"}
+    file, out = tmp_path / "q.jsonl", tmp_path / "out"
+    with serving(crate_refused) as server:
+        words = (f"questions={file}", f"vlm.base_url={server.url}")
+        batch(file, cube, crate, lost, wall)
+        assert ask(features, out, *words) == 2
+        told = capsys.readouterr().err
+        assert "2 of 4 questions have no answer: question crate: the server" in told
+        assert "no crates" in told
+        assert len(server.requests) == 3
+        # The file is mended and its lines change places: nothing is asked twice, nothing takes another's folder.
+        server.behave = answer("now it is fine")
+        batch(file, wall, crate, cube)
+        assert ask(features, out, *words) == 0
+        assert len(server.requests) == 4
+    rows = [json.loads(line) for line in (out / "answers.jsonl").read_text().splitlines()]
+    assert [row["id"] for row in rows] == ["wall", "crate", "cube"]
+    assert [row["answer"] for row in rows] == ["about Where is the wall?", "now it is fine", "about Where is the cube?"]
+    assert [row["folder"] for row in rows] == ["00001", "00002", "00003"]
+    for row in rows:
+        assert f"the {row['id']}?" in (out / row["folder"] / "prompt.txt").read_text()
+        kept = json.loads((out / row["folder"] / "answer.json").read_text())
+        assert kept["answer"] == row["answer"]
+
+
+def test_an_answer_that_was_begun_with_other_settings_leaves_nothing_behind(features: Path, tmp_path: Path) -> None:
+    file, out = (
+        batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "the crate"}),
+        tmp_path / "o",
+    )
+    with serving(crate_refused) as server:
+        words = (f"questions={file}", f"vlm.base_url={server.url}")
+        assert ask(features, out, *words, "choose.count=4") == 2
+    assert ask(features, out, *words, "dry_run=true") == 0
+    for folder in ("00001", "00002"):
+        names = {path.name for path in (out / folder).iterdir()}
+        assert names == {"prompt.txt", "request.json", "sheet.png", "view_00.png", "view_01.png"}
+
+
+def test_features_that_were_replaced_are_asked_anew(features: Path, tmp_path: Path) -> None:
+    file = batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "Where is the crate?"})
+    place = tmp_path / "features"
+    save_room(place)
+    with serving(crate_refused) as server:
+        words = (f"questions={file}", f"vlm.base_url={server.url}")
+        assert ask(place, tmp_path / "out", *words) == 2
+        server.behave = answer("x")
+        shutil.rmtree(place)
+        save_room(place, shift=(0.4, 0, 0))
+        assert ask(place, tmp_path / "out", *words) == 0
+        assert len(server.requests) == 4
+        # The same room in another place is the same scene.
+        assert ask(place, tmp_path / "out", *words, "overwrite=true") == 0
+
+
+def test_warnings_of_a_batch_name_the_question(
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = batch(tmp_path / "q.jsonl", {"id": "a", "question": "How large?"}, {"id": "b", "question": "How high?"})
+    assert ask(features, tmp_path / "out", f"questions={file}", "dry_run=true") == 0
+    told = capsys.readouterr().err
+    for name in ("a", "b"):
+        assert f"warning: question {name}: the question names nothing to look for" in told
+    rows = [json.loads(line) for line in (tmp_path / "out" / "answers.jsonl").read_text().splitlines()]
+    assert all("names nothing to look for" in row["warnings"][0] for row in rows)
+
+
+def test_lines_take_the_task_of_the_command_unless_they_name_one(tmp_path: Path) -> None:
+    file = batch(tmp_path / "q.jsonl", {"question": "a"}, {"question": "b", "task": "answer"})
+    assert [each.question.task for each in read_questions(file, "ground")] == ["ground", "answer"]
+    (tmp_path / "q.jsonl").write_text('{"question": "a\u2028b\u0085c"}\r\n')
+    assert read_questions(file)[0].question.text == "a\u2028b\u0085c"
+
+
+def test_words_for_one_thing_give_it_one_mark(features: Path, tmp_path: Path) -> None:
+    words = ("question=the left one", "task=ground", "query=crate,crates,cube,crate", "dry_run=true")
+    assert ask(features, tmp_path / "dry", *words) == 0
+    assert "Marks: 1 = crate; 2 = crate; 3 = cube." in (tmp_path / "dry" / "prompt.txt").read_text()
+
+
+def test_several_things_are_numbered_only_where_that_is_asked_for(features: Path, tmp_path: Path) -> None:
+    words = ("question=How many are there?", "query=crate", "dry_run=true")
+    assert ask(features, tmp_path / "plain", *words) == 0
+    assert "mark" not in (tmp_path / "plain" / "prompt.txt").read_text().lower()
+    assert ask(features, tmp_path / "marked", *words, "ask.marks=true") == 0
+    assert "1 = crate; 2 = crate." in (tmp_path / "marked" / "prompt.txt").read_text()
+
+
 def test_other_settings_ask_anew(features: Path, tmp_path: Path) -> None:
     file = batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "Where is the crate?"})
 
@@ -242,6 +383,9 @@ def test_other_settings_ask_anew(features: Path, tmp_path: Path) -> None:
         (b'{"question": "a", "query": [""]}\n', "line 1: query: expected a word"),
         (b'{"question": "a", "task": "sing"}\n', "line 1: task: expected one of answer, ground, caption"),
         (b'{"question": "a", "aabb": [true]}\n', "line 1: aabb: expected six numbers"),
+        (b'{"question": "a", "aabb": [0, 0, 0, 1, 1, 1' + b"0" * 400 + b"]}\n", "line 1: aabb: expected six numbers"),
+        (b'{"id": "z"}\n', "line 1: question= is missing"),
+        (b'{"question": "a \\ud800"}\n', "line 1: question: holds what is no character"),
         (b'{"question": "a", "aabb": [1, 2]}\n', "line 1: aabb: expected six numbers"),
         (b'{"question": "a", "id": null}\n', "line 1: id: expected text"),
         (b"\xff\xfe\n", "cannot be read as text"),
@@ -259,6 +403,8 @@ def test_files_of_questions_that_are_wrong_say_where(
 
 
 def test_what_a_server_says_cannot_steer_a_terminal() -> None:
+    assert printable("10\u202fm, 👨\u200d👩, a\tb\u00a0c") == "10\u202fm, 👨\u200d👩, a\tb\u00a0c"
+    assert printable("a\u202eb") == "a\N{REPLACEMENT CHARACTER}b"
     assert printable("a\x1b[31mb\nc\x07") == "a\N{REPLACEMENT CHARACTER}[31mb\nc\N{REPLACEMENT CHARACTER}"
 
 

@@ -84,7 +84,10 @@ def status(code: int, message: str) -> Callable[[Handler, Any], None]:
         (status(401, "bad key"), "refuses the key .401: bad key.; give vlm.key= or OPENAI_API_KEY"),
         (status(404, "no model x"), "has no model of that name, .*no model x.; it has tiny"),
         (lambda handler, _: handler.reply(422, {"detail": "pinned"}), "refuses the request .422: pinned"),
-        (lambda handler, _: handler.raw(200, b"", "application/json"), "broke off, or is no chat|cut off"),
+        (
+            lambda handler, _: handler.raw(200, b"", "application/json"),
+            "sent nothing that is a chat|is no chat completion",
+        ),
         (silent(3.0), "was silent for 0.5 s .vlm.timeout"),
     ],
 )
@@ -118,7 +121,7 @@ def test_answers_that_are_none_are_errors(value: Any) -> None:
         (events("a red ", "mu", finish=None), "cut off after 8 characters"),
         (events(finish="stop"), "the answer is empty .it ended with 'stop'"),
         (b"data: {not json}\n\n", "broke off, or is no chat completion"),
-        (b"<html>hello</html>", "cut off after 0 characters"),
+        (b"<html>hello</html>", "sent nothing that is a chat"),
         (events("fine") + b'data: {"error": {"message": "GPU fell over"}}\n\n', "GPU fell over|^$"),
     ],
 )
@@ -232,19 +235,19 @@ def test_pictures_are_sent_no_larger_than_asked(kind: Any, shape: tuple[int, int
 
 
 def test_prompts_hold_the_question_and_the_names_of_the_marks() -> None:
-    text = prompt_text("answer", " What's red? ", ["mug", "mug 2"], marked=True, kinds=RENDERS)
+    text = prompt_text("answer", " What's red? ", ["mug", "mug"], marks=(1, 2), kinds=RENDERS)
     assert "Question: What's red?" in text
     assert "1 = mug; 2 = mug." in text
-    assert "1 = " not in prompt_text("answer", "x", ["mug"], marked=False, kinds=RENDERS)
-    assert "Meant is: the left one" in prompt_text("ground", "the left one", ["mug"], marked=True, kinds=RENDERS)
-    caption = prompt_text("caption", "", ["mug 3"], marked=True, kinds=RENDERS)
+    assert "1 = " not in prompt_text("answer", "x", ["mug"], marks=(), kinds=RENDERS)
+    assert "Meant is: the left one" in prompt_text("ground", "the left one", ["mug"], marks=(1,), kinds=RENDERS)
+    caption = prompt_text("caption", "", ["mug"], marks=(1,), kinds=RENDERS)
     assert "The thing is the mug." in caption
     assert "mark 1" in caption
 
 
 def test_prompts_say_what_the_pictures_are() -> None:
     told = {
-        kinds: prompt_text("answer", "x", [], marked=False, kinds=kinds).splitlines()[0]
+        kinds: prompt_text("answer", "x", [], marks=(), kinds=kinds).splitlines()[0]
         for kinds in (("render",) * 2, ("photograph",) * 2, ("render", "photograph"))
     }
     assert "They are rendered" in told[("render",) * 2]
@@ -260,14 +263,14 @@ def test_prompts_say_what_the_pictures_are() -> None:
         ("ground", "", ["a"], True, "question= is missing"),
         ("ground", "x", [], True, "nothing was found"),
         ("caption", "", [], True, "nothing was found"),
-        ("ground", "x", ["a"], False, "needs the marks"),
+        ("ground", "x", ["a"], False, "needs marks"),
     ],
 )
 def test_prompts_without_what_they_need_are_refused(
     task: Any, question: str, names: list[str], marked: bool, told: str
 ) -> None:
     with pytest.raises(InputError, match=told):
-        prompt_text(task, question, names, marked=marked, kinds=RENDERS)
+        prompt_text(task, question, names, marks=(1,) if marked else (), kinds=RENDERS)
 
 
 @pytest.mark.parametrize(
@@ -275,15 +278,36 @@ def test_prompts_without_what_they_need_are_refused(
     [
         ("2", 2),
         ("Mark 3.", 3),
+        ("**Mark #3**", 3),
+        ("No.2", 2),
         ("It is number 1, not 2", 1),
+        ("In view 1, mark 2", 2),
+        ("There are 3 chairs; it is mark 2.", 2),
+        ("There are 2 crates; the far one is mark 1.", 1),
+        ("5 marks are shown; 2", 2),
+        ("<think>\nMark 1 is near, but the far one is 2.\n</think>\n\n2", 2),
+        ("thinking of 1</think>3", 3),
         ("0", 0),
+        ("none", 0),
+        ("None of the marks 1 or 2 is meant.", 0),
+        ("zero", 0),
+        ("Two.", 2),
+        ("the one by the window", None),
+        ("not 1 but 2", None),
+        ("1 or 2", None),
+        ("mark 1 or mark 2", None),
         ("4", None),
-        ("none", None),
+        ("four", None),
         ("1.5", None),
+        ("1/3", None),
+        ("1-2", None),
+        ("-1", None),
+        ("1,000", None),
         ("", None),
         ("the 12th", None),
         ("02", 2),
+        ("9" * 5000, None),
     ],
 )
-def test_the_first_number_of_an_answer_is_the_mark_that_it_means(text: str, number: int | None) -> None:
+def test_the_mark_that_an_answer_names_is_found_or_nothing_is_guessed(text: str, number: int | None) -> None:
     assert number_in(text, 3) == number
