@@ -24,6 +24,8 @@ from gsencoder.options import Option, is_list_of_words, join_list, near, options
 
 T = TypeVar("T")
 
+SHOWN = 6
+"""Longer values of options that there are not are not repeated."""
 SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
 """Under -m, and only there, a text option is swept where its value has this form."""
 
@@ -144,7 +146,11 @@ def read_words(
         elif full is None:
             raise InputError(_unknown(word, key, choices))
         elif full in given:
-            raise InputError(f"{full}: given twice, as {given[full]!r} and {value!r}; give it once")
+            secret = full in choices.options and choices.options[full].secret
+            told = "" if secret else f", as {given[full]!r} and {value!r}"
+            raise InputError(f"{full}: given twice{told}; give it once")
+        elif sweep and full in choices.options and choices.options[full].secret:
+            raise InputError(f"{full}: is not taken with -m, which writes down what it was given")
         else:
             given[full] = value
     if paths and "paths" not in choices.options:
@@ -164,7 +170,9 @@ def _unknown(word: str, key: str, choices: Choices) -> str:
         return f"{word}: is neither an option (KEY=VALUE) nor an existing file"
     if key.startswith("hydra"):
         return f"{key}: settings of Hydra itself are taken only with -m"
-    return f"{key}: no such option, and no file is named {word!r}{near(key, known)}"
+    # What follows may be a key whose option is misspelt.
+    shown = word if len(word) - len(key) <= SHOWN else f"{key}=…"
+    return f"{key}: no such option, and no file is named {shown!r}{near(key, known)}"
 
 
 def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:

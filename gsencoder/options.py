@@ -24,6 +24,7 @@ class Option:
         required: whether the command can run without it.
         member: the member of a choice that it belongs to, such as "teacher=onnx"; empty where it always applies.
         kind: "text" and "list" (of text) take the user's characters as they are; "value" is parsed.
+        secret: its value is never shown or written.
     """
 
     key: str
@@ -34,6 +35,7 @@ class Option:
     required: bool
     member: str
     kind: Kind
+    secret: bool = False
 
 
 def near(word: str, known: Iterable[str]) -> str:
@@ -183,6 +185,7 @@ def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
                     required=item.metadata.get("required", False),
                     member=member,
                     kind=kind_of(annotation),
+                    secret=item.metadata.get("secret", False),
                 )
             )
     return found

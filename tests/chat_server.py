@@ -65,9 +65,12 @@ def answer(text: str) -> Callable[[Handler, Any], None]:
 
     def behave(handler: Handler, body: Any) -> None:
         if body["stream"]:
-            handler.raw(
-                200, events(*(text[start : start + 3] for start in range(0, len(text), 3))), "text/event-stream"
-            )
+            data = events(*(text[start : start + 3] for start in range(0, len(text), 3)), done=False)
+            if body.get("stream_options", {}).get("include_usage"):
+                usage = completion("")["usage"]
+                chunk = {"id": "1", "object": "chat.completion.chunk", "created": 0, "model": "tiny", "choices": []}
+                data += f"data: {json.dumps(chunk | {'usage': usage})}\n\n".encode()
+            handler.raw(200, data + b"data: [DONE]\n\n", "text/event-stream")
         else:
             handler.reply(200, completion(text))
 

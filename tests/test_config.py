@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from gsencoder import cli
 from gsencoder.commands import COMMANDS
 from gsencoder.compose import choices_of, compose, conf_folder
 from gsencoder.config import HIDDEN, CommonConfig, check_required, settings, typed
@@ -393,3 +394,18 @@ class _WithSecret:
 def test_secrets_are_never_shown() -> None:
     assert settings(_WithSecret(key="s", name="n")) == {"key": HIDDEN, "name": "n"}
     assert settings(_WithSecret()) == {"key": "", "name": ""}
+
+
+def test_secrets_are_repeated_by_no_error_and_taken_by_no_sweep(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words, told in (
+        (["vlm.key=sk-first1", "vlm.key=sk-second2"], "vlm.key: given twice; give it once"),
+        (["vlm.kee=sk-first1"], "vlm.kee: no such option"),
+        (["api_key=sk-first1"], "api_key: no such option"),
+        (["-m", "vlm.key=choice(sk-first1,sk-second2)", "out=o"], "vlm.key: is not taken with -m"),
+    ):
+        assert cli.main(["ask", str(tmp_path), *words]) == 2
+        error = capsys.readouterr().err
+        assert told in error
+        assert "sk-" not in error

@@ -21,7 +21,7 @@ from gsencoder.errors import InputError, SceneWarning, about
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.infer.ask import AskConfig, Asker, Prompt, Question, meant, prompt_messages
 from gsencoder.infer.localize import LocalizeConfig, box_to_json
-from gsencoder.infer.prompts import Task
+from gsencoder.infer.prompts import Task, check_question
 from gsencoder.infer.questions import Asked, read_answers, read_questions
 from gsencoder.infer.view_set import ViewsConfig
 from gsencoder.infer.vlm import MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
@@ -89,6 +89,8 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
     server = None if config.dry_run else VlmServer(config.vlm)
     request_body([], config.vlm, named=server is not None)
     many = read_questions(Path(config.questions), config.task) if config.questions else ()
+    if not many:
+        check_question(config.task, config.question)
     with summary.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
         table = words_of(folder, config.words) if config.words or (folder / WORDS_FILE).is_file() else None

@@ -12,7 +12,7 @@ from gsencoder.data.text_table import TextTable
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.pictures import Picture
-from gsencoder.infer.prompts import Task, check_question, messages, number_in, prompt_text
+from gsencoder.infer.prompts import Task, messages, number_in, prompt_text
 from gsencoder.infer.question_words import words_in
 from gsencoder.infer.view_pictures import picture_kinds, view_pictures
 from gsencoder.infer.view_set import ViewsConfig, ViewSet
@@ -50,7 +50,6 @@ class Question:
             raise InputError(f"aabb: the lower corner is not below the upper one: {list(self.aabb)}")
         if self.aabb and self.query:
             raise InputError("aabb and query: give one of them")
-        check_question(self.task, self.text)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

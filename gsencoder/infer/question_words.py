@@ -39,11 +39,7 @@ def words_in(text: str, table: TextTable) -> tuple[str, ...]:
         start += length
     begins = {begin for begin, _, _ in found}
     # A colour belongs to the name after it.
-    kept = [
-        name
-        for _, end, name in found
-        if not (name.lower() in COLORS and end in begins and tokens[end].joined)
-    ]
+    kept = [name for _, end, name in found if not (name.lower() in COLORS and end in begins and tokens[end].joined)]
     return tuple(dict.fromkeys(kept))
 
 

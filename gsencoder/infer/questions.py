@@ -9,7 +9,7 @@ from typing import Any
 
 from gsencoder.errors import InputError, about
 from gsencoder.infer.ask import Question
-from gsencoder.infer.prompts import Task
+from gsencoder.infer.prompts import Task, check_question
 
 LARGEST_FILE = 1 << 26
 """Bytes of a file of questions."""
@@ -90,6 +90,7 @@ def _asked(line: str, number: str, task: Task) -> Asked:
     )
     if not numbers:
         raise InputError(f"aabb: expected six numbers, got {str(corners)[:40]!r}")
+    check_question(row.get("task", task), text)
     try:
         aabb = tuple(float(value) for value in corners)
     except OverflowError as error:

@@ -259,4 +259,8 @@ def _proxies() -> str:
     """Which variables lead elsewhere."""
     names = ("all_proxy", "http_proxy", "https_proxy")
     found = [name for each in names for name in (each, each.upper()) if os.environ.get(name)]
-    return f"; {' and '.join(found)} lead through a proxy (NO_PROXY names exceptions)" if found else ""
+    return (
+        f"; {' and '.join(found)} {'lead' if len(found) > 1 else 'leads'} through a proxy (NO_PROXY names exceptions)"
+        if found
+        else ""
+    )

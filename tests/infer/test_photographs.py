@@ -75,7 +75,8 @@ def test_frames_are_shown_as_photographs_and_placed_cameras_as_renders(tmp_path:
     views = choose_views(scene, [target], ViewsConfig(candidates=16, count=16, width=64, height=48))
     kinds = picture_kinds(scene, views)
     assert set(kinds) == {"photograph", "render"}
-    plain, marked = view_pictures(scene, views), view_pictures(scene, views, [target])
+    (plain, none), (marked, one) = view_pictures(scene, views), view_pictures(scene, views, [target])
+    assert (none, one) == (frozenset(), frozenset({1}))
     for number, (each, kind) in enumerate(zip(views.chosen, kinds, strict=True)):
         assert (kind == "photograph") == (each.frame is not None)
         if each.frame is not None:

@@ -395,7 +395,7 @@ def test_single_gaussians_and_unequal_pictures_can_be_looked_at() -> None:
 def test_pictures_and_the_sheet_are_of_the_chosen_cameras() -> None:
     scene, target = cube_in_room()
     chosen = choose_views(scene, [target], replace(SHELLS, count=3))
-    pictures = view_pictures(scene, chosen)
+    pictures, _ = view_pictures(scene, chosen)
     assert [picture.shape for picture in pictures] == [(120, 160, 3)] * 3
     assert all(picture.std() > 10 for picture in pictures)
     sheet_ = view_sheet(scene, chosen, pictures, [box_of("cube", 0, target.rows)], columns=2)

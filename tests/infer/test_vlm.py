@@ -4,6 +4,8 @@ import base64
 import io
 import json
 import socket
+import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +19,7 @@ from gsencoder.errors import InputError
 from gsencoder.infer.prompts import data_url, messages, number_in, prompt_text
 from gsencoder.infer.view_pictures import PictureKind
 from gsencoder.infer.vlm import KEY_VARIABLE, MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
+from gsencoder.infer.vlm_reply import ServerError
 
 pytest.importorskip("openai")
 
@@ -48,10 +51,11 @@ def test_an_answer_comes_back_whole_with_what_the_server_says_of_it(stream: bool
         reply = ask(server.url, stream=stream, max_tokens=17, temperature=0.5)
     assert reply.text == "a red mug"
     assert (reply.model, reply.finish) == ("tiny", "stop")
-    assert reply.tokens == ({} if stream else {"prompt": 7, "answer": 2})
+    assert reply.tokens == {"prompt": 7, "answer": 2}
     headers, body = server.requests[0]
     assert headers["authorization"] == f"Bearer {KEY}"
     assert (body["model"], body["max_tokens"], body["temperature"], body["stream"]) == ("tiny", 17, 0.5, stream)
+    assert body.get("stream_options") == ({"include_usage": True} if stream else None)
     kinds = [part["type"] for part in body["messages"][0]["content"]]
     assert kinds == ["image_url", "text"]
 
@@ -150,8 +154,6 @@ def test_a_connection_that_breaks_within_a_stream_is_an_error() -> None:
 
 def test_an_answer_that_drips_for_ever_ends() -> None:
     def behave(handler: Handler, _: Any) -> None:
-        import time
-
         handler.send_response(200)
         handler.send_header("Content-Type", "text/event-stream")
         handler.end_headers()
@@ -160,8 +162,82 @@ def test_an_answer_that_drips_for_ever_ends() -> None:
             handler.wfile.flush()
             time.sleep(0.05)
 
-    with serving(behave) as server, pytest.raises(InputError, match="took more than 0.3 s .vlm.longest"):
+    with serving(behave) as server, pytest.raises(ServerError, match="took more than 0.3 s .vlm.longest"):
         ask(server.url, longest=0.3)
+
+
+@BOTH
+def test_a_connection_that_is_only_kept_alive_ends_with_the_patience(stream: bool) -> None:
+    def behave(handler: Handler, _: Any) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Type", "text/event-stream" if stream else "application/json")
+        handler.end_headers()
+        for _ in range(40):
+            handler.wfile.write(b": ping\n\n" if stream else b" ")
+            handler.wfile.flush()
+            time.sleep(0.1)
+
+    begun = time.monotonic()
+    with serving(behave) as server, pytest.raises(ServerError, match="took more than 0.5 s .vlm.longest"):
+        ask(server.url, stream=stream, longest=0.5, timeout=0.4)
+    assert time.monotonic() - begun < 3
+
+
+def test_patience_holds_for_all_tries_together() -> None:
+    def behave(handler: Handler, _: Any) -> None:
+        handler.send_response(503)
+        handler.send_header("Retry-After", "20")
+        handler.send_header("Content-Length", "0")
+        handler.end_headers()
+
+    with serving(behave) as server, pytest.raises(ServerError, match="took more than 0.5 s"):
+        ask(server.url, longest=0.5, retries=3)
+
+
+def finished(finish: str, **message: Any) -> dict[str, Any]:
+    whole = completion("The cu", finish)
+    whole["choices"][0]["message"] |= message
+    return whole
+
+
+@pytest.mark.parametrize(
+    ("whole", "told"),
+    [
+        (finished("content_filter"), "a filter cut the answer off after 6 characters"),
+        (finished("stop", content=None, refusal="I must not look"), "the model refuses: I must not look"),
+        (finished("length", content="", reasoning_content="hmm"), "empty .*it thought until vlm.max_tokens"),
+    ],
+)
+def test_answers_that_a_model_keeps_back_are_about_the_question_and_not_the_server(whole: Any, told: str) -> None:
+    with (
+        serving(lambda handler, _: handler.reply(200, whole)) as server,
+        pytest.raises(InputError, match=told) as error,
+    ):
+        ask(server.url, stream=False)
+    assert not isinstance(error.value, ServerError)
+
+
+def test_odd_but_whole_answers_are_taken() -> None:
+    odd = finished("stop", content=[{"type": "text", "text": "a red "}, {"type": "text", "text": "mug"}])
+    odd["usage"] = {"prompt_tokens": "many"}
+    with serving(lambda handler, _: handler.reply(200, odd)) as server:
+        reply = ask(server.url, stream=False)
+    assert (reply.text, reply.tokens) == ("a red mug", {})
+
+
+def test_an_error_within_a_stream_is_told_in_the_servers_words() -> None:
+    data = events("a re", finish=None, done=False) + b'event: error\ndata: {"message": "GPU fell"}\n\n'
+    with (
+        serving(lambda handler, _: handler.raw(200, data, "text/event-stream")) as server,
+        pytest.raises(ServerError, match="after 4 characters.*GPU fell"),
+    ):
+        ask(server.url)
+
+
+def test_a_server_names_its_limit_and_its_temperature_as_it_likes() -> None:
+    body = request_body([], config("http://x/v1", limit_by="max_completion_tokens", temperature=None, max_tokens=9))
+    assert body["max_completion_tokens"] == 9
+    assert not {"max_tokens", "temperature"} & set(body)
 
 
 def test_a_server_that_fails_at_first_is_asked_again() -> None:
@@ -182,6 +258,21 @@ def test_keys_are_never_told() -> None:
         ask(server.url)
     assert KEY not in str(caught.value)
     assert "bad key (key)" in str(caught.value)
+    # Neither where the message is cut, nor in the traceback of --debug, nor in an answer.
+    long = serving(lambda handler, _: handler.reply(400, {"error": {"message": "x" * 295 + KEY}}))
+    with long as server, pytest.raises(InputError) as caught:
+        ask(server.url)
+    assert KEY[:5] not in str(caught.value)
+    assert KEY not in "".join(traceback.format_exception(caught.value))
+    with serving(answer(f"your header is Bearer {KEY}")) as server:
+        assert ask(server.url).text == "your header is Bearer (key)"
+        # A key from a file ends with a line break.
+        ask(server.url, key=f"{KEY}\n")
+        assert server.requests[-1][0]["authorization"] == f"Bearer {KEY}"
+    for wrong in ("sk-\N{BULLET}123456", "sk-12\n3456"):
+        with pytest.raises(InputError, match="holds characters that no key has") as caught:
+            VlmServer(config("http://x/v1", key=wrong))
+        assert wrong not in str(caught.value)
     chosen = config("http://x/v1")
     assert settings(chosen)["key"] == HIDDEN
     assert settings(VlmConfig())["key"] == ""
@@ -216,6 +307,12 @@ def test_what_is_left_out_comes_from_the_environment(monkeypatch: pytest.MonkeyP
         {"temperature": 3.0},
         {"image_side": 1},
         {"base_url": "localhost:8000"},
+        {"base_url": "ftp://x/v1"},
+        {"base_url": "http:///v1"},
+        {"base_url": "http://x:abc/v1"},
+        {"base_url": "http://[::1"},
+        {"base_url": "http://x /v1"},
+        {"base_url": "http://x\x07/v1"},
     ],
 )
 def test_settings_of_a_server_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
@@ -311,3 +408,29 @@ def test_prompts_without_what_they_need_are_refused(
 )
 def test_the_mark_that_an_answer_names_is_found_or_nothing_is_guessed(text: str, number: int | None) -> None:
     assert number_in(text, 3) == number
+
+
+@pytest.mark.parametrize(
+    "url", ["http://bob:hunter2pw@x/v1", "http://x/v1?api_key=hunter2pw", "http://hunter2pw@x:y/v1"]
+)
+def test_addresses_that_hold_a_secret_are_refused_without_telling_it(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="keys belong in vlm.key") as caught:
+        VlmConfig(base_url=url)
+    assert "hunter2pw" not in str(caught.value)
+    monkeypatch.setenv(URL_VARIABLE, url)
+    with pytest.raises(InputError, match=URL_VARIABLE) as caught:
+        VlmServer(VlmConfig())
+    assert "hunter2pw" not in str(caught.value)
+
+
+def test_settings_of_proxies_and_certificates_that_cannot_be_used_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("http_proxy", "HTTP_PROXY", "no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    with monkeypatch.context() as within:
+        within.setenv("HTTP_PROXY", "foo://x")
+        with pytest.raises(InputError, match="no connection can be set up .*HTTP_PROXY leads? through a proxy"):
+            VlmServer(config("http://127.0.0.1:9/v1"))
+    with monkeypatch.context() as within:
+        within.setenv("http_proxy", "http://127.0.0.1:9")
+        with pytest.raises(ServerError, match="no server answers there .*http_proxy leads? through a proxy"):
+            ask("http://127.0.0.1:10/v1")
