@@ -245,11 +245,19 @@ def test_a_defect_of_ours_keeps_its_traceback(toy: Any) -> None:
         cli.main(["toy"])
 
 
+def wrapped(stop: cli.Stopped) -> SystemError:
+    """As compiled code lets an exception out that a signal raised within it."""
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = stop
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
         (KeyboardInterrupt(), 130, "interrupted\n"),
         (cli.Stopped(15), 143, "stopped: SIGTERM\n"),
+        (wrapped(cli.Stopped(15)), 143, "stopped: SIGTERM\n"),
         (OSError(28, "No space left on device"), 2, "error: standard output: no space left on the device\n"),
     ],
 )

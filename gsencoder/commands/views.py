@@ -14,7 +14,7 @@ from gsencoder.data.archive import write_archive
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.errors import InputError
 from gsencoder.fusion.store import load_features
-from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize
+from gsencoder.infer.localize import LocalizeConfig, asked_features, box_to_json, localize
 from gsencoder.infer.photographs import with_photographs
 from gsencoder.infer.pictures import Picture
 from gsencoder.infer.tokens import Fit, feature_tokens, token_blends, tower_grid
@@ -24,6 +24,7 @@ from gsencoder.infer.view_targets import Target, best_boxes, targets_of
 from gsencoder.infer.views import choose_views
 from gsencoder.outputs import output_folder, write_json
 from gsencoder.progress import console
+from gsencoder.render import BlendConfig
 from gsencoder.summary import Summary
 from gsencoder.types import Box, Scene
 
@@ -123,6 +124,7 @@ def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
                 "picture": f"view_{number:02d}.png",
                 "kind": kind,
                 "frame": each.frame,
+                "clearance": each.clearance,
                 "gain": each.gain,
                 "covered": each.covered,
                 "sights": [
@@ -154,8 +156,8 @@ def write_pictures(
 def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:
     """Rendered features as tokens [V, lines · columns, D] float32, under the name "tokens"."""
     assert scene.gaussians is not None
-    features = scene.features[config.space] if config.space else next(iter(scene.features.values()))
+    _, features = asked_features(scene, config.space or None)
     grid = (config.grid[0], config.grid[1])
-    blends = token_blends(scene.gaussians, views.cameras, grid, fit=config.fit)
+    blends = token_blends(scene.gaussians, views.cameras, grid, fit=config.fit, config=BlendConfig(near=views.near))
     tokens = feature_tokens(blends, features).numpy()
     write_archive(path, {"tokens": tokens}, {"space": features.space.describe(), "grid": list(grid), "fit": config.fit})

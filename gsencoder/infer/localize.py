@@ -104,7 +104,7 @@ def localize(
     Raises:
         InputError: no Gaussians or features, no or unknown words, words of another space.
     """
-    gaussians, features = _asked_features(scene, space)
+    gaussians, features = asked_features(scene, space)
     if isinstance(queries, str) or not queries or any(not word.strip() for word in queries):
         raise InputError(f"localize: expected a list of one or more words, got {queries!r}")
     check_space(features.space, text.space)
@@ -141,7 +141,16 @@ def localize(
     )
 
 
-def _asked_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:
+def asked_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:
+    """A scene's Gaussians and the features that are meant.
+
+    Args:
+        scene: with both.
+        space: the name of the features; may be left out where there is one.
+
+    Raises:
+        InputError: there are none of that name, or several and no name.
+    """
     if scene.gaussians is None or not scene.features:
         missing = "Gaussians" if scene.gaussians is None else "features"
         raise InputError(f"localize: scene {scene.name} has no {missing}; run `gsencoder fuse` on it first")

@@ -28,7 +28,8 @@ def tower_grid(width: int, height: int, grid: tuple[int, int], fit: Fit = "stret
         height: of the picture, pixels.
         grid: lines and columns of patches.
         fit: stretch = the whole picture is resized to the tower's, whatever its shape; crop = it is resized until it
-            covers the tower's, and the middle is cut out.
+            covers the tower's, and the middle is cut out. Square pictures need neither, nor the padding of towers that
+            make a square by it.
 
     Raises:
         InputError: a grid without cells.
@@ -82,9 +83,12 @@ def feature_tokens(blends: Sequence[Blend], features: GaussianFeatures) -> Float
     """Rendered features of views as a vision tower would give them: patches in lines from the top left, D channels.
 
     A token is mean + Σᵢ B[p, i] (fᵢ − mean): where rays meet nothing, or Gaussians that no teacher saw, the mean of the
-    space stands. In a model of transformers these replace `last_hidden_state` of the vision tower (a forward hook does
-    it) if the features are of the layer that the model reads; towers that begin with a summary token need theirs put
-    first.
+    space stands.
+
+    In a model of transformers these replace what the vision tower gives to the model's connector, by a forward hook on
+    the tower. Where that is depends on the model: `last_hidden_state` for Idefics3 and SmolVLM, `hidden_states[-2]` for
+    LLaVA, so that features must be of that layer; towers that begin with a summary token need theirs put first, and
+    those that merge patches before they give them (Qwen2-VL) need tokens on the merged grid.
 
     Args:
         blends: of `token_blends`, one for each view, all on one grid.

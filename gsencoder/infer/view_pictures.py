@@ -1,6 +1,7 @@
 """Chosen views as pictures: plain ones to show to a VLM, and a sheet for people that says why."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 from gsencoder.errors import InputError
@@ -40,6 +41,7 @@ def view_pictures(
     """
     if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
+    config = replace(config, near=min(config.near, views.near))
     pictures: list[Picture] = []
     numbers: frozenset[int] = frozenset()
     for view, kind in enumerate(picture_kinds(scene, views)):
@@ -87,5 +89,7 @@ def view_sheet(
 def told(chosen: Chosen) -> str:
     """A view in a line."""
     shown = [sight for sight in chosen.sights if sight.share >= LEAST_TOLD]
-    sights = "; ".join(f"{sight.target} {sight.share:.0%} of it, {sight.visible:.0%} seen" for sight in shown)
+    sights = "; ".join(
+        f"{sight.target} fills {sight.share:.0%}, {sight.visible * sight.inside:.0%} of it seen" for sight in shown
+    )
     return f"{chosen.name}: {sights or 'nothing of what was found'}" if chosen.sights else chosen.name

@@ -6,19 +6,31 @@ from typing import Literal
 from gsencoder.errors import InputError
 from gsencoder.types import Cameras
 
+MOST_CANDIDATES = 4096
+MOST_PIXELS = 8192
+MOST_WEIGHT = 1e6
+WIDEST = 120.0
+"""Gaussians are projected as if the picture were flat around each; degrees up to which that looks right."""
+JUDGED_SIDES = (40, 1024)
+"""Smaller pictures show small targets too large, because no Gaussian is drawn smaller than a pixel; larger ones cost
+gigabytes and tell no more."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewsConfig:
     """How views are found and chosen."""
 
     source: Literal["both", "frames", "shells"] = field(
-        default="both", metadata={"help": "the scene's own cameras, cameras around the targets, or half of each"}
+        default="both", metadata={"help": "the scene's own cameras, cameras around the targets, or up to half of each"}
     )
     method: Literal["greedy", "uniform"] = field(
         default="greedy", metadata={"help": "the best by what they show, or evenly spread frames (the baseline)"}
     )
     count: int = field(default=8, metadata={"help": "views chosen"})
-    candidates: int = field(default=32, metadata={"help": "views judged; the paper's table has 16, 32 and 64"})
+    candidates: int = field(
+        default=32,
+        metadata={"help": "views judged (one for each target at least); the paper's table has 16, 32 and 64"},
+    )
     width: int = field(default=640, metadata={"help": "of the pictures around targets, pixels"})
     height: int = field(default=480, metadata={"help": "of the pictures around targets, pixels"})
     fov: float = field(default=60.0, metadata={"help": "their horizontal field of view, degrees"})
@@ -33,25 +45,33 @@ class ViewsConfig:
     spread_weight: float = field(default=0.2, metadata={"help": "what seeing it from many directions is worth"})
 
     def __post_init__(self) -> None:
-        if self.count < 1 or self.candidates < 1:
-            raise InputError(f"count, candidates: expected 1 or more, got {self.count}, {self.candidates}")
+        if self.count < 1 or not 1 <= self.candidates <= MOST_CANDIDATES:
+            raise InputError(
+                f"count, candidates: expected 1 or more, and at most {MOST_CANDIDATES} candidates, "
+                f"got {self.count}, {self.candidates}"
+            )
+        if self.method == "uniform" and self.source == "shells":
+            raise InputError("source: expected frames or both with method=uniform, which spreads frames evenly")
         if self.method == "greedy" and self.count > self.candidates:
             raise InputError(f"count: expected 1 to candidates={self.candidates}, got {self.count}")
-        if self.width < 1 or self.height < 1 or not 1 <= self.fov <= 170:
+        if not (1 <= self.width <= MOST_PIXELS and 1 <= self.height <= MOST_PIXELS and 1 <= self.fov <= WIDEST):
             raise InputError(
-                f"width, height, fov: expected pixels and 1 to 170 degrees, got {self.width}, {self.height}, {self.fov}"
+                f"width, height, fov: expected at most {MOST_PIXELS} pixels and 1 to {WIDEST} degrees, "
+                f"got {self.width}, {self.height}, {self.fov}"
             )
-        if self.frame_side < 1:
-            raise InputError(f"frame_side: expected 1 pixel or more, got {self.frame_side}")
-        if not 8 <= self.judged_side <= 4096:
-            raise InputError(f"judged_side: expected 8 to 4096 pixels, got {self.judged_side}")
+        if not 1 <= self.frame_side <= MOST_PIXELS:
+            raise InputError(f"frame_side: expected 1 to {MOST_PIXELS} pixels, got {self.frame_side}")
+        if not JUDGED_SIDES[0] <= self.judged_side <= JUDGED_SIDES[1]:
+            raise InputError(
+                f"judged_side: expected {JUDGED_SIDES[0]} to {JUDGED_SIDES[1]} pixels, got {self.judged_side}"
+            )
         if not 0 < self.least_share < self.most_share < 1:
             raise InputError(
                 f"least_share, most_share: expected shares that rise, got {self.least_share}, {self.most_share}"
             )
         for name in ("cover_weight", "context_weight", "spread_weight"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(f"{name}: expected zero or a positive number, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) <= MOST_WEIGHT:
+                raise InputError(f"{name}: expected 0 to {MOST_WEIGHT:g}, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +100,7 @@ class Chosen:
     Attributes:
         name: of the frame, or "around mug 03".
         frame: which of the scene's views it is; None where it was placed.
-        clearance: world units from the camera to the nearest surface; None where there are no targets.
+        clearance: world units from the camera to the nearest surface.
         gain: what it added to the choice; None for uniform frames.
         covered: how well this view and those before it show the targets' Gaussians, by `coverage`: 1 = each as well
             as the candidate that shows it best; None where there are no targets.
@@ -89,7 +109,7 @@ class Chosen:
 
     name: str
     frame: int | None
-    clearance: float | None
+    clearance: float
     gain: float | None
     covered: float | None
     sights: tuple[Sight, ...]
@@ -103,11 +123,13 @@ class ViewSet:
         cameras: relative to the scene's origin.
         chosen: why, one for each.
         judged: how many candidates there were.
+        near: near plane for their renders, world units: scenes of small units are not cut open.
     """
 
     cameras: Cameras
     chosen: tuple[Chosen, ...]
     judged: int
+    near: float
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -12,7 +12,9 @@ from gsencoder.infer.view_targets import Target
 from gsencoder.types import Cameras, Gaussians, Scene
 
 TRIED = 8
-"""So many times as many directions are tried as cameras are wanted."""
+"""So many times as many directions are tried as cameras are wanted …"""
+LEAST_TRIED = 64
+"""… but at least so many."""
 SHARES = (0.30, 0.18, 0.10)
 """Shares of the picture that targets are to fill, direction by direction …"""
 ROOM = 1.5
@@ -65,7 +67,7 @@ def shell_cameras(
         Cameras relative to the scene's origin; none where there is no room.
     """
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
-    outward, vertical = spiral_directions(TRIED * count, up)
+    outward, vertical = spiral_directions(max(TRIED * count, LEAST_TRIED), up)
     wanted, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height, between)
     # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
     begins = reach + 2 * free.cell
@@ -89,7 +91,8 @@ def shell_cameras(
 def _backed(
     target: Target, centers: Float64[np.ndarray, "n 3"], vertical: Float64[np.ndarray, "3"], free: FreeSpace
 ) -> Float64[np.ndarray, " n"]:
-    """Share of the rays through a target, and beside it, that end at something, for each camera."""
+    """Share of the rays through a target, and beside it, that end at something, for each camera. They begin before the
+    target, so that what it hangs on or lies on counts from either side."""
     forward = target.center - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, vertical)
@@ -102,7 +105,7 @@ def _backed(
             through = target.center + BESIDE * target.radius * (across * right + along * down)
             ray = through - centers
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            hits += np.isfinite(free.first_hit(through, ray, length))
+            hits += np.isfinite(free.first_hit(through - BESIDE * target.radius * ray, ray, length))
     return hits / 9
 
 

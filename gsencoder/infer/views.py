@@ -6,6 +6,7 @@ them best: large and whole, from all sides, with what is around them (`view_wort
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from gsencoder.infer.view_set import Chosen, Sight, ViewsConfig, ViewSet
 from gsencoder.infer.view_shells import shell_cameras, up_of
 from gsencoder.infer.view_targets import Target, check_targets
 from gsencoder.infer.view_worth import Values
+from gsencoder.render import BlendConfig
 from gsencoder.types import Cameras, Gaussians, Scene
 
 WATCHERS = 12
@@ -48,13 +50,14 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
         raise InputError(f"views: scene {scene.name} has no Gaussians")
     if targets or config.method == "greedy":
         check_targets(targets, gaussians)
-    free = FreeSpace(gaussians) if targets else None
-    if config.method == "uniform" or free is None:
+    free = FreeSpace(gaussians)
+    judged = replace(JUDGED, near=min(JUDGED.near, free.cell / 2))
+    if config.method == "uniform":
         found = _uniform(scene, gaussians, config)
     else:
-        found = _candidates(scene, gaussians, targets, free, config)
+        found = _candidates(scene, gaussians, targets, free, config, judged)
     cameras = found.cameras
-    looks = look(gaussians, cameras, targets, side=config.judged_side)
+    looks = look(gaussians, cameras, targets, side=config.judged_side, config=judged)
     values = Values(cameras, targets, looks, config)
     if config.method == "uniform":
         order, gains = np.arange(len(cameras)), None
@@ -72,14 +75,14 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
         )
         for view in order
     ]
-    room = None if free is None else free.clearance(cameras.centers[order])
+    room = free.clearance(cameras.centers[order])
     return ViewSet(
         cameras=cameras.select(order),
         chosen=tuple(
             Chosen(
                 name=found.names[view],
                 frame=found.frames[view],
-                clearance=None if room is None else float(room[place]),
+                clearance=float(room[place]),
                 gain=None if gains is None else float(gains[place]),
                 covered=values.covered(order[: place + 1]),
                 sights=sights[place],
@@ -87,6 +90,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
             for place, view in enumerate(order)
         ),
         judged=len(cameras),
+        near=judged.near,
     )
 
 
@@ -135,7 +139,12 @@ def _uniform(scene: Scene, gaussians: Gaussians, config: ViewsConfig) -> _Found:
 
 
 def _candidates(
-    scene: Scene, gaussians: Gaussians, targets: Sequence[Target], free: FreeSpace, config: ViewsConfig
+    scene: Scene,
+    gaussians: Gaussians,
+    targets: Sequence[Target],
+    free: FreeSpace,
+    config: ViewsConfig,
+    judged: BlendConfig,
 ) -> _Found:
     own = scene.views.cameras if scene.views is not None and len(scene.views) else None
     if config.source == "frames" and own is None:
@@ -153,7 +162,7 @@ def _candidates(
     if config.source != "frames":
         if own is not None:
             watchers = frames_on(own, gaussians, targets, max(WATCHERS, len(targets)), spaces)
-            free = free.seen_by(own.select(watchers), JUDGED)
+            free = free.seen_by(own.select(watchers), judged)
         for target, room in zip(targets, _shared_out(config.candidates - len(frames), len(targets)), strict=True):
             around = shell_cameras(
                 gaussians,
@@ -174,7 +183,8 @@ def _candidates(
     cameras = _joined(parts)
     if not len(cameras):
         raise InputError(
-            f"views: there is no room for a camera around {', '.join(target.name for target in targets)}; "
+            f"views: there is no room for a camera around {', '.join(target.name for target in targets)} "
+            f"(pictures of {config.width} x {config.height} pixels, {config.fov:g} degrees); "
             + ("choose.method=uniform looks at all of the splat" if own is None else "take choose.source=frames")
         )
     return _Found(cameras, names, frames)

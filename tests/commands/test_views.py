@@ -77,6 +77,8 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
         (("query=cube", "choose.count=99"), "count: expected 1 to candidates"),
         (("query=cube", "choose.source=nowhere"), "choose.source: expected one of both, frames, shells"),
         (("query=cube", "space=other"), "other"),
+        (("choose.method=uniform", "grid=[3,4]", "space=other"), "none of 'other'"),
+        (("query=cube", "photos=nowhere"), "nowhere: no such file or folder"),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(

@@ -1,13 +1,17 @@
 """Photographs in place of renders: each with its own frame, in its size, and only those of the same cameras."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from asked_rooms import save_room
+from PIL import Image
 from rooms import corner_cameras, room
 from scene_files import OPENGL, rewrite, save
 
+from gsencoder import cli
 from gsencoder.data.scenes import load_scene
 from gsencoder.errors import InputError
 from gsencoder.infer.photographs import with_photographs
@@ -124,3 +128,20 @@ def test_photographs_of_other_cameras_are_refused(tmp_path: Path) -> None:
         with_photographs(scene, scene)
     with pytest.raises(InputError, match="have no cameras"):
         with_photographs(replace(scene, views=None), taken)
+
+
+def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
+    taken = load_scene(write_room(tmp_path / "scene", larger=2))
+    assert taken.views is not None
+    save_room(tmp_path / "features", taken.views.names)
+    quick = ("choose.source=frames", "choose.candidates=12", "choose.count=3", "quiet=true")
+    words = [str(tmp_path / "features"), f"photos={tmp_path / 'scene'}", "query=cube", *quick]
+    assert cli.main(["views", *words, f"out={tmp_path / 'views'}"]) == 0
+    rows = json.loads((tmp_path / "views" / "views.json").read_text())
+    assert len(rows) == 3
+    for row in rows:
+        assert row["kind"] == "photograph"
+        with Image.open(tmp_path / "views" / row["picture"]) as picture:
+            assert (np.asarray(picture) == shade(row["frame"])).all()
+    assert cli.main(["ask", *words, "question=What is on it?", "dry_run=true", f"out={tmp_path / 'ask'}"]) == 0
+    assert "They are photographs." in (tmp_path / "ask" / "prompt.txt").read_text()

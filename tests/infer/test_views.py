@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rooms import CUBE, HALF, HEIGHT, UP, corner_cameras, cube, room, sheet, splat
+from rooms import CUBE, HALF, HEIGHT, UP, corner_cameras, cube, room, sheet, splat, walls
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.errors import InputError, SceneWarning
@@ -275,6 +275,42 @@ def test_views_that_add_nothing_are_left_out_and_that_is_said() -> None:
     assert sorted(each.name for each in chosen.chosen) == ["d", "e", "f"]
 
 
+@pytest.mark.parametrize("unit", [1e-4, 1e-2, 1e3])
+def test_the_same_views_are_chosen_in_scenes_of_any_unit(unit: float) -> None:
+    scene, target = cube_in_room()
+    g = scene.gaussians
+    assert g is not None
+    assert scene.views is not None
+    poses = scene.views.cameras.cam_from_world.copy()
+    poses[:, :3, 3] *= unit
+    other = replace(
+        scene,
+        gaussians=replace(g, means=g.means * np.float32(unit), scales=g.scales * np.float32(unit)),
+        views=replace(scene.views, cameras=replace(scene.views.cameras, cam_from_world=poses)),
+    )
+    assert other.gaussians is not None
+    here = choose_views(scene, [target], SHELLS)
+    there = choose_views(other, [target_of("cube", other.gaussians, target.rows)], SHELLS)
+    np.testing.assert_allclose(there.cameras.centers, here.cameras.centers * unit, rtol=1e-3, atol=1e-3 * unit)
+    for a, b in zip(here.chosen, there.chosen, strict=True):
+        assert b.sights[0].visible == pytest.approx(a.sights[0].visible, abs=0.01)
+    pictures, _ = view_pictures(other, there)
+    same, _ = view_pictures(scene, here)
+    assert np.abs(np.stack(pictures).astype(int) - np.stack(same)).mean() < 2
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.2])
+def test_a_thing_on_a_wall_of_a_closed_room_is_looked_at_from_inside_though_no_camera_was_there(gap: float) -> None:
+    poster = sheet((HALF - gap, 0, 1.2), (1, 2), (0.4, 0.3), 0.03)
+    means = np.concatenate([poster, walls()])
+    scene = Scene(name="room", gaussians=splat(means), up=UP)
+    assert scene.gaussians is not None
+    target = target_of("poster", scene.gaussians, np.arange(len(poster)))
+    chosen = choose_views(scene, [target], replace(SHELLS, candidates=32, count=6))
+    inside = (np.abs(chosen.cameras.centers[:, :2]) < HALF).all(axis=1)
+    assert inside.mean() >= 0.8
+
+
 def test_clearance_of_each_view_is_told() -> None:
     scene, target = cube_in_room()
     chosen = choose_views(scene, [target], SHELLS)
@@ -373,6 +409,11 @@ def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
         {"width": 0},
         {"fov": 0.5},
         {"judged_side": 4},
+        {"judged_side": 2048},
+        {"fov": 170.0},
+        {"candidates": 5000},
+        {"cover_weight": 1e300},
+        {"method": "uniform", "source": "shells"},
         {"least_share": 0.7},
         {"cover_weight": -1.0},
         {"spread_weight": float("inf")},
