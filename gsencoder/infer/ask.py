@@ -1,7 +1,7 @@
 """A question about a scene, from words to what a VLM is sent: what to look for, which views, which prompt."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, get_args
 
@@ -21,6 +21,8 @@ from gsencoder.infer.views import choose_views
 from gsencoder.infer.vlm import VlmConfig
 from gsencoder.types import Box, Scene
 
+KEPT_PICTURES = 8
+"""Sets of pictures that are kept for the next question; each is some megabytes."""
 SAME = 0.5
 """What shares more of its Gaussians with what was found before, as intersection over union, is the same thing."""
 
@@ -115,7 +117,8 @@ class Asker:
         """
         self._scene, self._table, self._space, self._side = scene, table, space, side
         self._config, self._localization, self._views = config, localization, views
-        self._kept: dict[Any, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
+        self._kept: dict[Hashable, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
+        self._drawn: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
 
     def prompt(self, question: Question) -> Prompt:
         """What to send for a question.
@@ -143,12 +146,22 @@ class Asker:
         marked = self._config.marks
         if marked is None:
             marked = question.task in ("ground", "caption")
-        pictures, marks = view_pictures(self._scene, views, targets if marked else ())
+        pictures, marks = self._pictures_of((*key, marked), views, targets if marked else ())
         # A thing in a box that was given has no name.
         names = [box.query for box in boxes] or ["" for _ in targets]
         kinds = picture_kinds(self._scene, views)
         text = prompt_text(question.task, question.text, names, marks=marks, kinds=kinds)
         return Prompt(text=text, pictures=pictures, views=views, targets=targets, boxes=boxes, words=words, marks=marks)
+
+    def _pictures_of(
+        self, key: Hashable, views: ViewSet, marked: Sequence[Target]
+    ) -> tuple[list[Picture], frozenset[int]]:
+        """Pictures of what was asked about last are kept: many questions are about the same thing."""
+        found = self._drawn.pop(key, None) or view_pictures(self._scene, views, marked)
+        self._drawn[key] = found
+        if len(self._drawn) > KEPT_PICTURES:
+            del self._drawn[next(iter(self._drawn))]
+        return found
 
     def _nothing(self, words: Sequence[str]) -> str:
         return f"nothing was found of {', '.join(words)}" if words else "the question names nothing to look for"

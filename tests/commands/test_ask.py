@@ -23,10 +23,15 @@ from PIL import Image
 from tiny_vlm import save_tiny_vlm
 
 from gsencoder import cli
-from gsencoder.data.text_table import make_text_table
+from gsencoder.data.text_table import load_text_table, make_text_table
 from gsencoder.errors import InputError
+from gsencoder.fusion.store import WORDS_FILE, load_features
+from gsencoder.infer import ask as ask_module
+from gsencoder.infer.ask import KEPT_PICTURES, Asker, Question
 from gsencoder.infer.question_words import words_in
 from gsencoder.infer.questions import read_answers, read_questions
+from gsencoder.infer.view_pictures import view_pictures
+from gsencoder.infer.view_set import ViewsConfig
 from gsencoder.progress import printable
 
 pytest.importorskip("openai")
@@ -329,6 +334,32 @@ def test_warnings_of_a_batch_name_the_question(
         assert f"warning: question {name}: the question names nothing to look for" in told
     rows = [json.loads(line) for line in (tmp_path / "out" / "answers.jsonl").read_text().splitlines()]
     assert all("names nothing to look for" in row["warnings"][0] for row in rows)
+
+
+def test_pictures_are_rendered_once_for_questions_about_one_thing(
+    features: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered: list[int] = []
+
+    def counted(*given: Any, **named: Any) -> Any:
+        rendered.append(1)
+        return view_pictures(*given, **named)
+
+    monkeypatch.setattr(ask_module, "view_pictures", counted)
+    config = ViewsConfig(source="frames", candidates=4, count=2)
+    asker = Asker(load_features(features), load_text_table(features / WORDS_FILE), views=config)
+    first, second = (asker.prompt(Question(text=text)) for text in ("Where is the cube?", "Is the cube red?"))
+    assert first.pictures is second.pictures
+    assert len(rendered) == 1
+    marked = asker.prompt(Question(text="the left cube", task="ground"))
+    assert len(rendered) == 2
+    assert marked.marks == {1}
+    for number in range(KEPT_PICTURES):
+        low = ORIGIN + (0.1, 0.0, 0.6 - 0.001 * number)
+        asker.prompt(Question(text="What?", aabb=(*low.tolist(), *(ORIGIN + (0.5, 0.4, 1.0)).tolist())))
+    assert len(asker._drawn) == KEPT_PICTURES
+    asker.prompt(Question(text="Where is the cube?"))
+    assert len(rendered) == 3 + KEPT_PICTURES
 
 
 def test_lines_take_the_task_of_the_command_unless_they_name_one(tmp_path: Path) -> None:
