@@ -355,8 +355,8 @@ def test_pictures_are_rendered_once_for_questions_about_one_thing(
     assert len(rendered) == 2
     assert marked.marks == {1}
     for number in range(KEPT_PICTURES):
-        low = ORIGIN + (0.1, 0.0, 0.6 - 0.001 * number)
-        asker.prompt(Question(text="What?", aabb=(*low.tolist(), *(ORIGIN + (0.5, 0.4, 1.0)).tolist())))
+        low = ORIGIN + np.array([0.1, 0.0, 0.6 - 0.001 * number])
+        asker.prompt(Question(text="What?", aabb=(*low.tolist(), *(ORIGIN + np.array([0.5, 0.4, 1.0])).tolist())))
     assert len(asker._drawn) == KEPT_PICTURES
     asker.prompt(Question(text="Where is the cube?"))
     assert len(rendered) == 3 + KEPT_PICTURES
