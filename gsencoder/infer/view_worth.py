@@ -19,8 +19,9 @@ BLURRED = 0.04
 """Gaussians of this standard deviation, as a share of the picture's longer side, halve what a view is worth."""
 LEAST_BEST = 0.1
 """Views count as good in comparison with the best of them, if that is worth so much."""
-NOTHING = 0.01
-"""A view adds nothing if it adds less than one that is worth so much by itself."""
+NOTHING = 0.004
+"""A view adds nothing if it adds less than this share of what the first one shows; small things are worth little in all
+of them."""
 
 
 def worth(looks: Looks, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
@@ -87,7 +88,7 @@ class Values:
                         gain += weight / len(self._kept) * np.maximum(part - level, 0).mean(axis=1)
             gain[order] = -np.inf
             view = int(gain.argmax())
-            if order and gain[view] * self._count < NOTHING:
+            if order and gain[view] <= NOTHING * gains[0]:
                 break
             order.append(view)
             gains.append(float(gain[view]))
