@@ -21,7 +21,9 @@ LEAST_BEST = 0.1
 """Views count as good in comparison with the best of them, if that is worth so much."""
 NOTHING = 0.004
 """A view adds nothing if it adds less than this share of what the first one shows; small things are worth little in all
-of them."""
+of them …"""
+LEAST_GAIN = 1e-4
+"""… nor does one that adds less than a view that is worth so much by itself: not a pixel of the target."""
 
 
 def worth(looks: Looks, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
@@ -88,7 +90,7 @@ class Values:
                         gain += weight / len(self._kept) * np.maximum(part - level, 0).mean(axis=1)
             gain[order] = -np.inf
             view = int(gain.argmax())
-            if order and gain[view] <= NOTHING * gains[0]:
+            if order and gain[view] <= max(NOTHING * gains[0], LEAST_GAIN / self._count):
                 break
             order.append(view)
             gains.append(float(gain[view]))
