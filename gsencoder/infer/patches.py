@@ -47,15 +47,21 @@ def patches(gaussians: Gaussians, edge: float) -> Patches:
     while parts.prod(axis=1).sum() > max(MOST, len(gaussians)) and most > 1:
         most //= 2
         parts = _parts(gaussians, edge, most)
+    large = np.flatnonzero(parts.prod(axis=1) > 1)
+    turn_of = np.zeros(len(gaussians), np.int64)
+    turn_of[large] = np.arange(len(large))
+    turns = rotmats_from_quats(torch.from_numpy(gaussians.quats[large]).double()).numpy()
     kinds, kind_of = np.unique(parts, axis=0, return_inverse=True)
     centers, rows, scales = [], [], []
     for number, kind in enumerate(kinds):
         chosen = np.flatnonzero(kind_of.reshape(-1) == number)
         offsets = _middles(kind)
-        turns = rotmats_from_quats(torch.from_numpy(gaussians.quats[chosen]).double()).numpy()
-        reach = SIGMAS * gaussians.scales[chosen].astype(np.float64)
-        places = np.einsum("nij,nkj->nki", turns, offsets[None] * reach[:, None])
-        centers.append((gaussians.means[chosen, None].astype(np.float64) + places).reshape(-1, 3))
+        means = gaussians.means[chosen].astype(np.float64)
+        if len(offsets) > 1:
+            reach = SIGMAS * gaussians.scales[chosen].astype(np.float64)
+            places = np.einsum("nij,nkj->nki", turns[turn_of[chosen]], offsets[None] * reach[:, None])
+            means = (means[:, None] + places).reshape(-1, 3)
+        centers.append(means)
         rows.append(np.repeat(chosen, len(offsets)))
         scales.append(np.repeat(gaussians.scales[chosen] / kind.astype(np.float32), len(offsets), axis=0))
     return Patches(centers=np.concatenate(centers), rows=np.concatenate(rows), scales=np.concatenate(scales))
