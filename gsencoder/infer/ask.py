@@ -170,7 +170,7 @@ class Asker:
         targets, boxes = self._targets(words, question)
         config = self._views
         if not targets:
-            config = replace(config, method="uniform")
+            config = replace(config, method="uniform", source="both")
         views = choose_views(self._scene, targets, config)
         # Marks are drawn on pictures of the size that is sent, or their numbers would shrink.
         small = views.cameras.resized(self._side, enlarge=False)

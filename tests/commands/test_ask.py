@@ -140,6 +140,14 @@ def test_a_question_that_names_nothing_is_shown_even_frames_and_says_so(features
     summary = json.loads((tmp_path / "dry" / "summary.json").read_text())
     assert any("evenly spread views are shown" in line for line in summary["warnings"])
     assert [view["frame"] for view in summary["results"]["views"]] == [0, 11]
+    words = (
+        "question=How large is this place?",
+        "dry_run=true",
+        "choose.source=shells",
+        "choose.count=2",
+        "quiet=true",
+    )
+    assert cli.main(["ask", str(features), f"out={tmp_path / 'shells'}", *words]) == 0
 
 
 def test_words_of_a_question_are_found_with_the_longest_name_first() -> None:
