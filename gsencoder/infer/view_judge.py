@@ -1,12 +1,12 @@
 """What cameras really see of a target: small renders, occlusion included."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from gsencoder.evenly import evenly
 from gsencoder.infer.free_space import in_picture
@@ -83,6 +83,11 @@ def look(
     # Whole views share the threads out better than parts of small ones.
     found = parallel(one, range(len(cameras)))
     return tuple(_together([each[place] for each in found]) for place in range(len(targets)))
+
+
+def as_photographs(looks: Looks, taken: Bool[np.ndarray, " V"]) -> Looks:
+    """Looks where some cameras are shown as photographs: sharp and solid, however rough the splat is."""
+    return replace(looks, alpha=np.where(taken, 1.0, looks.alpha), blur=np.where(taken, 0.0, looks.blur))
 
 
 class _Seen(NamedTuple):

@@ -15,7 +15,7 @@ from gsencoder.render.rgb import render_image
 from gsencoder.types import Box, Scene
 
 PictureKind = Literal["photograph", "render"]
-LEAST_TOLD = 0.005
+LEAST_TOLD = 0.0005
 """Smaller shares of a picture are not told."""
 
 
@@ -90,6 +90,8 @@ def told(chosen: Chosen) -> str:
     """A view in a line."""
     shown = [sight for sight in chosen.sights if sight.share >= LEAST_TOLD]
     sights = "; ".join(
-        f"{sight.target} fills {sight.share:.0%}, {sight.visible * sight.inside:.0%} of it seen" for sight in shown
+        f"{sight.target} fills {sight.share:{'.0%' if sight.share >= 0.01 else '.1%'}}, "
+        f"{sight.visible * sight.inside:.0%} of it seen"
+        for sight in shown
     )
     return f"{chosen.name}: {sights or 'nothing of what was found'}" if chosen.sights else chosen.name

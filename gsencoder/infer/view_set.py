@@ -80,7 +80,7 @@ class Sight:
 
     Attributes:
         target: its name.
-        visible, share, inside, alpha, blur: as judged.
+        visible, share, inside, alpha, blur: as judged; alpha 1 and blur 0 where a photograph is shown.
         worth: what these come to, 0 to 1.
     """
 

@@ -17,7 +17,7 @@ from gsencoder.errors import InputError, SceneWarning
 from gsencoder.evenly import evenly
 from gsencoder.infer.free_space import FreeSpace
 from gsencoder.infer.view_frames import frames_on
-from gsencoder.infer.view_judge import JUDGED, Looks, look
+from gsencoder.infer.view_judge import JUDGED, Looks, as_photographs, look
 from gsencoder.infer.view_set import Chosen, Sight, ViewsConfig, ViewSet
 from gsencoder.infer.view_shells import shell_cameras, up_of
 from gsencoder.infer.view_targets import Target, check_targets
@@ -35,7 +35,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
     """The views that show targets best.
 
     Args:
-        scene: Gaussians, and cameras where it has any.
+        scene: Gaussians, and cameras where it has any. Frames of a scene with photographs are judged as these.
         targets: what is looked at; all count alike. Evenly spread frames need none.
         config: see there.
 
@@ -58,6 +58,9 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
         found = _candidates(scene, gaussians, targets, free, config, judged)
     cameras = found.cameras
     looks = look(gaussians, cameras, targets, side=config.judged_side, config=judged)
+    if scene.views is not None and scene.views.images is not None:
+        taken = np.array([frame is not None for frame in found.frames])
+        looks = tuple(as_photographs(each, taken) for each in looks)
     values = Values(cameras, targets, looks, config)
     if config.method == "uniform":
         order, gains = np.arange(len(cameras)), None

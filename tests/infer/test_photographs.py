@@ -145,3 +145,31 @@ def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
             assert (np.asarray(picture) == shade(row["frame"])).all()
     assert cli.main(["ask", *words, "question=What is on it?", "dry_run=true", f"out={tmp_path / 'ask'}"]) == 0
     assert "They are photographs." in (tmp_path / "ask" / "prompt.txt").read_text()
+
+
+def test_a_photograph_counts_as_sharp_and_solid_however_rough_the_splat_is(tmp_path: Path) -> None:
+    taken = load_scene(write_room(tmp_path / "taken"))
+    bare = kept_room(taken, list(range(COUNT)))
+    assert bare.gaussians is not None
+    thin = replace(bare.gaussians, scales=2 * bare.gaussians.scales, opacities=0.3 * bare.gaussians.opacities)
+    rough = replace(bare, gaussians=thin)
+    target = target_of("cube", thin, room()[1])
+    config = ViewsConfig(source="frames", count=4, candidates=12)
+    renders = choose_views(rough, [target], config)
+    photographs = choose_views(with_photographs(rough, taken), [target], config)
+    told = {each.frame: each.sights[0] for each in renders.chosen}
+    assert set(told) & {each.frame for each in photographs.chosen}
+    for each in photographs.chosen:
+        (sight,) = each.sights
+        assert (sight.alpha, sight.blur) == (1, 0)
+        if each.frame in told:
+            before = told[each.frame]
+            assert before.alpha < 1
+            assert before.blur > 0
+            assert sight.worth > before.worth
+            assert (sight.visible, sight.share, sight.inside) == (before.visible, before.share, before.inside)
+    # Cameras around the target show renders still.
+    both = choose_views(with_photographs(rough, taken), [target], ViewsConfig(count=8, candidates=24))
+    placed = [each.sights[0] for each in both.chosen if each.frame is None]
+    assert placed
+    assert all(sight.blur > 0 for sight in placed)
