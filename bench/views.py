@@ -64,10 +64,15 @@ def objects_of(path: str, large: bool) -> tuple[Scene, list[tuple[Target, SceneO
         found = localize(scene, list(dict.fromkeys(one.name for one in asked if one.name)), words)
     pairs = []
     for target in targets_of(scene.gaussians, found):
-        same = [one for one in asked if one.name == target.name]
+        same = [one for one in scene.objects if one.name == target.name]
         away = [np.linalg.norm((one.aabb_min + one.aabb_max) / 2 - scene.origin - target.center) for one in same]
-        pairs.append((target, same[int(np.argmin(away))]))
-    return scene, pairs
+        nearest = same[int(np.argmin(away))]
+        # Another one of the name may have been found, which is not among those that frames show well.
+        if any(one.id == nearest.id for one in asked):
+            pairs.append((target, nearest))
+    assert scene.views is not None
+    # Frames are judged as renders, as they are when features are all that there is.
+    return replace(scene, views=replace(scene.views, images=None)), pairs
 
 
 def pixels_of(scene: Scene, one: SceneObject) -> np.ndarray:
