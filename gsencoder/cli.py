@@ -22,7 +22,7 @@ import gsencoder
 from gsencoder.commands import COMMANDS, Command
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.options import near
-from gsencoder.progress import printable
+from gsencoder.printable import printable
 
 FLAGS = {
     "--help": "show this help (-h)",

@@ -6,7 +6,6 @@ Functions below the command line know nothing of this. One that loops for long t
 
 import sys
 import time
-import unicodedata
 from collections.abc import Iterable, Iterator, Sized
 from typing import Any, TypeVar
 
@@ -21,18 +20,6 @@ def console(quiet: bool = False) -> Console:
     """Where commands print results and tables: standard output, no markup, wide where it is not a terminal."""
     width = None if sys.stdout.isatty() else 200
     return Console(file=sys.stdout, quiet=quiet, markup=False, highlight=False, emoji=False, width=width)
-
-
-def printable(text: str) -> str:
-    """Text without the characters by which a terminal could be told to do other things than to show it: controls,
-    halves of characters, and what turns the direction of writing."""
-    turning = {*map(chr, range(0x202A, 0x202F)), *map(chr, range(0x2066, 0x206A))}
-    return "".join(
-        "\N{REPLACEMENT CHARACTER}"
-        if letter in turning or (unicodedata.category(letter) in ("Cc", "Cs") and letter not in "\n\t")
-        else letter
-        for letter in text.replace("\r\n", "\n")
-    )
 
 
 class Progress:

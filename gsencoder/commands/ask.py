@@ -27,7 +27,8 @@ from gsencoder.infer.view_set import ViewsConfig
 from gsencoder.infer.vlm import MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
 from gsencoder.infer.vlm_reply import Reply, ServerError
 from gsencoder.outputs import output_folder, write_bytes, write_json
-from gsencoder.progress import Progress, console, printable
+from gsencoder.printable import printable
+from gsencoder.progress import Progress, console
 from gsencoder.summary import Summary, plain
 from gsencoder.types import Scene
 from gsencoder.work_folder import WorkFolder

@@ -32,7 +32,7 @@ from gsencoder.infer.question_words import words_in
 from gsencoder.infer.questions import read_answers, read_questions
 from gsencoder.infer.view_pictures import view_pictures
 from gsencoder.infer.view_set import ViewsConfig
-from gsencoder.progress import printable
+from gsencoder.printable import printable
 
 pytest.importorskip("openai")
 

@@ -85,7 +85,7 @@ def test_bad_exports_are_errors_that_name_the_file(tmp_path: Path) -> None:
         ("1 2 3", "expected 4×4"),
         ("a b\nc d", "table of numbers"),
         ("", "expected 4×4"),
-        (good_pose.replace("1", "7", 1), "pose"),
+        (good_pose.replace("e-01", "e+00", 1), "pose"),
     ):
         pose.write_text(text)
         with pytest.raises(InputError, match=rf"1\.txt.*{said}|{said}.*1\.txt"):
