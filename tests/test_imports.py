@@ -18,7 +18,7 @@ LEVELS = (
     ("train", "infer"),
     ("evaluate", "viewer"),
     ("options", "summary"),
-    ("config", "outputs", "progress", "work_folder"),
+    ("config", "outputs", "printable", "progress", "work_folder"),
     ("compose",),
     ("help", "multirun"),
     ("commands",),
