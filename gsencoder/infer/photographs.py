@@ -1,42 +1,87 @@
-"""Photographs for the frames of a scene whose features were kept without them."""
+"""Photographs for the frames of a scene whose features were kept without them, and what cameras show of them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int64, UInt8
 from PIL import Image
 
 from gsencoder.errors import InputError, listed
-from gsencoder.types import Cameras, Scene
+from gsencoder.types import Cameras, Scene, Views
 
 ANGLE, PLACE = 0.01, 1e-3
 """How far two readings of one camera may be from each other: radians or parts of a focal length, and parts of the
 distance between cameras."""
 TOLD = 3
+ROUNDED = 0.5
+"""A window that ends so near to the photograph's edges is all of it, pixels: sizes of smaller frames are rounded."""
 
 
 class Photographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
     """Pictures of a scene in the order and the sizes of other cameras, read on access."""
 
-    def __init__(self, images: Sequence[np.ndarray], rows: Sequence[int], cameras: Cameras) -> None:
-        self._images, self._rows, self._cameras = images, rows, cameras
+    def __init__(self, views: Views, rows: Int64[np.ndarray, " n"], cameras: Cameras) -> None:
+        self._views, self._rows, self._cameras = views, rows, cameras
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
-            return Photographs(self._images, self._rows[index], self._cameras.select(index))
+            return Photographs(self._views, self._rows[index], self._cameras.select(index))
         size = int(self._cameras.widths[index]), int(self._cameras.heights[index])
-        return resized_picture(self._images[self._rows[index]], size)
+        return resized_picture(self.taken(index), size)
+
+    def taken(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        """A picture in the size that it was taken in."""
+        assert self._views.images is not None
+        return self._views.images[int(self._rows[index])]
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras in the sizes that the pictures were taken in."""
+        taken = self._views.cameras.select(self._rows)
+        scale = np.ones((len(self), 3))
+        scale[:, 0], scale[:, 1] = taken.widths / self._cameras.widths, taken.heights / self._cameras.heights
+        Ks = (self._cameras.Ks * scale[:, :, None]).astype(np.float32)
+        return replace(self._cameras, Ks=Ks, widths=taken.widths, heights=taken.heights)
+
+
+def photograph_cameras(views: Views) -> Cameras:
+    """The cameras of views in the sizes that their photographs were taken in."""
+    return views.images.cameras if isinstance(views.images, Photographs) else views.cameras
 
 
 def resized_picture(picture: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
     """A picture of another width and height."""
     image = Image.fromarray(picture)
     return picture if image.size == size else np.asarray(image.resize(size, Image.Resampling.LANCZOS))
+
+
+def photograph_of(views: Views, frame: int, cameras: Cameras, view: int) -> UInt8[np.ndarray, "H W 3"]:
+    """What a camera in a frame's place shows of its photograph: all or a window, by its K, in the camera's size.
+
+    Args:
+        views: with photographs.
+        frame: which of them.
+        cameras: with one of the same pose that sees no more than the frame.
+        view: which of these.
+    """
+    assert views.images is not None
+    picture = views.images.taken(frame) if isinstance(views.images, Photographs) else views.images[frame]
+    image = Image.fromarray(picture)
+    own, other = views.cameras.Ks[frame].astype(np.float64), cameras.Ks[view].astype(np.float64)
+    size = np.array([cameras.widths[view], cameras.heights[view]])
+    # Pixels of the frame's camera: where the window begins, and how large it is; then pixels as they were taken.
+    zoom = np.diag(own)[:2] / np.diag(other)[:2]
+    begins = own[:2, 2] - zoom * other[:2, 2]
+    taken = np.array(image.size) / (views.cameras.widths[frame], views.cameras.heights[frame])
+    low, high = (np.clip(taken * edge, 0, image.size) for edge in (begins, begins + zoom * size))
+    if max(np.abs(low).max(), np.abs(high - image.size).max()) < ROUNDED:
+        return resized_picture(picture, tuple(size.tolist()))
+    return np.asarray(image.resize(tuple(size.tolist()), Image.Resampling.LANCZOS, box=(*low, *high)))
 
 
 def with_photographs(scene: Scene, taken: Scene) -> Scene:
@@ -60,7 +105,7 @@ def with_photographs(scene: Scene, taken: Scene) -> Scene:
             f"photos: scene {taken.name} has no photograph of {len(missing)} of {len(scene.views)} frames: "
             f"{listed(missing, TOLD)}"
         )
-    rows = [place[name] for name in scene.views.names]
+    rows = np.array([place[name] for name in scene.views.names], np.int64)
     own, other = scene.views.cameras, taken.views.cameras.select(rows)
     apart = [scene.views.names[view] for view in np.flatnonzero(_differ(own, other, taken.origin - scene.origin))]
     if apart:
@@ -68,7 +113,7 @@ def with_photographs(scene: Scene, taken: Scene) -> Scene:
             f"photos: the cameras of scene {taken.name} are not those of the features: {len(apart)} of "
             f"{len(scene.views)} differ, {listed(apart, TOLD)}; give the scene that the features were made from"
         )
-    return replace(scene, views=replace(scene.views, images=Photographs(taken.views.images, rows, own)))
+    return replace(scene, views=replace(scene.views, images=Photographs(taken.views, rows, own)))
 
 
 def _differ(own: Cameras, other: Cameras, offset: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from gsencoder.errors import InputError
 from gsencoder.infer.marks import draw_marks
-from gsencoder.infer.photographs import resized_picture
+from gsencoder.infer.photographs import photograph_of
 from gsencoder.infer.pictures import Picture, contact_sheet, draw_boxes
 from gsencoder.infer.view_set import Chosen, ViewSet
 from gsencoder.infer.view_targets import Target
@@ -60,10 +60,8 @@ def view_pictures(
 def _photograph(scene: Scene, views: ViewSet, view: int) -> Picture:
     frame = views.chosen[view].frame
     assert scene.views is not None
-    assert scene.views.images is not None
     assert frame is not None
-    size = int(views.cameras.widths[view]), int(views.cameras.heights[view])
-    return resized_picture(scene.views.images[frame], size)
+    return photograph_of(scene.views, frame, views.cameras, view)
 
 
 def view_sheet(

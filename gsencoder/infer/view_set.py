@@ -98,8 +98,8 @@ class Chosen:
     """Why a view was chosen.
 
     Attributes:
-        name: of the frame, or "around mug 03".
-        frame: which of the scene's views it is; None where it was placed.
+        name: of the frame, "IMG_2.jpg near mug" for a close-up, or "around mug 03".
+        frame: which of the scene's views it is or is cut from; None where it was placed.
         clearance: world units from the camera to the nearest surface.
         gain: what it added to the choice; None for uniform frames.
         covered: how well this view and those before it show the targets' Gaussians, by `coverage`: 1 = each as well

@@ -16,6 +16,8 @@ from gsencoder.data.orbits import orbit_cameras
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.evenly import evenly
 from gsencoder.infer.free_space import FreeSpace
+from gsencoder.infer.photographs import photograph_cameras
+from gsencoder.infer.view_closeups import closeups
 from gsencoder.infer.view_frames import frames_on
 from gsencoder.infer.view_judge import JUDGED, Looks, as_photographs, look
 from gsencoder.infer.view_set import Chosen, Sight, ViewsConfig, ViewSet
@@ -35,7 +37,8 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
     """The views that show targets best.
 
     Args:
-        scene: Gaussians, and cameras where it has any. Frames of a scene with photographs are judged as these.
+        scene: Gaussians, and cameras where it has any. Frames of a scene with photographs are judged as these, and
+            close-ups cut from them are candidates too.
         targets: what is looked at; all count alike. Evenly spread frames need none.
         config: see there.
 
@@ -158,7 +161,16 @@ def _candidates(
     spaces = [free.without(target.rows) for target in targets]
     if config.source != "shells" and own is not None and scene.views is not None:
         room = config.candidates if config.source == "frames" else config.candidates // 2
-        taken = frames_on(own, gaussians, targets, room, spaces)
+        if scene.views.images is not None and room >= 2 * len(targets):
+            sharp = frames_on(own, gaussians, targets, room - room // 2, spaces)
+            large = photograph_cameras(scene.views).select(sharp)
+            for target, part in zip(targets, _shared_out(room // 2, len(targets)), strict=True):
+                near, rows = closeups(large, gaussians, target, width=config.width, height=config.height)
+                some = evenly(len(near), part)
+                parts.append(near.select(some))
+                names += [f"{scene.views.names[view]} near {target.name}" for view in sharp[rows[some]]]
+                frames += sharp[rows[some]].tolist()
+        taken = frames_on(own, gaussians, targets, room - len(frames), spaces)
         parts.append(_shown(own.select(taken), config))
         names += [scene.views.names[view] for view in taken]
         frames += taken.tolist()
