@@ -162,14 +162,13 @@ def _candidates(
     if config.source != "shells" and own is not None and scene.views is not None:
         room = config.candidates if config.source == "frames" else config.candidates // 2
         if scene.views.images is not None and room >= 2 * len(targets):
-            sharp = frames_on(own, gaussians, targets, room - room // 2, spaces)
-            large = photograph_cameras(scene.views).select(sharp)
-            for target, part in zip(targets, _shared_out(room // 2, len(targets)), strict=True):
-                near, rows = closeups(large, gaussians, target, width=config.width, height=config.height)
-                some = evenly(len(near), part)
-                parts.append(near.select(some))
-                names += [f"{scene.views.names[view]} near {target.name}" for view in sharp[rows[some]]]
-                frames += sharp[rows[some]].tolist()
+            large = photograph_cameras(scene.views)
+            for target, space, part in zip(targets, spaces, _shared_out(room // 2, len(targets)), strict=True):
+                best = frames_on(own, gaussians, [target], part, [space])
+                near, rows = closeups(large.select(best), gaussians, target, width=config.width, height=config.height)
+                parts.append(near)
+                names += [f"{scene.views.names[view]} near {target.name}" for view in best[rows]]
+                frames += best[rows].tolist()
         taken = frames_on(own, gaussians, targets, room - len(frames), spaces)
         parts.append(_shown(own.select(taken), config))
         names += [scene.views.names[view] for view in taken]
