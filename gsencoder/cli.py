@@ -23,6 +23,7 @@ from gsencoder.commands import COMMANDS, Command
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.options import near
 from gsencoder.printable import printable
+from gsencoder.stopping import Stopped, stop_of
 
 FLAGS = {
     "--help": "show this help (-h)",
@@ -32,14 +33,6 @@ FLAGS = {
     "--multirun": "run every combination of values, key=1,2,3 (-m); run k writes to OUT/k",
 }
 SHORT = {"-h": "--help", "-m": "--multirun"}
-
-
-class Stopped(BaseException):
-    """The process was asked to end; raised where it was, so that half-written output is removed."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,15 +51,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         _report("error", str(error), debug)
         return 2
-    except KeyboardInterrupt:
-        _report("interrupted", "", debug)
-        return 130
-    except Stopped as stop:
+    except (KeyboardInterrupt, Stopped) as stop:
         return _stopped(stop, debug)
     except SystemError as error:
-        # A signal that arrives within a compiled function comes out wrapped.
-        inner = error.__cause__ or error.__context__
-        if not isinstance(inner, Stopped):
+        inner = stop_of(error)
+        if inner is None:
             raise
         return _stopped(inner, debug)
     except BrokenPipeError:
@@ -80,7 +69,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _stopped(stop: Stopped, debug: bool) -> int:
+def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:
+    if isinstance(stop, KeyboardInterrupt):
+        _report("interrupted", "", debug)
+        return 128 + signal.SIGINT
     _report("stopped", signal.Signals(stop.number).name, debug)
     return 128 + stop.number
 

@@ -25,6 +25,7 @@ from gsencoder.data.repair import FIXES
 from gsencoder.data.splats import load_splat, save_splat
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.outputs import output_folder
+from gsencoder.stopping import Stopped
 from gsencoder.types import Gaussians
 
 
@@ -245,7 +246,7 @@ def test_a_defect_of_ours_keeps_its_traceback(toy: Any) -> None:
         cli.main(["toy"])
 
 
-def wrapped(stop: cli.Stopped) -> SystemError:
+def wrapped(stop: Stopped) -> SystemError:
     """As compiled code lets an exception out that a signal raised within it."""
     error = SystemError("returned a result with an exception set")
     error.__cause__ = stop
@@ -256,8 +257,8 @@ def wrapped(stop: cli.Stopped) -> SystemError:
     ("error", "code", "said"),
     [
         (KeyboardInterrupt(), 130, "interrupted\n"),
-        (cli.Stopped(15), 143, "stopped: SIGTERM\n"),
-        (wrapped(cli.Stopped(15)), 143, "stopped: SIGTERM\n"),
+        (Stopped(15), 143, "stopped: SIGTERM\n"),
+        (wrapped(Stopped(15)), 143, "stopped: SIGTERM\n"),
         (OSError(28, "No space left on device"), 2, "error: standard output: no space left on the device\n"),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "gsencoder"
 
 LEVELS = (
-    ("errors", "evenly", "rounding"),
+    ("errors", "evenly", "rounding", "stopping"),
     ("types", "tracking"),
     ("geometry",),
     ("render", "data"),

@@ -24,6 +24,7 @@ from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render.quality import WINDOW as SSIM_WINDOW
 from gsencoder.render.quality import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
+from gsencoder.stopping import held_back
 from gsencoder.types import Gaussians
 
 LARGEST_RATE = 10.0
@@ -176,6 +177,7 @@ class Optimizer:
         view = self.view_at(self.step)
         shot = self.photographs.shot(view, self.config.shrink_at(self.step))
         terms: dict[str, float] = {}
+        grads: Parameters = {}
         raster, rows, seen = self._look(view, shot, self.config.degree_at(self.step))
         if len(rows):
             losses = losses_of(raster, shot, self.config)
@@ -183,17 +185,19 @@ class Optimizer:
             total.backward()
             grads = {name: value.grad for name, value in seen.items() if value.grad is not None}
             self._check(view, losses, grads)
-            self.whole = False
-            rates = self.config.rates_at(self.step, self.extent)
-            self.adam.step(rows, grads, rates)
-            if self.leash is not None:
-                self.leash.pull(self.raw["means"], rows, rates["means"])
             terms = {name: float(value.detach()) for name, value in losses.items()}
-        self.whole = False
-        self.step += 1
-        if self.pruning.due(self.step, self.config.steps):
-            self.prune()
-        self.whole = True
+        # A step that is cut in two could not be gone on with.
+        with held_back():
+            self.whole = False
+            if len(rows):
+                rates = self.config.rates_at(self.step, self.extent)
+                self.adam.step(rows, grads, rates)
+                if self.leash is not None:
+                    self.leash.pull(self.raw["means"], rows, rates["means"])
+            self.step += 1
+            if self.pruning.due(self.step, self.config.steps):
+                self.prune()
+            self.whole = True
         return terms
 
     def _look(self, view: int, shot: Shot, degree: int) -> tuple[Raster, Int64[Tensor, " n"], Parameters]:

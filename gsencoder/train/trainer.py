@@ -22,6 +22,7 @@ from gsencoder.errors import InputError
 from gsencoder.models.choices import Precision
 from gsencoder.models.device import autocast_dtype
 from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.stopping import held_back, stop_of
 from gsencoder.tracking import Track, untracked
 from gsencoder.train.checkpoint import CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
@@ -131,7 +132,6 @@ class Trainer:
             _groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
         )
         self.state = TrainingState()
-        self._in_step = False
         self.validated: Validated | None = None
         if (folder / CHECKPOINT_FILE).is_file():
             self.state = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
@@ -155,8 +155,8 @@ class Trainer:
         self._autocast = autocast_dtype(config.precision, device)
 
     def run(self, track: Track = untracked) -> TrainingState:
-        """All steps that are left. Whatever stops the run between two steps, an interrupt, a signal or an error of the
-        input, leaves a checkpoint of the last one.
+        """All steps that are left. Whatever stops the run, an interrupt, a signal or an error of the input, leaves a
+        checkpoint of the last step that was done.
 
         Raises:
             InputError: a sample cannot be made, or a loss or gradient is not finite; the samples and the term are
@@ -165,9 +165,8 @@ class Trainer:
         try:
             self._run(track)
         except BaseException as stop:
-            foreseen = isinstance(stop, InputError) or not isinstance(stop, Exception)
-            # What is within a step is not saved: the checkpoint before it continues to the same losses.
-            if foreseen and not self._in_step and self.state.step:
+            foreseen = isinstance(stop, InputError) or not isinstance(stop, Exception) or stop_of(stop) is not None
+            if foreseen and self.state.step:
                 with suppress(InputError):
                     self.save()
             raise
@@ -183,10 +182,13 @@ class Trainer:
             self._close()
         batches = iter(self._loader(first))
         for step in track(range(first, config.steps), "training"):
-            losses = self._step(step, [next(batches) for _ in range(config.accumulate)])
+            losses = self._gradients(step, [next(batches) for _ in range(config.accumulate)])
             unlogged = (*self.state.unlogged, losses)
-            self.state = TrainingState(step=step + 1, seconds=time.monotonic() - start, unlogged=unlogged, closed=False)
-            self._in_step = False
+            # A checkpoint of half a step would continue to other losses.
+            with held_back():
+                self.optimizer.step()
+                seconds = time.monotonic() - start
+                self.state = TrainingState(step=step + 1, seconds=seconds, unlogged=unlogged, closed=False)
             self._close()
             if time.monotonic() - saved >= config.checkpoint_every or self.state.step == config.steps:
                 self.save()
@@ -232,8 +234,9 @@ class Trainer:
             prefetch_factor=4 if config.workers else None,
         )
 
-    def _step(self, step: int, made: list[Batch | InputError]) -> dict[str, float]:
-        """One optimiser step; returns the losses of all processes together."""
+    def _gradients(self, step: int, made: list[Batch | InputError]) -> dict[str, float]:
+        """What one optimiser step goes by; returns the losses of all processes together."""
+        self.optimizer.zero_grad(set_to_none=True)
         rate = self.rate_at(step)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -254,9 +257,6 @@ class Trainer:
             parts.append(shares.detach().double())
         norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), self.config.clip or math.inf).item()
         totals = self._finite_totals(step, batches, torch.stack(parts), norm)
-        self._in_step = True
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
         losses = dict(zip(lambdas, totals, strict=True))
         total = sum(lambdas[name] * loss for name, loss in losses.items())
         return {"loss": total, **losses, "gradient": norm, "learning_rate": rate}
@@ -357,6 +357,6 @@ def _begin_worker(worker: int) -> None:  # noqa: ARG001
 
 def _quiet_of_ended_connections(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """A training process that is stopped while it takes a sample from a worker says why itself; the thread that handed
-    the sample over would print that its connection was reset."""
-    if not issubclass(kind, ConnectionError):
+    the sample over would print that its connection was reset, or ended."""
+    if not issubclass(kind, ConnectionError | EOFError):
         sys.__excepthook__(kind, error, trace)

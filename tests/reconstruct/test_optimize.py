@@ -1,7 +1,10 @@
 """Fitting: it gets better, it takes up where it stopped, it prunes what does nothing, and nothing bad gets in."""
 
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,6 +83,24 @@ def test_each_round_shows_every_photograph_once() -> None:
     one = optimizer()
     for turn in range(3):
         assert sorted(one.view_at(3 * turn + place) for place in range(3)) == [0, 1, 3]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_signal_within_a_step_is_heard_after_it() -> None:
+    whole, cut = optimizer(), optimizer()
+    step = cut.adam.step
+
+    def half(*arguments: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        step(*arguments)
+
+    cut.adam.step = half  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        cut.advance()
+    whole.advance()
+    assert (cut.step, cut.whole) == (1, True)
+    for name, value in whole.raw.items():
+        assert torch.equal(value, cut.raw[name]), name
 
 
 def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None:

@@ -20,11 +20,12 @@ from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
 from gsencoder.data.archive import open_archive, write_archive
 from gsencoder.errors import InputError, SceneWarning
+from gsencoder.stopping import Stopped
 from gsencoder.train.checkpoint import CHECKPOINT_FILE
 from gsencoder.train.log import LOG_FILE, read_log
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.trainer import Trainer, TrainerConfig, Validated
+from gsencoder.train.trainer import Trainer, TrainerConfig, Validated, _quiet_of_ended_connections
 
 Prepared = tuple[PreparedDataset, list[str]]
 
@@ -97,6 +98,49 @@ def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset: Prep
     again.run()
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
     assert_same_weights(tmp_path / "cut", tmp_path / "whole")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path / "whole").run()
+    cut = trainer(dataset, tmp_path / "cut")
+    step = cut.optimizer.step
+
+    def half() -> None:
+        if cut.state.step == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        step()
+
+    cut.optimizer.step = half  # type: ignore[method-assign,assignment]
+    with pytest.raises(KeyboardInterrupt):
+        cut.run()
+    assert steps_in(tmp_path / "cut") == 5
+    trainer(dataset, tmp_path / "cut").run()
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert_same_weights(tmp_path / "cut", tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("cause", "saved"), [(Stopped(15), True), (KeyboardInterrupt(), True), (None, False)])
+def test_a_stop_that_compiled_code_wraps_is_a_stop(
+    dataset: Prepared, tmp_path: Path, cause: BaseException | None, saved: bool
+) -> None:
+    def stop_at_three(steps: range, label: str):
+        for step in steps:
+            if step == 3:
+                raise SystemError("returned a result with an exception set") from cause
+            yield step
+
+    with pytest.raises(SystemError):
+        trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9)).run(stop_at_three)
+    assert (tmp_path / CHECKPOINT_FILE).is_file() == saved
+
+
+def test_a_worker_whose_training_process_is_gone_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    for error in (ConnectionResetError(), BrokenPipeError(), EOFError()):
+        _quiet_of_ended_connections(type(error), error, None)
+    assert capsys.readouterr().err == ""
+    _quiet_of_ended_connections(ValueError, ValueError("wrong"), None)
+    assert "ValueError: wrong" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("at", [4, 8])
