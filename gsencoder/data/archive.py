@@ -1,11 +1,14 @@
 """One safetensors file with a JSON header: written whole or not at all, and on load checked against what it must hold.
 
 A file comes from anywhere: an array of another size would otherwise be broadcast, or end the run far from its cause.
+A disk or a transfer may change it: files of version 2 carry checksums (`checksums.py`) of header and arrays, and each
+array is held against its own when it is read. Version 1 had none, and is read with a warning.
 """
 
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,12 +17,18 @@ from typing import Any
 import numpy as np
 
 from gsencoder.data.atomic import is_full_disk
-from gsencoder.errors import InputError, about
+from gsencoder.data.checksums import block_checksums, bytes_of, file_digest, wrong_blocks
+from gsencoder.errors import InputError, SceneWarning, about
 
-VERSION = 1
+VERSION = 2
+WITHOUT_CHECKSUMS = 1
+"""The version whose files have none, but for packages, which had one over the whole file."""
+OWN_KEYS = ("version", "checksums", "digest")
+"""Keys of the header that are not the caller's: the blocks' checksums by array, and the digest over everything else."""
 LARGEST_NUMBER = 2.0**63
 DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", "I64": "int64", "U8": "uint8"}
 """safetensors' names of the number types that are written here."""
+DAMAGED = "the file is damaged"
 
 
 def first_difference(found: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = "") -> str:
@@ -42,8 +51,30 @@ class Archive:
     """
 
     def __init__(self, path: Path, file: Any, header: dict[str, Any]) -> None:
+        """Args:
+        path: of the file.
+        file: it, opened by safetensors.
+        header: what it says of itself.
+
+        Raises:
+            InputError: another version, or a header that has been changed since it was written.
+        """
         self.path, self.sizes = path, dict[str, int]()
         self._file, self._header, self._names = file, header, frozenset(file.keys())
+        version = header.get("version")
+        self.checksums: Mapping[str, str] | None = None
+        if type(version) is int and version == WITHOUT_CHECKSUMS and not {"checksums", "digest"} & set(header):
+            if "sum" not in header:
+                warn_without_checksums(path)
+            return
+        if version != VERSION:
+            raise InputError(f"{path}: expected version {VERSION} of the format, got {str(version)[:20]}")
+        covered = {key: value for key, value in header.items() if key != "digest"}
+        checksums = header.get("checksums")
+        good = isinstance(checksums, dict) and checksums.keys() == self._names
+        if not good or header.get("digest") != file_digest(covered, {name: self._stored(name) for name in self._names}):
+            raise InputError(f"{path}: {DAMAGED}: its header does not have the checksum that was written with it")
+        self.checksums = checksums
 
     def array(self, name: str, dtype: str, shape: tuple[int | str, ...]) -> np.ndarray:
         """An array; a letter in its shape means the same size in all arrays of the file.
@@ -60,7 +91,7 @@ class Archive:
                 "the file is damaged or from another program"
             )
         self.sizes |= {side: size for side, size in zip(wanted, got, strict=True) if isinstance(side, str)}
-        values: np.ndarray = self._file.get_tensor(name)
+        values = self._read(name)
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             bad = values.size - int(np.count_nonzero(np.isfinite(values)))
             raise InputError(f"{self.path}: {bad} of {values.size} values of {name} are not finite")
@@ -79,6 +110,12 @@ class Archive:
                 "the file is damaged or from another program"
             )
         return shape
+
+    def _read(self, name: str) -> np.ndarray:
+        values: np.ndarray = self._file.get_tensor(name)
+        if self.checksums is not None and wrong_blocks(bytes_of(values), self.checksums[name]):
+            raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
+        return values
 
     def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
         """Type and size of an array as the file states them."""
@@ -105,15 +142,19 @@ class Archive:
         return value
 
     def verify(self) -> None:
-        """Checks the sum that `write_archive` wrote with the contents, which reads all of them.
+        """Reads all arrays and holds them against their checksums; those of version 1 against the sum of the file.
 
         Raises:
-            InputError: there is none, or the file is damaged.
+            InputError: the file is damaged, or has no checksums.
         """
+        if self.checksums is not None:
+            for name in sorted(self._names):
+                self._read(name)
+            return
         arrays = {name: self._file.get_tensor(name) for name in self._names}
         header = {key: value for key, value in self._header.items() if key not in ("version", "sum")}
-        if self.value("sum", str) != _sum(arrays, header):
-            raise InputError(f"{self.path}: its contents do not have the sum that was written with them; it is damaged")
+        if self.value("sum", str) != _sum_of_version_1(arrays, header):
+            raise InputError(f"{self.path}: {DAMAGED}: it does not have the checksum that was written with it")
 
     def __contains__(self, key: str) -> bool:
         return key in self._header or key in self._names
@@ -123,7 +164,22 @@ def _listed(shape: tuple[int | str, ...]) -> str:
     return ", ".join(map(str, shape))
 
 
-def _sum(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
+def warn_without_checksums(path: Path) -> None:
+    """One warning a folder: a run may read hundreds of files of one kind from it."""
+    if path.parent not in _WARNED:
+        _WARNED.add(path.parent)
+        warnings.warn(
+            f"{path}: was written by an earlier version, without checksums, so damage to it or to files beside it "
+            "would not be noticed; make it anew to have them",
+            SceneWarning,
+            stacklevel=5,
+        )
+
+
+_WARNED: set[Path] = set()
+
+
+def _sum_of_version_1(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
     """sha256 over the header and over names, types, shapes and bytes of all arrays."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
@@ -133,16 +189,13 @@ def _sum(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def write_archive(
-    path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], *, summed: bool = False
-) -> None:
-    """Writes arrays and header; what had the name stays until the new file is whole.
+def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+    """Writes arrays and header with their checksums; what had the name stays until the new file is whole.
 
     Args:
         path: the file.
-        arrays: by name.
-        header: values that JSON has.
-        summed: with a sum for `Archive.verify`.
+        arrays: by name, of the types in `DTYPES`.
+        header: values that JSON has, under other keys than `OWN_KEYS`.
 
     Raises:
         InputError: the disk is full, or the system refuses.
@@ -151,10 +204,16 @@ def write_archive(
     from safetensors.numpy import save_file
 
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    told = {**header, "sum": _sum(arrays, header)} if summed else header
-    metadata = {"gsencoder": json.dumps({"version": VERSION, **told})}
+    pieces = {name: _contiguous(array) for name, array in arrays.items()}
+    assert not set(OWN_KEYS) & set(header)
+    assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that readers do not know"
+    checksums = {name: block_checksums(array) for name, array in pieces.items()}
+    # As it will be read: JSON makes lists of tuples and text of keys.
+    covered = json.loads(json.dumps({**header, "version": VERSION, "checksums": checksums}))
+    digest = file_digest(covered, {name: (array.dtype.name, array.shape) for name, array in pieces.items()})
+    metadata = {"gsencoder": json.dumps({**covered, "digest": digest})}
     try:
-        save_file({name: _contiguous(array) for name, array in arrays.items()}, temporary, metadata)
+        save_file(pieces, temporary, metadata)
         with temporary.open("rb") as stream:
             os.fsync(stream.fileno())
         # safetensors writes files that nobody else may read.
@@ -190,36 +249,11 @@ def open_archive(path: Path) -> Iterator[Archive]:
     try:
         with about(path), safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
-            if not isinstance(header, dict) or header.get("version") != VERSION:
-                found = header.get("version") if isinstance(header, dict) else None
-                raise InputError(f"{path}: expected version {VERSION} of the format, got {found}")
+            if not isinstance(header, dict):
+                raise InputError(f"{path}: expected version {VERSION} of the format, got none")
             yield Archive(path, file, header)
     except InputError:
         raise
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged or no safetensors file: {message}") from error
-
-
-def map_arrays(path: Path, wanted: Mapping[str, tuple[str, int]]) -> dict[str, np.ndarray]:
-    """Arrays of a file as read-only memory maps: only what is looked at is read, and processes share it.
-
-    Values are not looked at, so the file must be one that this program wrote whole.
-
-    Args:
-        path: the file.
-        wanted: dtype and number of axes of each array.
-
-    Raises:
-        InputError: missing, damaged, or without these arrays.
-    """
-    with open_archive(path) as file:
-        sizes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in wanted.items()}
-    raw = np.memmap(path, dtype=np.uint8, mode="r")
-    begin = 8 + int.from_bytes(raw[:8].tobytes(), "little")
-    entries = json.loads(raw[8:begin].tobytes())
-    mapped = {}
-    for name, (dtype, _) in wanted.items():
-        first, last = entries[name]["data_offsets"]
-        mapped[name] = raw[begin + first : begin + last].view(dtype).reshape(sizes[name])
-    return mapped

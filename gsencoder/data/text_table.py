@@ -7,19 +7,19 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.data.atomic import atomic_file
+from gsencoder.data.archive import open_archive, warn_without_checksums, write_archive
 from gsencoder.data.npz import read_npz
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, about
 from gsencoder.types import FeatureSpace
 
 UNIT_TOLERANCE = 1e-2
 """How far from 1 the norm of a stored embedding may be: float16 rounding is about 1e-3."""
-FORMAT = "gsencoder text table 1"
+FORMAT_1 = "gsencoder text table 1"
 LONGEST_SHOWN = 80
 """Characters of an unknown word that its error repeats."""
 
@@ -163,11 +163,11 @@ def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
         zipped = stream.read(2) == b"PK"
     if zipped or file.suffix == ".npz":
         return _read_npz(file, encoder)
-    return _read_safetensors(file)
+    return _read_version_1(file) if _is_version_1(file) else _read_archive(file)
 
 
 def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float32", "float16"] = "float32") -> None:
-    """Writes the table as safetensors (embeddings and mean), with the names and the space as JSON in its header.
+    """Writes the table as an archive of embeddings and mean, with the names and the space in its header.
 
     Args:
         path: the file.
@@ -177,44 +177,68 @@ def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float
     Raises:
         InputError: the file cannot be written; what was there before stays.
     """
-    from safetensors.numpy import save
-
     space = {item.name: getattr(table.space, item.name) for item in fields(table.space)}
-    header = json.dumps({"names": table.names, "space": space}, ensure_ascii=False)
-    data = save({"embeddings": table.embeddings.astype(dtype), "mean": table.mean}, {"format": FORMAT, "table": header})
-    with atomic_file(path) as stream:
-        stream.write(data)
+    arrays = {"embeddings": table.embeddings.astype(dtype), "mean": table.mean}
+    write_archive(Path(path), arrays, {"names": list(table.names), "space": space, "dtype": dtype})
 
 
-def _read_safetensors(file: Path) -> TextTable:
+def _read_archive(file: Path) -> TextTable:
+    with open_archive(file) as archive:
+        dtype = archive.value("dtype", str)
+        if dtype not in ("float32", "float16"):
+            raise InputError(f"{file}: expected embeddings of float32 or float16, got {dtype[:20]!r}")
+        arrays = {
+            "embeddings": archive.array("embeddings", dtype, ("C", "D")),
+            "mean": archive.array("mean", "float32", ("D",)),
+        }
+        return _table(file, archive.value("names", list), archive.value("space", dict), arrays)
+
+
+def _is_version_1(file: Path) -> bool:
+    """Whether a safetensors file is a text table as the first version wrote it: with a format of its own, and without
+    checksums."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(file, framework="np") as stored:
-            metadata = stored.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise InputError(f"{file}: is no text table of this version (expected {FORMAT!r} in its header)")
-            arrays = {name: stored.get_tensor(name) for name in ("embeddings", "mean")}
-        header = json.loads(metadata["table"])
-        names, space = header["names"], FeatureSpace(**header["space"])
-        good = all(isinstance(name, str) for name in names) and isinstance(space.channels, int)
-        good &= all(isinstance(getattr(space, item.name), str) for item in fields(space) if item.name != "channels")
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
+            return (stored.metadata() or {}).get("format") == FORMAT_1
+    except (OSError, SafetensorError, ValueError) as error:
         raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
+
+
+def _read_version_1(file: Path) -> TextTable:
+    from safetensors import SafetensorError, safe_open
+
+    warn_without_checksums(file)
+    try:
+        with safe_open(file, framework="np") as stored:
+            arrays = {name: stored.get_tensor(name) for name in ("embeddings", "mean")}
+            header = json.loads(stored.metadata()["table"])
+        names, space = header["names"], header["space"]
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
+    return _table(file, names, space, arrays)
+
+
+def _table(file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray]) -> TextTable:
+    """A table of what a file holds.
+
+    Raises:
+        InputError: other types, shapes or values than a table has.
+    """
     shapes = arrays["embeddings"].ndim == 2 and arrays["mean"].ndim == 1
     types = arrays["embeddings"].dtype in (np.float32, np.float16) and arrays["mean"].dtype == np.float32
-    if not good or not shapes or not types:
+    texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    texts &= isinstance(space, dict) and set(space) <= {item.name for item in fields(FeatureSpace)}
+    texts = texts and all(isinstance(value, int if key == "channels" else str) for key, value in space.items())
+    if not texts or not {"name", "channels"} <= set(space) or not shapes or not types:
         raise InputError(
             f"{file}: expected embeddings [C, D] of float32 or float16, a float32 mean [D], names and a space of text"
         )
     if arrays["embeddings"].dtype == np.float16:
         arrays["embeddings"] = unrounded(arrays["embeddings"].astype(np.float32))
-    try:
-        return TextTable(names=tuple(names), space=space, **arrays)
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from error
+    with about(file):
+        return TextTable(names=tuple(names), space=FeatureSpace(**space), **arrays)
 
 
 def _read_npz(file: Path, encoder: str) -> TextTable:

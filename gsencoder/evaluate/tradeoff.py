@@ -6,13 +6,13 @@ what is timed is what the knobs change: blending, visibility, basis and lift. Ro
 """
 
 import itertools
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeds import SeedConfig, seed
@@ -23,11 +23,12 @@ from gsencoder.evaluate.localization import LocalizationProtocol, ask
 from gsencoder.evaluate.memory import memory_growth
 from gsencoder.fusion.field_error import FieldError, field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.tracking import Track, untracked
-from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Scene, Views
+from gsencoder.types import GaussianFeatures, Scene
 
 REFERENCE = "reference"
 """The label of what all others are held against; it is neither on the front nor picked."""
@@ -119,37 +120,6 @@ def _with(base: FuseConfig, knobs: dict[str, Any]) -> FuseConfig:
     return replace(base, blend=replace(base.blend, **blend), **rest)
 
 
-class _KeptTeacher:
-    """A teacher whose maps are made once and stay in memory."""
-
-    cheap = True
-
-    def __init__(self, teacher: Teacher) -> None:
-        self._teacher = teacher
-        self._maps: dict[int, FeatureMap] = {}
-        self.needs_images = teacher.needs_images
-
-    @property
-    def space(self) -> FeatureSpace:
-        return self._teacher.space
-
-    @property
-    def table(self) -> Float32[np.ndarray, "C D"] | None:
-        return self._teacher.table
-
-    @property
-    def mean(self) -> Float32[np.ndarray, " D"] | None:
-        return self._teacher.mean
-
-    def feature_map(self, views: Views, view: int) -> FeatureMap:
-        if view not in self._maps:
-            self._maps[view] = self._teacher.feature_map(views, view)
-        return self._maps[view]
-
-    def settings(self) -> dict[str, Any]:
-        return self._teacher.settings()
-
-
 def trade_off(
     paths: Sequence[str | Path],
     *,
@@ -187,8 +157,10 @@ def trade_off(
         scene = load_scene(path, options=data)
         if scene.gaussians is None:
             scene = replace(scene, gaussians=seed(scene, seeds))
-        kept = _KeptTeacher(build_teacher(teacher, scene, words))
-        per_scene.append(_measure(scene, kept, [reference, *settings], words, protocol, localization, sweep, track))
+        with tempfile.TemporaryDirectory(prefix="gsencoder_maps_") as maps:
+            cached = CachedTeacher(build_teacher(teacher, scene, words), Path(maps))
+            measured = _measure(scene, cached, [reference, *settings], words, protocol, localization, sweep, track)
+        per_scene.append(measured)
     reference_trade, *trades = [_over_scenes([one[place] for one in per_scene]) for place in range(len(settings) + 1)]
     return [replace(reference_trade, label=REFERENCE), *mark_front(trades)]
 

@@ -7,6 +7,7 @@ of views or with the teacher's width.
 """
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -118,12 +119,17 @@ def fuse(
         if basis is not None:
             settings["basis"] = hashlib.sha256(basis.mean.tobytes() + basis.components.tobytes()).hexdigest()[:16]
         kept = PartialFusion(work, settings | {"scene": _identity(scene.gaussians, scene.views)})
-    maps = _Maps(teacher, scene.views, kept, clock)
+    views, cached = scene.views, teacher if kept is None else kept.cached(teacher)
+
+    def map_of(view: int) -> FeatureMap:
+        with clock("teacher"):
+            return cached.feature_map(views, view)
+
     if basis is not None:
         mean: np.ndarray | None = basis.mean
         truncation = 1 - float(np.sqrt(basis.energy_kept))
     else:
-        basis, mean, truncation = _find_basis(maps, chosen, config, clock, track, resumable=kept is not None)
+        basis, mean, truncation = _find_basis(teacher, map_of, chosen, config, clock, track, resumable=kept is not None)
     # Where the mean alone is missing, it is found on the way; not so in a run that may start in the middle.
     moments = Moments(teacher.space.channels, second=False) if mean is None else None
     with clock("lift"):
@@ -131,7 +137,7 @@ def fuse(
         sums = Sums(len(scene.gaussians), columns, basis, teacher.table)
         done = sums.restore(kept)
     for position in track(range(done, len(chosen)), "lifting views"):
-        feature_map = maps.get(chosen[position])
+        feature_map = map_of(chosen[position])
         if moments is not None:
             _add_rows(moments, feature_map, clock)
         b = view_matrix(
@@ -173,32 +179,18 @@ def _identity(gaussians: Gaussians, views: Views) -> dict[str, str]:
     return {"gaussians": fingerprint(gaussians)[:16], "views": digest.hexdigest()[:16]}
 
 
-class _Maps:
-    """The teacher's maps, from disk where they have been made before."""
-
-    def __init__(self, teacher: Teacher, views: Views, kept: PartialFusion | None, clock: Clock) -> None:
-        self.teacher, self.views, self.clock = teacher, views, clock
-        self.kept = None if teacher.cheap else kept
-
-    def get(self, view: int) -> FeatureMap:
-        with self.clock("teacher"):
-            if self.kept is None:
-                return self.teacher.feature_map(self.views, view)
-            found = self.kept.load_map(view, self.teacher.space)
-            if found is not None:
-                return found
-            self.kept.save_map(view, self.teacher.feature_map(self.views, view))
-            # What was written is what is used: a resumed run meets the same float16 values, and so the same basis.
-            found = self.kept.load_map(view, self.teacher.space)
-            assert found is not None
-            return found
-
-
 def _find_basis(
-    maps: _Maps, chosen: tuple[int, ...], config: FuseConfig, clock: Clock, track: Track, *, resumable: bool
+    teacher: Teacher,
+    map_of: Callable[[int], FeatureMap],
+    chosen: tuple[int, ...],
+    config: FuseConfig,
+    clock: Clock,
+    track: Track,
+    *,
+    resumable: bool,
 ) -> tuple[FeatureBasis | None, Float32[np.ndarray, " D"] | None, float]:
     """The basis, the space's mean (None: not known without a pass of its own), and what the basis costs."""
-    teacher, space = maps.teacher, maps.teacher.space
+    space = teacher.space
     wanted = config.basis and space.channels > config.narrow
     if teacher.table is not None:
         mean = teacher.mean if teacher.mean is not None else teacher.table.mean(axis=0)
@@ -210,7 +202,7 @@ def _find_basis(
         return None, teacher.mean, 0.0
     moments = Moments(space.channels, second=wanted)
     for view in track(chosen, "finding the basis"):
-        _add_rows(moments, maps.get(view), clock)
+        _add_rows(moments, map_of(view), clock)
     mean = teacher.mean if teacher.mean is not None else moments.mean.astype(np.float32)
     if not wanted:
         return None, mean, 0.0

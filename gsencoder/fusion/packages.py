@@ -12,9 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsencoder.data.archive import map_arrays, open_archive, write_archive
+from gsencoder.data.archive import open_archive, write_archive
 from gsencoder.data.archived import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.atomic import atomic_file
+from gsencoder.data.mapped_arrays import MappedArrays
 from gsencoder.data.splats import fingerprint, load_splat, save_splat
 from gsencoder.errors import InputError
 from gsencoder.fusion.compact import CompactFeatures, compact
@@ -61,7 +62,7 @@ def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, erro
         "error": made.error,
         "lowest": made.lowest,
     }
-    write_archive(folder / PACKAGE_FILE, arrays | coded, header, summed=True)
+    write_archive(folder / PACKAGE_FILE, arrays | coded, header)
     return made
 
 
@@ -79,15 +80,15 @@ def open_package(file: Path) -> CompactFeatures:
         _, _, basis = read_space(archive)
         if basis is None:
             raise InputError("expected components of a basis; the file is damaged or from another program")
-        mapped = map_arrays(file, {"codes": ("uint8", 2), "weight_codes": ("uint8", 1)})
+        mapped = MappedArrays(file, {"codes": ("uint8", 2), "weight_codes": ("uint8", 1)})
         seen, total = archive.array("seen", "uint8", ("S",)), archive.value("total", int)
         if not 0 <= total <= 8 * len(seen) < total + 8:
             raise InputError(f"expected marks of {total} Gaussians, got {8 * len(seen)}")
         return CompactFeatures(
-            codes=mapped["codes"],
+            codes=mapped.whole("codes"),
             bits=archive.array("bits", "uint8", ("R",)),
             levels=archive.array("levels", "float32", ("L",)),
-            weight_codes=mapped["weight_codes"],
+            weight_codes=mapped.whole("weight_codes"),
             lightest=archive.value("lightest", float, int),
             heaviest=archive.value("heaviest", float, int),
             rows=np.flatnonzero(np.unpackbits(seen, count=total)),

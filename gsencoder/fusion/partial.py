@@ -2,18 +2,17 @@
 
 import json
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.data.archive import Archive, first_difference, open_archive, write_archive
+from gsencoder.data.archive import first_difference, open_archive, write_archive
 from gsencoder.data.atomic import atomic_file
-from gsencoder.errors import InputError
-from gsencoder.types import FeatureMap, FeatureSpace
+from gsencoder.errors import InputError, advised
+from gsencoder.fusion.teacher_maps import CachedTeacher
+from gsencoder.fusion.teachers import Teacher
 
 SETTINGS_FILE, SUMS_FILE = "settings.json", "sums.safetensors"
 
@@ -59,30 +58,9 @@ class PartialFusion:
         """Whether the sums are old enough to be worth saving again."""
         return time.monotonic() - self._last >= self._every
 
-    def save_map(self, view: int, feature_map: FeatureMap) -> None:
-        """Keeps a dense map as float16, scaled by its largest magnitude."""
-        values = feature_map.features
-        assert values is not None, "coded maps are cheap and not kept"
-        self._make()
-        scale = max(float(np.abs(values).max(initial=0)), 1e-30)
-        arrays = {"features": (values / np.float32(scale)).astype(np.float16), "grid": feature_map.grid_from_image}
-        write_archive(self._map(view), arrays, {"scale": scale})
-
-    def load_map(self, view: int, space: FeatureSpace) -> FeatureMap | None:
-        """A map of an earlier run or pass, or None.
-
-        Raises:
-            InputError: the file is damaged.
-        """
-        if not self._map(view).is_file():
-            return None
-        with self._open(self._map(view)) as file:
-            features = file.array("features", "float16", ("h", "w", space.channels)).astype(np.float32)
-            return FeatureMap(
-                features=features * np.float32(file.value("scale", float)),
-                grid_from_image=file.array("grid", "float64", (2, 3)),
-                space=space,
-            )
+    def cached(self, teacher: Teacher) -> CachedTeacher:
+        """The teacher, its maps kept here."""
+        return CachedTeacher(teacher, self.folder, before_write=self._make, advice=self._advice)
 
     def save_sums(self, done: int, sums: Float32[np.ndarray, "N columns"], weights: Float32[np.ndarray, " N"]) -> None:
         """Keeps the sums over the first `done` views."""
@@ -100,20 +78,13 @@ class PartialFusion:
         """
         if not (self.folder / SUMS_FILE).is_file():
             return None
-        with self._open(self.folder / SUMS_FILE) as file:
+        with advised(self._advice), open_archive(self.folder / SUMS_FILE) as file:
             sums = file.array("sums", "float32", (gaussians, columns))
             return file.value("done", int), sums, file.array("weights", "float32", (gaussians,))
 
-    @contextmanager
-    def _open(self, path: Path) -> Iterator[Archive]:
-        try:
-            with open_archive(path) as file:
-                yield file
-        except InputError as error:
-            raise InputError(f"{error}; delete {self.folder} to start anew") from error
-
-    def _map(self, view: int) -> Path:
-        return self.folder / f"map_{view:05d}.safetensors"
+    @property
+    def _advice(self) -> str:
+        return f"delete {self.folder} to start anew"
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

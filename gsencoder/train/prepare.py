@@ -19,6 +19,7 @@ from gsencoder.errors import InputError, advised
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import capped
+from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
 from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
@@ -27,7 +28,7 @@ from gsencoder.tracking import Track
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.prepared import PreparedScene, ViewRows, write_prepared
 from gsencoder.train.rarity import Rarity, cluster_targets, count_targets
-from gsencoder.types import FeatureMap, Scene, Views
+from gsencoder.types import FeatureMap, Scene
 
 SPACE_FILE, SETTINGS_FILE, RARITY_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
 MAPS_PREFIX, MAPS_SECONDS = ".maps.", 24 * 3600.0
@@ -56,36 +57,6 @@ class PrepareConfig:
             )
         if not 0 <= self.render_min_weight < 1:
             raise InputError(f"render_min_weight: expected a number in [0, 1), got {self.render_min_weight}")
-
-
-class KeptMaps:
-    """A teacher whose maps are wanted twice, for the targets and for the rows: a dear one's are kept as files.
-
-    They are kept in half the precision, and the kept ones are what is given, so that both uses see the same.
-    """
-
-    def __init__(self, teacher: Teacher, folder: Path) -> None:
-        self.teacher, self.folder = teacher, folder
-        self.space, self.table, self.mean = teacher.space, teacher.table, teacher.mean
-        self.needs_images, self.cheap = teacher.needs_images, teacher.cheap
-
-    def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The teacher's map of a view, from its file where there is one."""
-        path = self.folder / f"{view}.npz"
-        if self.cheap:
-            return self.teacher.feature_map(views, view)
-        if not path.is_file():
-            found = self.teacher.feature_map(views, view)
-            if found.features is None:
-                return found
-            np.savez(path, features=found.features.astype(np.float16), grid=found.grid_from_image)
-        with np.load(path, allow_pickle=False) as kept:
-            return FeatureMap(
-                features=kept["features"].astype(np.float32), grid_from_image=kept["grid"], space=self.space
-            )
-
-    def settings(self) -> dict[str, Any]:
-        return self.teacher.settings()
 
 
 class PreparedDataset:
@@ -200,7 +171,7 @@ class PreparedDataset:
         path = self.path_of(scene.name)
         path.parent.mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self.folder, prefix=MAPS_PREFIX) as maps:
-            prepare_scene(path, scene, KeptMaps(teacher, Path(maps)), outputs, config, source=source)
+            prepare_scene(path, scene, CachedTeacher(teacher, Path(maps)), outputs, config, source=source)
 
     def remove_leftovers(self) -> None:
         """Removes maps that killed runs left behind."""

@@ -2,11 +2,11 @@
 teacher's cells beside the teacher's vectors there.
 
 The file is memory-mapped: a sample reads the Gaussians and the views that it was given and nothing else, and the data
-workers of one machine share what was read.
+workers of one machine share what was read. What is read is held against its checksums the first time.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from gsencoder.data.archive import map_arrays, open_archive, write_archive
+from gsencoder.data.archive import open_archive, write_archive
 from gsencoder.data.archived import camera_arrays, read_cameras
+from gsencoder.data.mapped_arrays import MappedArrays
 from gsencoder.errors import InputError, about, advised
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene
@@ -65,9 +66,9 @@ class PreparedScene:
         return PreparedScene, (self.path,)
 
     @cached_property
-    def _arrays(self) -> dict[str, np.ndarray]:
+    def _arrays(self) -> MappedArrays:
         with self._whole():
-            arrays = map_arrays(self.path, _ARRAYS)
+            arrays = MappedArrays(self.path, _ARRAYS)
             _check_arrays(arrays, len(self._header[0]))
         return arrays
 
@@ -98,7 +99,7 @@ class PreparedScene:
         self.__dict__.pop("_arrays", None)
 
     def __len__(self) -> int:
-        return len(self._arrays["means"])
+        return self._arrays.shape("means")[0]
 
     @property
     def cameras(self) -> Cameras:
@@ -119,58 +120,55 @@ class PreparedScene:
     @property
     def channels(self) -> int:
         """Columns of the targets."""
-        return int(self._arrays["targets"].shape[1])
+        return self._arrays.shape("targets")[1]
 
     @property
     def means(self) -> Float32[np.ndarray, "N 3"]:
-        return self._arrays["means"]
+        return self._arrays.whole("means")
 
     @property
     def weights(self) -> Float32[np.ndarray, " N"]:
         """How much each Gaussian was seen; 0 = never, and it has no target."""
-        return self._arrays["weights"]
+        return self._arrays.whole("weights")
 
     def gaussians(self, rows: np.ndarray) -> Gaussians:
         """Some of the Gaussians, with degree-0 colours."""
-        arrays = self._arrays
-        return Gaussians(
-            means=arrays["means"][rows],
-            quats=arrays["quats"][rows],
-            scales=arrays["scales"][rows],
-            opacities=arrays["opacities"][rows],
-            sh=arrays["sh_dc"][rows][:, None],
-        )
+        with self._whole():
+            parts = {name: self._arrays.rows(name, rows) for name in ("means", "quats", "scales", "opacities", "sh_dc")}
+        sh = parts.pop("sh_dc")[:, None]
+        return Gaussians(**parts, sh=sh)
 
     def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
         """What the encoder should give for these Gaussians, standard units; zero where never seen."""
-        return self._arrays["targets"][rows].astype(np.float32)
+        with self._whole():
+            return self._arrays.rows("targets", rows).astype(np.float32)
 
     def view(self, view: int) -> ViewRows:
         """One view's rows."""
-        arrays = self._arrays
-        first, last = int(arrays["rows"][view]), int(arrays["rows"][view + 1])
-        crow = np.array(arrays["crow"][first : last + 1])
+        first, last = (int(row) for row in self._arrays.whole("rows")[view : view + 2])
+        crow = np.array(self._arrays.whole("crow")[first : last + 1])
         start, end = int(crow[0]), int(crow[-1])
-        found = ViewRows(
-            crow=crow - start,
-            col=np.array(arrays["col"][start:end]),
-            weight=arrays["weight"][start:end].astype(np.float32),
-            targets=arrays["row_targets"][first:last].astype(np.float32),
-            valid=arrays["row_valid"][first:last].astype(bool),
-        )
         with self._whole():
+            found = ViewRows(
+                crow=crow - start,
+                col=np.array(self._arrays.part("col", start, end)),
+                weight=self._arrays.part("weight", start, end).astype(np.float32),
+                targets=self._arrays.part("row_targets", first, last).astype(np.float32),
+                valid=self._arrays.part("row_valid", first, last).astype(bool),
+            )
             inside = (found.col >= 0) & (found.col < len(self))
             if not inside.all() or not (found.weight >= 0).all() or not np.isfinite(found.targets).all():
                 raise InputError(f"view {self.view_names[view]!r} has entries that no Blend has")
         return found
 
 
-def _check_arrays(arrays: Mapping[str, np.ndarray], views: int) -> None:
+def _check_arrays(arrays: MappedArrays, views: int) -> None:
     """Whether the arrays fit together, and what is looked at of every Gaussian is sound. Entries of B and targets are
     looked at where they are used: here that would read the whole file."""
-    sizes = {name: len(array) for name, array in arrays.items()}
-    columns = {name: array.shape[1:] for name, array in arrays.items()}
-    n, rows, crow = sizes["means"], arrays["rows"], arrays["crow"]
+    stored = {name: arrays.shape(name) for name in _ARRAYS}
+    sizes = {name: shape[0] for name, shape in stored.items()}
+    columns = {name: shape[1:] for name, shape in stored.items()}
+    n, rows, crow = sizes["means"], arrays.whole("rows"), arrays.whole("crow")
     width = columns["targets"]
     shapes = [("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ()), ("sh_dc", (3,)), ("weights", ())]
     good = all(sizes[name] == n and columns[name] == wanted for name, wanted in [*shapes, ("targets", width)])
@@ -181,7 +179,7 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], views: int) -> None:
     good = bool(good) and crow[0] == 0 and bool((np.diff(crow) >= 0).all())
     if not good or not crow[-1] == sizes["col"] == sizes["weight"]:
         raise InputError("its arrays do not fit together")
-    if not np.isfinite(arrays["means"]).all() or not (arrays["weights"] >= 0).all():
+    if not np.isfinite(arrays.whole("means")).all() or not (arrays.whole("weights") >= 0).all():
         raise InputError("it has positions that are not finite, or weights below 0")
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsencoder.data.text_table import TextTable, load_text_table, make_text_table, save_text_table
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning
 
 NAMES = (
     "mug",
@@ -232,13 +232,26 @@ def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None
 
     path = tmp_path / "other.safetensors"
     save_file({"embeddings": np.eye(2, dtype=np.float32)}, path)
-    with pytest.raises(InputError, match="no text table of this version"):
+    with pytest.raises(InputError, match="expected version 2 of the format, got None"):
         load_text_table(path)
     header = json.dumps({"names": ["x"], "space": {"name": "s", "channels": "many"}})
     metadata = {"format": "gsencoder text table 1", "table": header}
     save_file({"embeddings": np.eye(2, dtype=np.float32), "mean": np.zeros(2, np.float32)}, path, metadata)
-    with pytest.raises(InputError):
+    with pytest.warns(SceneWarning), pytest.raises(InputError, match="names and a space of text"):
         load_text_table(path)
+
+
+def test_a_table_of_the_first_version_is_read_with_a_warning(tmp_path: Path) -> None:
+    from safetensors.numpy import save_file
+
+    path = tmp_path / "old.safetensors"
+    header = json.dumps({"names": ["x", "y"], "space": {"name": "s", "channels": 2, "text_encoder": "s"}})
+    arrays = {"embeddings": np.eye(2, dtype=np.float16), "mean": np.full(2, 0.5, np.float32)}
+    save_file(arrays, path, {"format": "gsencoder text table 1", "table": header})
+    with pytest.warns(SceneWarning, match="without checksums"):
+        table = load_text_table(path)
+    assert table.names == ("x", "y")
+    np.testing.assert_array_equal(table.embeddings, np.eye(2))
 
 
 def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
@@ -267,7 +280,7 @@ def test_a_header_nested_without_end_is_refused(tmp_path: Path) -> None:
 
     arrays = {"embeddings": np.eye(2, dtype=np.float32), "mean": np.zeros(2, np.float32)}
     save_file(arrays, tmp_path / "t.safetensors", {"format": "gsencoder text table 1", "table": "[" * 100_000})
-    with pytest.raises(InputError, match="cannot be read as a text table"):
+    with pytest.warns(SceneWarning), pytest.raises(InputError, match="cannot be read as a text table"):
         load_text_table(tmp_path / "t.safetensors")
 
 

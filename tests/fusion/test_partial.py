@@ -1,31 +1,46 @@
 """A fusion under way: what is taken up belongs to this run, and a run that made nothing leaves nothing."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from training_scenes import DenseSideTeacher, scene
 
 from gsencoder.errors import InputError
 from gsencoder.fusion.partial import SETTINGS_FILE, SUMS_FILE, PartialFusion
-from gsencoder.types import FeatureMap, FeatureSpace
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.types import FeatureMap, Views
 
-SPACE = FeatureSpace(name="s", channels=3)
+
+class CountingTeacher(DenseSideTeacher):
+    """Counts the maps that it makes."""
+
+    cheap = False
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        self.calls += 1
+        return super().feature_map(views, view)
 
 
-def some_map() -> FeatureMap:
-    values = np.random.default_rng(0).normal(size=(2, 4, 3)).astype(np.float32)
-    return FeatureMap(features=values, grid_from_image=np.array([[0.5, 0, 0], [0, 0.5, 0]]), space=SPACE)
+def a_map(folder: Path, settings: dict[str, Any], teacher: Teacher | None = None, view: int = 0) -> FeatureMap:
+    views = scene(0).views
+    assert views is not None
+    return PartialFusion(folder, settings).cached(teacher or CountingTeacher()).feature_map(views, view)
 
 
 def test_maps_and_sums_come_back(tmp_path: Path) -> None:
-    kept = PartialFusion(tmp_path / "work", {"a": 1})
-    kept.save_map(7, some_map())
-    kept.save_sums(2, np.ones((5, 3), np.float32), np.full(5, 2, np.float32))
+    teacher = CountingTeacher()
+    first = a_map(tmp_path / "work", {"a": 1}, teacher)
+    PartialFusion(tmp_path / "work", {"a": 1}).save_sums(2, np.ones((5, 3), np.float32), np.full(5, 2, np.float32))
     again = PartialFusion(tmp_path / "work", {"a": 1})
-    found = again.load_map(7, SPACE)
-    assert found is not None
-    np.testing.assert_allclose(found.features, some_map().features, atol=2e-3)
-    assert again.load_map(6, SPACE) is None
+    np.testing.assert_array_equal(a_map(tmp_path / "work", {"a": 1}, teacher).features, first.features)
+    assert teacher.calls == 1
+    a_map(tmp_path / "work", {"a": 1}, teacher, view=1)
+    assert teacher.calls == 2
     sums = again.load_sums(5, 3)
     assert sums is not None
     assert sums[0] == 2
@@ -35,7 +50,7 @@ def test_maps_and_sums_come_back(tmp_path: Path) -> None:
 def test_a_run_that_kept_nothing_leaves_no_folder_to_refuse_the_next(tmp_path: Path) -> None:
     PartialFusion(tmp_path / "work", {"patch": 13})
     assert not (tmp_path / "work").exists()
-    PartialFusion(tmp_path / "work", {"patch": 14}).save_map(0, some_map())
+    a_map(tmp_path / "work", {"patch": 14})
     with pytest.raises(InputError, match="begun with patch=14, and this run asks patch=13; delete it"):
         PartialFusion(tmp_path / "work", {"patch": 13})
 
@@ -50,12 +65,12 @@ def test_settings_that_cannot_be_read_say_what_to_delete(tmp_path: Path, content
 @pytest.mark.parametrize("kept_bytes", [0, 7, 100, 200])
 def test_damaged_maps_and_sums_are_named(tmp_path: Path, kept_bytes: int) -> None:
     kept = PartialFusion(tmp_path, {})
-    kept.save_map(0, some_map())
+    a_map(tmp_path, {})
     kept.save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
     for file in ("map_00000.safetensors", SUMS_FILE):
         (tmp_path / file).write_bytes((tmp_path / file).read_bytes()[:kept_bytes])
     with pytest.raises(InputError, match=r"map_00000\.safetensors.*delete .* to start anew"):
-        kept.load_map(0, SPACE)
+        a_map(tmp_path, {})
     with pytest.raises(InputError, match=r"sums\.safetensors.*delete .* to start anew"):
         kept.load_sums(5, 3)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from safetensors import safe_open
-from safetensors.numpy import load_file, save_file
+from archives import rewrite
+from safetensors.numpy import load_file
 from training_scenes import PREPARE, SPACE, TABLE, DenseSideTeacher, SideTeacher, prepared, scene
 
 from gsencoder.data.archive import write_archive
@@ -130,13 +130,6 @@ def turn_round(array: np.ndarray) -> None:
 def look_at_all(one: PreparedScene) -> None:
     for view in range(len(one.cameras)):
         one.view(view)
-
-
-def rewrite(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Other arrays under the header that the file has."""
-    with safe_open(path, framework="numpy") as file:
-        header = file.metadata()
-    save_file(arrays, path, header)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """The loop: it learns, it goes on after a kill, it does the same on several processes, and it stops before harm."""
 
-import json
 import os
 import signal
 import subprocess
@@ -9,12 +8,11 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
+from archives import header_of
 from safetensors.numpy import load_file
 from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
@@ -194,12 +192,6 @@ def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, 
     trainer(dataset, tmp_path).run()
     with pytest.raises(InputError, match=r"was made with run=1, and this run asks run=2"):
         Trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
-
-
-def header_of(path: Path) -> dict[str, Any]:
-    with safe_open(path, framework="numpy") as file:
-        found: dict[str, Any] = json.loads(file.metadata()["gsencoder"])
-    return found
 
 
 @pytest.mark.parametrize(

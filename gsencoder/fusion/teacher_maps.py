@@ -1,0 +1,109 @@
+"""A teacher whose maps are kept in a folder: made once, and the same for whoever asks again.
+
+Fusing asks for a dense map twice (for the basis and for the sums), preparing a scene three times, a sweep of settings
+as often as it has settings; making a map takes far longer than reading it. What is given is always what the file
+holds, so all of them see the same values.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.errors import advised
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+SMALLEST_SCALE = 1e-30
+
+
+def write_map(path: Path, feature_map: FeatureMap) -> None:
+    """Writes a dense map as float16, each channel divided by its largest magnitude: float16 holds values up to 65,504
+    with three digits, and backbones have channels that are a hundred times larger than others. Cells that are not
+    finite are no part of the map, and are marked as such.
+
+    Raises:
+        InputError: the disk is full, or the system refuses.
+    """
+    values = feature_map.features
+    assert values is not None, "coded maps are as quickly made as read"
+    valid = np.isfinite(values).all(axis=-1)
+    values = np.where(valid[..., None], values, np.float32(0))
+    scale = np.maximum(np.abs(values).max(axis=(0, 1), initial=0), np.float32(SMALLEST_SCALE))
+    arrays = {
+        "features": (values / scale).astype(np.float16),
+        "channel_scale": scale,
+        "valid": valid.astype(np.uint8),
+        "grid": feature_map.grid_from_image,
+    }
+    write_archive(path, arrays, {})
+
+
+def read_map(path: Path, space: FeatureSpace) -> FeatureMap:
+    """The map of a file; cells that had none are NaN.
+
+    Raises:
+        InputError: the file is damaged, or of another space.
+    """
+    with open_archive(path) as file:
+        features = file.array("features", "float16", ("h", "w", space.channels)).astype(np.float32)
+        features *= file.array("channel_scale", "float32", (space.channels,))
+        features[file.array("valid", "uint8", ("h", "w")) == 0] = np.nan
+        grid = file.array("grid", "float64", (2, 3))
+    return FeatureMap(features=features, grid_from_image=grid, space=space)
+
+
+class CachedTeacher:
+    """A teacher with its dense maps cached as files; those of cheap teachers, and coded ones, are made each time.
+
+    Attributes:
+        space, table, mean, needs_images, cheap: as the teacher has them.
+    """
+
+    def __init__(
+        self, teacher: Teacher, folder: Path, *, before_write: Callable[[], None] = lambda: None, advice: str = ""
+    ) -> None:
+        """Args:
+        teacher: whose maps.
+        folder: of one scene's maps of this teacher and no other; whoever gives it sees to that.
+        before_write: called before a file is written.
+        advice: what to do about a damaged file, for the error.
+        """
+        self.teacher, self._folder, self._before_write, self._advice = teacher, folder, before_write, advice
+        self.needs_images, self.cheap = teacher.needs_images, teacher.cheap
+
+    @property
+    def space(self) -> FeatureSpace:
+        return self.teacher.space
+
+    @property
+    def table(self) -> Float32[np.ndarray, "C D"] | None:
+        return self.teacher.table
+
+    @property
+    def mean(self) -> Float32[np.ndarray, " D"] | None:
+        return self.teacher.mean
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """The map of a view, from its file where there is one.
+
+        Raises:
+            InputError: whatever the teacher refuses, a damaged file, or a full disk.
+        """
+        if self.cheap:
+            return self.teacher.feature_map(views, view)
+        path = self._folder / f"map_{view:05d}.safetensors"
+        if not path.is_file():
+            made = self.teacher.feature_map(views, view)
+            if made.features is None:
+                return made
+            self._before_write()
+            write_map(path, made)
+        with advised(self._advice or f"remove {path}, and it is made again"):
+            return read_map(path, self.space)
+
+    def settings(self) -> dict[str, Any]:
+        return self.teacher.settings()
