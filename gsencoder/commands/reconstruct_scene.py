@@ -47,7 +47,8 @@ def open_scene(given: Path, work: Path, splat: str, data: SceneConfig, sfm: SfmC
         if placed is None and os.path.lexists(work / CHECKPOINT_FILE):
             raise InputError(
                 f"{work}: a run was cut off here, and where its photographs were placed ({PLACED_FILE}, sparse/0) is "
-                "gone, or belongs to other photographs or settings; put these back, or give resume=false to begin anew"
+                "gone or damaged, or belongs to other photographs or settings; put these back, or give resume=false to "
+                "begin anew"
             )
         if placed is None:
             with summary.step("place"):

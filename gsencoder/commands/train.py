@@ -309,6 +309,11 @@ def _digest_of(words: TextTable | None) -> str:
     return hashlib.sha256(repr(words.names).encode() + words.embeddings.tobytes()).hexdigest()[:16]
 
 
+def _digest_of_file(given: str) -> str:
+    """What a file of adapter heads holds, wherever it lies; empty for none."""
+    return hashlib.sha256(find_file(given, "heads").read_bytes()).hexdigest()[:16] if given else ""
+
+
 def _validate(
     scenes: Sequence[PreparedScene],
     outputs: OutputSpace,
@@ -329,6 +334,6 @@ def _identity(config: TrainConfig, place: Place, dataset: PreparedDataset) -> di
     chosen = {name: settings(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
     for name in ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate"):
         del chosen["train"][name]
-    told = {"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": config.heads}
+    told = {"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": _digest_of_file(config.heads)}
     # How the micro-batches of a step are spread over processes may change.
     return {**chosen, **told, "samples_per_step": config.train.samples_per_step(place.size)}

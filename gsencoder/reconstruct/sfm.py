@@ -1,5 +1,6 @@
 """Photographs without poses: structure from motion by pycolmap, on a CPU."""
 
+import hashlib
 import json
 import math
 import os
@@ -136,14 +137,15 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
         "points": best.num_points3D(),
         "error": float(best.compute_mean_reprojection_error()),
     }
+    record = {"asked": asked, "found": found, "files": _digests(model)}
     with atomic_file(work / PLACED_FILE) as stream:
-        stream.write(json.dumps({"asked": asked, "found": found}).encode())
+        stream.write(json.dumps({**record, "digest": _digest(record)}).encode())
     return _placed(model, found)
 
 
 def placed_before(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed | None:
-    """What an earlier call left in `work`, if it came to its end for the same photographs and settings; with several
-    threads a second search need not find the same.
+    """What an earlier call left in `work`, if it came to its end for the same photographs and settings, and its files
+    have their checksums; with several threads a second search need not find the same.
 
     Args:
         folder: of the photographs.
@@ -154,11 +156,20 @@ def placed_before(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> 
     try:
         record = json.loads((work / PLACED_FILE).read_text(encoding="utf-8"))
         same = model.is_dir() and record["asked"] == _asked(folder, photographs_in(folder), config)
+        sound = record.pop("digest") == _digest(record) and record["files"] == _digests(model)
         found = _placed(model, record["found"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    sound = isinstance(found.points, int) and isinstance(found.error, float)
-    return found if same and sound and all(isinstance(name, str) for name in found.placed + found.missing) else None
+    return found if same and sound else None
+
+
+def _digests(model: Path) -> dict[str, str]:
+    """The SHA-256 of each file of a model."""
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(model.iterdir())}
+
+
+def _digest(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def _asked(folder: Path, names: list[str], config: SfmConfig) -> dict[str, Any]:

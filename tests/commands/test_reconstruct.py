@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from archives import flip_bit
 from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
 from gsencoder import cli
@@ -105,10 +106,23 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(
     placed = (work / "placed.json").read_bytes()
     monkeypatch.setattr("gsencoder.reconstruct.sfm.load_pycolmap", never)
     # Places of another placement would put old Gaussians into a new world.
-    for damaged in (b"", b"[]", b"{}", b'{"asked": 1}', placed[:-9], placed.replace(b"found", b"lost"), b"\xff\xfe"):
+    for damaged in (
+        b"",
+        b"[]",
+        b"{}",
+        b'{"asked": 1}',
+        placed[:-9],
+        placed.replace(b"found", b"lost"),
+        placed.replace(b"grey", b"gray"),
+        b"\xff\xfe",
+    ):
         (work / "placed.json").write_bytes(damaged)
-        assert "where its photographs were placed (placed.json, sparse/0) is gone" in refusal(capsys, *words)
+        assert "where its photographs were placed (placed.json, sparse/0) is gone or damaged" in refusal(capsys, *words)
     (work / "placed.json").write_bytes(placed)
+    for file in sorted((work / "sparse" / "0").iterdir()):
+        flip_bit(file, 4 * file.stat().st_size)
+        assert "(placed.json, sparse/0) is gone or damaged" in refusal(capsys, *words)
+        flip_bit(file, 4 * file.stat().st_size)
     os.utime(folder / "grey.jpg", ns=(1, 1))
     assert "belongs to other photographs" in refusal(capsys, *words)
     shutil.copystat(ten / "grey.jpg", folder / "grey.jpg")

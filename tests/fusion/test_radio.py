@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from splats import front_camera
 
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Views
 
@@ -112,6 +112,52 @@ def test_a_folder_that_holds_no_radio_is_refused(folder: Path, tmp_path: Path, c
             spoil(path, model_type="clip_text_model")
     with pytest.raises(InputError, match=message):
         RadioTeacher(RadioConfig(model=str(path)))
+
+
+def without(weights: dict[str, Any], part: str) -> dict[str, Any]:
+    return {name: value for name, value in weights.items() if part not in name}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda w: {f"student.{name}": value for name, value in w.items()}, r"\d+ are missing \(embeddings\."),
+        (lambda w: without(w, "blocks.1.attn.qkv"), r"6 are missing \(encoder\.layer\.1\.attention\.k_proj"),
+        (lambda w: {n: v[:1] if "norm1" in n else v for n, v in w.items()}, r"4 have other shapes than the config"),
+        (None, r"\d+ belong to layers that the configuration does not have \(encoder\.layer\.1\."),
+    ],
+)
+def test_weights_that_do_not_fit_the_configuration_are_refused_and_named(
+    folder: Path, tmp_path: Path, change: Any, message: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from safetensors.torch import load_file, save_file
+
+    path = tmp_path / "model"
+    shutil.copytree(folder, path)
+    if change is None:
+        spoil(path, num_hidden_layers=1)
+    else:
+        weights = load_file(path / "model.safetensors")
+        changed = {name: value.contiguous() for name, value in change(weights).items()}
+        save_file(changed, path / "model.safetensors", {"format": "pt"})
+    with pytest.raises(InputError, match=f"{path}: the weights do not fit the configuration: {message}"):
+        RadioTeacher(RadioConfig(model=str(path)))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_weights_beside_the_backbone_are_told_and_change_nothing(folder: Path, tmp_path: Path) -> None:
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    path = tmp_path / "model"
+    shutil.copytree(folder, path)
+    weights = load_file(path / "model.safetensors")
+    save_file({**weights, "adaptors.clip.weight": torch.zeros(2)}, path / "model.safetensors", {"format": "pt"})
+    with pytest.warns(SceneWarning, match=r"1 weights that are no part of the backbone are not used: adaptors\.clip"):
+        teacher = RadioTeacher(RadioConfig(model=str(path), size=48, device="cpu"))
+    plain = RadioTeacher(RadioConfig(model=str(folder), size=48, device="cpu"))
+    one, other = (each.feature_map(views(picture()), 0).features for each in (teacher, plain))
+    np.testing.assert_array_equal(one, other)
 
 
 def test_a_model_that_is_not_named_and_a_size_out_of_range_are_refused() -> None:
