@@ -10,15 +10,16 @@ from typing import Any
 import gsply
 import numpy as np
 import pytest
+from archives import header_of
 from feature_fields import make_features
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save_file
 from splats import front_camera, random_gaussians
 
 from gsencoder import cli
 from gsencoder.data.archive import open_archive, write_archive
 from gsencoder.data.splats import load_splat, save_splat
 from gsencoder.data.text_table import make_text_table, save_text_table
-from gsencoder.errors import InputError
+from gsencoder.errors import InputError, SceneWarning
 from gsencoder.fusion.packages import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
 from gsencoder.fusion.store import WORDS_FILE, load_features, save_features
 from gsencoder.types import GaussianFeatures, Scene, Views
@@ -124,6 +125,22 @@ def test_a_package_of_another_version_is_refused(package: Path) -> None:
             open_package(file)
     write_archive(file, arrays, header)
     open_package(file)
+
+
+def test_a_package_of_the_first_version_is_held_against_its_one_sum(package: Path) -> None:
+    from gsencoder.data.archive import _sum_of_version_1
+
+    file = package / PACKAGE_FILE
+    arrays, header = load_file(file), header_of(file)
+    whole = {"gsencoder": json.dumps({**header, "version": 1, "sum": _sum_of_version_1(arrays, header)})}
+    save_file(arrays, file, whole)
+    load_features(package)
+    save_file({**arrays, "mean": arrays["mean"] + 1}, file, whole)
+    with pytest.raises(InputError, match="does not have the checksum"):
+        load_features(package)
+    save_file(arrays, file, {"gsencoder": json.dumps({**header, "version": 1})})
+    with pytest.warns(SceneWarning, match="without checksums"), pytest.raises(InputError, match="expected sum"):
+        load_features(package)
 
 
 HEADER = ("name", "metres_per_unit", "up", "views", "space", "energy_kept", "form", "fingerprint", "total")
