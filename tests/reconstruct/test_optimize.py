@@ -157,6 +157,7 @@ def test_pruning_happens_when_it_is_due() -> None:
     assert all(len(moments["means"]) == counts[-1] for moments in (one.adam.averages, one.adam.squares))
 
 
+@pytest.mark.usefixtures("no_jaxtyping")
 def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
     """Opacities at the ends, splats behind and on the camera, needles and discs, black and saturated pictures."""
     made = np.random.default_rng(0)
