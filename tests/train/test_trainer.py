@@ -23,6 +23,7 @@ from gsencoder.train.checkpoint import CHECKPOINT_FILE
 from gsencoder.train.log import LOG_FILE, read_log
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.trainer import Trainer, TrainerConfig, Validated, _quiet_of_ended_connections
 
 Prepared = tuple[PreparedDataset, list[str]]
@@ -277,17 +278,15 @@ def _fix_turns(encoder: torch.nn.Module) -> None:
 
 
 def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the_scene(
-    dataset: Prepared, tmp_path: Path
+    dataset: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = samples(*dataset)
     for number in range(len(data.scenes)):
         data[number]  # Kinds of targets are looked up once, and here before they are spoiled.
     one = Trainer(small_encoder(), data, LOSSES, SHORT, folder=tmp_path, settings={})
     before = {name: value.clone() for name, value in one.encoder.state_dict().items()}
-    for scene in data.scenes:
-        spoiled = scene._arrays["targets"].copy()
-        spoiled[:] = np.inf
-        scene.__dict__["_arrays"] = {**scene._arrays, "targets": spoiled}
+    spoiled = lambda scene, rows: np.full((len(rows), scene.channels), np.inf, np.float32)  # noqa: E731
+    monkeypatch.setattr(PreparedScene, "targets", spoiled)
     with pytest.raises(
         InputError, match=r"the field loss of wall_\d \((near, far|far, near)\) is not finite at step 0"
     ):
@@ -365,6 +364,7 @@ sys.path.insert(0, {tests!r})
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.train.distributed import joined
 from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.trainer import Trainer
 
 if __name__ == "__main__":
