@@ -21,8 +21,8 @@ from typing import Any
 import gsencoder
 from gsencoder.commands import COMMANDS, Command
 from gsencoder.errors import InputError, SceneWarning
-from gsencoder.options import near
-from gsencoder.printable import printable
+from gsencoder.options import near, without_value
+from gsencoder.printable import clipped, one_line, printable
 from gsencoder.stopping import Stopped, stop_of
 
 FLAGS = {
@@ -79,12 +79,10 @@ def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:
 
 def _report(kind: str, message: str, debug: bool) -> None:
     if debug:
-        traceback.print_exc()
-    print(f"{kind}: {_one_line(message)}" if message else kind, file=sys.stderr)
-
-
-def _one_line(message: str) -> str:
-    return printable(" ".join(message.split()))
+        # Messages of other programs and servers are in it.
+        for line in traceback.format_exc().splitlines():
+            print(printable(clipped(line)), file=sys.stderr)
+    print(f"{kind}: {one_line(message)}" if message else kind, file=sys.stderr)
 
 
 def _discard_stdout() -> None:
@@ -126,9 +124,9 @@ def _split_flags(words: Sequence[str]) -> tuple[set[str], list[str]]:
         elif SHORT.get(word, word) in FLAGS:
             flags.add(SHORT.get(word, word))
         else:
-            name, equals, value = word.lstrip("-").partition("=")
-            hint = f"; settings are written {name}={value or '…'}" if equals else near(word, FLAGS)
-            raise InputError(f"{word}: no such flag{hint}")
+            shown = without_value(word)
+            hint = f"; settings are written {shown.lstrip('-')}" if "=" in word else near(word, FLAGS)
+            raise InputError(f"{shown}: no such flag{hint}")
     return flags, rest
 
 
@@ -142,7 +140,8 @@ def _dispatch(words: Sequence[str]) -> int:
         return 0
     name, *words = rest
     if name not in COMMANDS:
-        raise InputError(f"{name}: no such command{near(name, COMMANDS)} (gsencoder --help lists them)")
+        shown = without_value(name)
+        raise InputError(f"{shown}: no such command{near(shown, COMMANDS)} (gsencoder --help lists them)")
     command = COMMANDS[name]
     cls, _ = command.load()
     if "--help" in flags:
@@ -204,7 +203,7 @@ def _collected_warnings(found: list[str], debug: bool) -> Iterator[None]:
             if not issubclass(category, SceneWarning):
                 usual(message, category, filename, lineno, file, line)
                 return
-            text = _one_line(str(message))
+            text = one_line(str(message))
             found.append(text)
             print(f"warning: {text}" + (f" ({filename}:{lineno})" if debug else ""), file=sys.stderr)
 

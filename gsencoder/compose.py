@@ -20,12 +20,19 @@ from typing import Any, TypeVar
 
 from gsencoder.config import typed
 from gsencoder.errors import InputError
-from gsencoder.options import Option, is_list_of_words, join_list, near, options_by_key, options_of, wrong_value
+from gsencoder.options import (
+    Option,
+    is_list_of_words,
+    join_list,
+    near,
+    options_by_key,
+    options_of,
+    without_value,
+    wrong_value,
+)
 
 T = TypeVar("T")
 
-SHOWN = 6
-"""Longer values of options that there are not are not repeated."""
 SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
 """Under -m, and only there, a text option is swept where its value has this form."""
 
@@ -155,24 +162,23 @@ def read_words(
             given[full] = value
     if paths and "paths" not in choices.options:
         known = [*choices.options, *choices.groups]
-        raise InputError(f"{paths[0]}: this command takes no path{near(paths[0], known)}")
+        first = without_value(paths[0])
+        raise InputError(f"{first}: this command takes no path{near(first, known)}")
     if paths and "paths" in given:
-        raise InputError(f"paths: given both as paths= and as the word {paths[0]!r}; give one of them")
+        raise InputError(f"paths: given both as paths= and as the word {without_value(paths[0])!r}; give one of them")
     return tuple(paths), given
 
 
 def _unknown(word: str, key: str, choices: Choices) -> str:
-    known = [*choices.options, *choices.groups]
+    known, shown = [*choices.options, *choices.groups], without_value(word)
     sections = [name for name in known if name.startswith(key + ".")]
     if sections:
         return f"{key}: is a section; set its options one by one: {', '.join(f'{name}=' for name in sections[:4])}"
     if not re.fullmatch(r"[A-Za-z_][\w.]*", key):
-        return f"{word}: is neither an option (KEY=VALUE) nor an existing file"
+        return f"{shown}: is neither an option (KEY=VALUE) nor an existing file"
     if key.startswith("hydra"):
         return f"{key}: settings of Hydra itself are taken only with -m"
-    # What follows may be a key whose option is misspelt.
-    shown = word if len(word) - len(key) <= SHOWN else f"{key}=…"
-    return f"{key}: no such option, and no file is named {shown!r}{near(key, known)}"
+    return f"{shown.removesuffix('=…')}: no such option, and no file has this name{near(shown, known)}"
 
 
 def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:
@@ -191,8 +197,10 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
         written = value
         if key in choices.groups:
             names = choices.groups[key]
-            if not sweep and value not in names:
-                raise InputError(f"{key}: expected one of {', '.join(names)}, got {value!r}{near(value, names)}")
+            secret = any(name.startswith(f"{key}.") and each.secret for name, each in choices.options.items())
+            if value not in names and (secret or not sweep):
+                got = "" if secret else f", got {value!r}{near(value, names)}"
+                raise InputError(f"{key}: expected one of {', '.join(names)}{got}")
         elif option is not None and option.kind != "value":
             if not (sweep and SWEPT_TEXT.fullmatch(value)):
                 # Whoever knows Hydra writes brackets around a list; text may begin with one, words of a set do not.

@@ -28,6 +28,7 @@ from gsencoder.compose import (
 from gsencoder.config import CommonConfig, typed
 from gsencoder.errors import InputError
 from gsencoder.options import join_list
+from gsencoder.printable import one_line
 
 # A launcher that runs jobs in other processes imports this module there, and only then resolves the settings.
 OmegaConf.register_new_resolver("text", unseal, replace=True)
@@ -41,12 +42,12 @@ def _job(composed: Any, *, cls: type[CommonConfig], run: Callable[[Any], int], s
     try:
         config = typed(cls, plain_settings(composed))
     except InputError as error:
-        print(f"error: run {job.job.num}: {error}", file=sys.stderr)
+        print(one_line(f"error: run {job.job.num}: {error}"), file=sys.stderr)
         return 2
     assert config.out is not None
     if not config.quiet:
         told = [text for text in job.overrides.task if text.partition("=")[0] in swept]
-        print(f"run {job.job.num}: {' '.join(told)}", file=sys.stderr)
+        print(one_line(f"run {job.job.num}: {' '.join(told)}"), file=sys.stderr)
     return run(replace(config, out=config.out / str(job.job.num)))
 
 

@@ -38,6 +38,16 @@ class Option:
     secret: bool = False
 
 
+LONGEST_WORD = 200
+"""Characters of a word of the command line that an error repeats."""
+
+
+def without_value(word: str) -> str:
+    """A word that is no option, for an error: what follows its = may be a secret whose option is misspelt."""
+    key, equals, _ = word.partition("=")
+    return key[:LONGEST_WORD] + ("=…" if equals else "")
+
+
 def near(word: str, known: Iterable[str]) -> str:
     """`; did you mean …?` where the last part of some known name is close to that of `word`, else nothing."""
 

@@ -2,6 +2,9 @@
 
 import unicodedata
 
+LONGEST_LINE, END_OF_LINE = 2000, 500
+"""Characters of a message; of a longer one the beginning and the end are shown, where it says what to do."""
+
 
 def printable(text: str) -> str:
     """Text without the characters by which a terminal could be told to do other things than to show it: controls,
@@ -13,3 +16,15 @@ def printable(text: str) -> str:
         else letter
         for letter in text.replace("\r\n", "\n")
     )
+
+
+def one_line(message: str) -> str:
+    """A message as one line of a terminal."""
+    return printable(clipped(" ".join(message.split())))
+
+
+def clipped(line: str) -> str:
+    """A line of at most `LONGEST_LINE` characters."""
+    if len(line) <= LONGEST_LINE:
+        return line
+    return f"{line[: LONGEST_LINE - END_OF_LINE - 3]} … {line[-END_OF_LINE:]}"

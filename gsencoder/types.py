@@ -7,8 +7,10 @@ opacities are probabilities, never logarithms or logits.
 """
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Integer, UInt8
@@ -397,6 +399,17 @@ class SceneObject:
     max_pixels: int = 0
 
 
+def check_unit(metres_per_unit: float, name: str) -> None:
+    """Complains about what is no unit of length.
+
+    Raises:
+        InputError: not a positive finite number; `name` begins the message.
+    """
+    good = isinstance(metres_per_unit, (int, float)) and not isinstance(metres_per_unit, bool)
+    if not good or not 0 < metres_per_unit <= sys.float_info.max:
+        raise InputError(f"{name}: expected a positive number of metres, got {str(metres_per_unit)[:40]}")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
     """A place: Gaussians, or views, or both.
@@ -411,6 +424,7 @@ class Scene:
         up: unit vector in the world, or None where unknown.
         objects: labelled objects, where the scene has them.
         sfm_points: structure-from-motion points relative to `origin`, with uint8 colours beside them.
+        folder: that the scene was read from; None for one that was made.
     """
 
     name: str
@@ -423,6 +437,7 @@ class Scene:
     objects: tuple[SceneObject, ...] = ()
     sfm_points: Float32[np.ndarray, "P 3"] | None = None
     sfm_colors: UInt8[np.ndarray, "P 3"] | None = None
+    folder: Path | None = None
 
     def __post_init__(self) -> None:
         if self.name in ("", ".", "..") or "/" in self.name or "\0" in self.name:
@@ -430,8 +445,8 @@ class Scene:
         _check_array("Scene", "origin", self.origin, "float64", (3,))
         if not np.isfinite(self.origin).all():
             _fail("Scene", "origin", "finite values", str(self.origin.tolist()))
-        if self.metres_per_unit is not None and not 0 < self.metres_per_unit < math.inf:
-            _fail("Scene", "metres_per_unit", "a positive number or None", str(self.metres_per_unit))
+        if self.metres_per_unit is not None:
+            check_unit(self.metres_per_unit, "Scene.metres_per_unit")
         if self.up is not None:
             _check_array("Scene", "up", self.up, "float64", (3,))
             if not abs(float(np.linalg.norm(self.up)) - 1) <= UNIT_TOLERANCE:

@@ -19,7 +19,7 @@ class Handler(BaseHTTPRequestHandler):
         self.server.behave(self, body)  # type: ignore[attr-defined]
 
     def do_GET(self) -> None:
-        self.reply(200, {"object": "list", "data": [{"id": "tiny", "object": "model", "created": 0, "owned_by": "x"}]})
+        self.server.listing(self)  # type: ignore[attr-defined]
 
     def reply(self, status: int, value: Any) -> None:
         self.raw(status, json.dumps(value).encode(), "application/json")
@@ -87,6 +87,11 @@ def silent(seconds: float) -> Callable[[Handler, Any], None]:
     return behave
 
 
+def one_model(handler: Handler) -> None:
+    """Lists the models of a server."""
+    handler.reply(200, {"object": "list", "data": [{"id": "tiny", "object": "model", "created": 0, "owned_by": "x"}]})
+
+
 class Server(ThreadingHTTPServer):
     """Keeps what it was sent."""
 
@@ -95,6 +100,7 @@ class Server(ThreadingHTTPServer):
     def __init__(self, behave: Callable[[Handler, Any], None]) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
         self.behave = behave
+        self.listing: Callable[[Handler], None] = one_model
         self.requests: list[tuple[dict[str, str], dict[str, Any]]] = []
 
     @property

@@ -140,7 +140,7 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
         (["zzz"], "zzz: no such command (gsencoder --help lists them)"),
         (["inspect", "--overwrit"], "--overwrit: no such flag"),
         (["inspect", "--hepl"], "--hepl: no such flag; did you mean --help?"),
-        (["inspect", "--out=x"], "--out=x: no such flag; settings are written out=x"),
+        (["inspect", "--out=x"], "--out=…: no such flag; settings are written out=…"),
         (["inspect", "a.ply", "overwrit=true"], "did you mean overwrite?"),
         (["inspect"], "SPLAT is missing: splat files"),
         (["inspect", ""], "a path is empty"),

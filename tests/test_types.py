@@ -1,11 +1,14 @@
 """What the types that pass between stages do beside holding arrays."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from splats import random_gaussians
 
+from gsencoder.errors import InputError
 from gsencoder.render import blend
-from gsencoder.types import Cameras
+from gsencoder.types import Cameras, Scene
 
 
 def camera(width: int, height: int) -> Cameras:
@@ -37,3 +40,9 @@ def test_a_resized_picture_of_large_gaussians_shows_the_same() -> None:
     fine = blend(gaussians, large).alpha.reshape(24, 4, 32, 4).mean(dim=(1, 3))
     coarse = blend(gaussians, small).alpha.reshape(24, 32)
     assert (fine - coarse).abs().mean() < 0.03
+
+
+@pytest.mark.parametrize("unit", [0.0, -1.0, float("nan"), float("inf"), 10**400, True, "1"])
+def test_a_scene_has_a_positive_unit_or_none(unit: Any, no_jaxtyping: None) -> None:
+    with pytest.raises(InputError, match=r"Scene\.metres_per_unit: expected a positive number of metres"):
+        Scene(name="room", metres_per_unit=unit)

@@ -203,7 +203,10 @@ def _ask_many(
             if name in rows and rows[name].get("digest") == digest and (kept.path / digest).is_dir()
         }
         # Lines of other settings, and one that was cut off, go before new ones come.
-        write_bytes(file, b"".join(_line(row) for row in done.values()))
+        try:
+            write_bytes(file, b"".join(_line(row) for row in done.values()))
+        except RecursionError as error:
+            raise InputError(f"{file}: an answer is nested too deep; give resume=false to ask anew") from error
         for asked in track(many, "asking"):
             if asked.id in done:
                 continue

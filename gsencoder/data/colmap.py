@@ -1,6 +1,7 @@
 """COLMAP models, binary and text, with or without rigs and frames, read by pycolmap."""
 
 import itertools
+import math
 import re
 import warnings
 from pathlib import Path
@@ -12,6 +13,9 @@ from gsencoder.data.colmap_binary import check_binary_model
 from gsencoder.data.posed import FARTHEST, PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.undistort import CameraModel, check_camera, load_pycolmap
 from gsencoder.errors import InputError, SceneWarning
+
+QUATERNION_TOLERANCE = 1e-3
+"""How far from 1 the length of a quaternion may be; the rest is taken for rounding in the file."""
 
 
 def is_colmap_model(folder: Path) -> bool:
@@ -61,8 +65,16 @@ def read_colmap(model: Path, images: Path, root: Path, *, allow_outside: bool = 
             )
             check_camera(camera, f"{model}: camera {image.camera_id}")
             cameras[image.camera_id] = camera
+        cam_from_world = image.cam_from_world()
+        length = math.hypot(*map(float, cam_from_world.rotation.quat))
+        # pycolmap takes a quaternion of zeros for no rotation.
+        if not abs(length - 1) <= QUATERNION_TOLERANCE:
+            raise InputError(
+                f"{where}: its quaternion ({_pose_file(model)}) has length {length:.4g}, expected 1; export the model "
+                "again, or remove the image"
+            )
         pose = np.eye(4)
-        pose[:3] = image.cam_from_world().matrix()
+        pose[:3] = cam_from_world.matrix()
         posed.append(
             PosedImage(
                 name=image.name,
@@ -87,6 +99,29 @@ def read_colmap(model: Path, images: Path, root: Path, *, allow_outside: bool = 
     return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors)
 
 
+def _pose_file(model: Path) -> str:
+    """The file that holds the poses: that of the frames where there is one (since COLMAP 3.12)."""
+    suffix = "bin" if (model / "cameras.bin").is_file() else "txt"
+    return f"frames.{suffix}" if (model / f"frames.{suffix}").is_file() else f"images.{suffix}"
+
+
+def _check_text_poses(file: Path) -> None:
+    """Names the image whose pose is not finite, where pycolmap names none. Each image has two lines."""
+    with file.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            words = line.split(maxsplit=9)
+            if not words or words[0].startswith("#"):
+                continue
+            next(lines, None)
+            try:
+                finite = bool(np.isfinite([float(word) for word in words[1:8]]).all())
+            except ValueError:
+                continue
+            if not finite:
+                name = words[9].strip() if len(words) > 9 else ""
+                raise InputError(f"{file}: image {name[:120]!r}: the pose has values that are not finite")
+
+
 def _load(model: Path) -> Any:
     pycolmap = load_pycolmap()
     binary = (model / "cameras.bin").is_file()
@@ -96,6 +131,7 @@ def _load(model: Path) -> Any:
         for name in ("cameras.txt", "images.txt", "points3D.txt"):
             if not (model / name).is_file():
                 raise InputError(f"{model}: {name} is missing; a COLMAP model has cameras, images and points3D")
+        _check_text_poses(model / "images.txt")
     reconstruction = pycolmap.Reconstruction()
     try:
         (reconstruction.read_binary if binary else reconstruction.read_text)(str(model))

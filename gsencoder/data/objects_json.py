@@ -11,6 +11,9 @@ from gsencoder.data.transforms_json import read_json
 from gsencoder.errors import InputError
 from gsencoder.types import SceneObject
 
+LONGEST_NAME = 1000
+"""Characters of a name, as in a table of words."""
+
 
 def read_objects(path: Path) -> tuple[SceneObject, ...]:
     """Reads a list of {id, name or null, aabb_min, aabb_max, placed, views, max_pixels}; boxes in world coordinates.
@@ -31,6 +34,8 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
         name = row.get("name")
         if name is not None and not isinstance(name, str):
             raise InputError(f"{where}: name must be a word or null, got {str(name)[:40]!r}")
+        if name is not None and len(name) > LONGEST_NAME:
+            raise InputError(f"{where}: name has {len(name):,} characters, expected at most {LONGEST_NAME:,}")
         lower, upper = _corner(row, "aabb_min", where), _corner(row, "aabb_max", where)
         if (lower > upper).any():
             raise InputError(f"{where}: aabb_min {lower.tolist()} is not below aabb_max {upper.tolist()}")

@@ -14,6 +14,8 @@ from gsencoder.errors import InputError, SceneWarning
 
 RIGID_TOLERANCE = 1e-3
 """How far from 1 a singular value of a pose's rotation may be; the rest is taken for rounding in the file."""
+LONGEST_PATH = 4096
+"""Characters of a path: PATH_MAX of Linux, which other systems do not exceed."""
 FARTHEST = 1e12
 """Coordinates beyond this are refused: float64 steps by a tenth of a millimetre there."""
 ORIGIN_STEP = 1000.0
@@ -129,6 +131,11 @@ def inside(folder: Path, relative: str, where: str, *, root: Path | None = None,
         InputError: it leaves, or is no path at all.
     """
     root = folder if root is None else root
+    # A longer path is no file's, and to look for the links in it takes the square of its length.
+    if len(relative) > LONGEST_PATH:
+        raise InputError(
+            f"{where}: {relative[:80]!r}… is not a path ({len(relative):,} characters, at most {LONGEST_PATH:,})"
+        )
     try:
         path = folder / relative
         leaves = not path.resolve().is_relative_to(root.resolve())

@@ -41,16 +41,20 @@ def find_splat(root: Path) -> Path:
     )
 
 
-def splat_beside(splat: str | Path, folder: Path) -> Path:
-    """The file that `splat=` means: from here, or from the scene's folder.
+def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:
+    """The file that an option of several scenes names: in each scene's own folder, or else from here.
 
     Raises:
         InputError: neither exists.
     """
-    for path in (Path(splat), folder / splat):
-        if path.exists():
-            return path
-    raise InputError(f"splat={splat}: no such file (looked from here and in {folder})")
+    try:
+        # An absolute path stays itself.
+        for path in (folder / name, Path(name)):
+            if path.exists():
+                return path
+    except (OSError, ValueError) as error:
+        raise InputError(f"{option}={str(name)[:200]}: is not a path ({type(error).__name__})") from error
+    raise InputError(f"{option}={name}: no such file (looked in {folder} and from here)")
 
 
 def read_bare_splat(path: Path) -> tuple[Gaussians, Float64[np.ndarray, "3"]]:

@@ -22,7 +22,7 @@ from gsencoder.data.images import (
 from gsencoder.data.objects_json import read_objects
 from gsencoder.data.posed import PosedImage, PosedImages, choose_origin, inverse_rigid
 from gsencoder.data.scannet import is_scannet_export, read_scannet
-from gsencoder.data.scene_splat import SPLAT_SUFFIXES, find_splat, read_bare_splat, splat_beside, warn_of_unused_splat
+from gsencoder.data.scene_splat import SPLAT_SUFFIXES, file_of_scene, find_splat, read_bare_splat, warn_of_unused_splat
 from gsencoder.data.splats import load_splat
 from gsencoder.data.transforms_json import TRANSFORMS, read_transforms
 from gsencoder.data.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
@@ -74,7 +74,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
 
     Args:
         path: a folder or file.
-        splat: the Gaussians of a scene that has views; relative to the current folder or else to the scene. They must
+        splat: the Gaussians of a scene that has views; relative to the scene or else to the current folder. They must
             be in the world of the cameras. Without it a splat that lies beside the views is not used.
         options: see SceneConfig.
 
@@ -99,9 +99,9 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
             raise InputError(f"{given}: splat= is for scenes with views, and here there are none; give one splat only")
         name = _name_of(root) if root.is_dir() else root.stem
         bare, origin = read_bare_splat(find_splat(root))
-        return Scene(name=name, gaussians=bare, origin=origin, metres_per_unit=options.metres_per_unit)
+        return Scene(name=name, gaussians=bare, origin=origin, metres_per_unit=options.metres_per_unit, folder=folder)
     views, origin = make_views(posed, max_views=options.max_views, image_scale=options.image_scale)
-    gaussians = load_splat(splat_beside(splat, folder), origin=origin) if splat is not None else None
+    gaussians = load_splat(file_of_scene("splat", splat, folder), origin=origin) if splat is not None else None
     if splat is None:
         warn_of_unused_splat(folder)
     objects = folder / "objects.json"
@@ -117,6 +117,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         objects=read_objects(objects) if beside_transforms and objects.is_file() else (),
         sfm_points=(points - origin).astype(np.float32) if len(points) else None,
         sfm_colors=posed.colors if len(points) else None,
+        folder=folder,
     )
 
 
@@ -234,13 +235,21 @@ def _read_colmap(root: Path, model: Path, options: SceneConfig) -> tuple[PosedIm
             raise InputError(f"images={options.images}: no such folder (looked from here and in {root})")
         # Naming the folder is leave to read it.
         return read_colmap(model, images, images, allow_outside=options.allow_outside), root
-    # A model may be given itself, as scene/sparse/0; its photographs then lie up to two folders above.
-    homes = [root, root.parent, root.parent.parent] if model == root else [root]
-    home = next((home for home in homes if (home / "images").is_dir()), None)
+    home = _home(root, model)
     if home is None:
-        looked = ", ".join(str(home / "images") for home in homes)
+        looked = ", ".join(str(home / "images") for home in _homes(root, model))
         raise InputError(f"{model}: a COLMAP model without photographs; looked for {looked}; say images=FOLDER")
     return read_colmap(model, home / "images", home, allow_outside=options.allow_outside), home
+
+
+def _home(root: Path, model: Path) -> Path | None:
+    """The folder that holds the photographs of a COLMAP model. It may be given itself, as scene/sparse/0; they then lie
+    up to two folders above."""
+    return next((home for home in _homes(root, model) if (home / "images").is_dir()), None)
+
+
+def _homes(root: Path, model: Path) -> list[Path]:
+    return [root, root.parent, root.parent.parent] if model == root else [root]
 
 
 def make_views(

@@ -8,10 +8,12 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from gsencoder.data.scene_splat import file_of_scene
 from gsencoder.data.seeds_depth import depth_samples, read_rgbd
 from gsencoder.data.seeds_flat import flat_gaussians
 from gsencoder.data.seeds_mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
@@ -52,7 +54,10 @@ class SeedConfig:
     voxel_units: float | None = field(
         default=None, metadata={"help": "edge of the grid in the scene's own units, where its unit is unknown"}
     )
-    mesh: str = field(default="", metadata={"help": "the file of source=mesh, in world coordinates"})
+    mesh: str = field(
+        default="",
+        metadata={"help": "the file of source=mesh, in world coordinates: in each scene's folder, else from here"},
+    )
     min_cos: float = field(
         default=0.1, metadata={"help": "surfaces seen at a slant beyond arccos(min_cos) are not taken from depth"}
     )
@@ -98,10 +103,11 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig()) -> Gaussians:
         voxel = _voxel(scene, config, lambda: typical_spacing(points), "the points' median nearest-neighbour distance")
         return seed_from_points(points, scene.sfm_colors, views=views, voxel=voxel)
     if source == "mesh":
+        mesh = config.mesh if scene.folder is None else file_of_scene("seeds.mesh", config.mesh, scene.folder)
         voxel = _voxel(
-            scene, config, lambda: _mesh_voxel(scene, config.mesh), "estimated from the mesh's size and the cameras"
+            scene, config, lambda: _mesh_voxel(scene, mesh), "estimated from the mesh's size and the cameras"
         )
-        return seed_from_mesh(config.mesh, voxel=voxel, origin=scene.origin)
+        return seed_from_mesh(mesh, voxel=voxel, origin=scene.origin)
     if views is None:
         raise InputError(f"seeds: scene {scene.name!r} has no views; source={source} needs posed RGB-D frames")
     voxel = _voxel(scene, config, lambda: _depth_voxel(views), "one hundredth of the median depth")
@@ -188,7 +194,7 @@ def _depth_voxel(views: Views) -> float:
     return float(np.median(values)) / TYPICAL_DEPTH_IN_VOXELS
 
 
-def _mesh_voxel(scene: Scene, path: str) -> float:
+def _mesh_voxel(scene: Scene, path: str | Path) -> float:
     lower, upper = mesh_bounds(path)
     if scene.views is not None and len(scene.views):
         middle = (lower + upper) / 2 - scene.origin

@@ -21,7 +21,9 @@ UNIT_TOLERANCE = 1e-2
 """How far from 1 the norm of a stored embedding may be: float16 rounding is about 1e-3."""
 FORMAT_1 = "gsencoder text table 1"
 LONGEST_SHOWN = 80
-"""Characters of an unknown word that its error repeats."""
+"""Characters of a word that an error repeats."""
+LONGEST_NAME = 1000
+"""Characters of a name: longer than any word or caption, and short enough to compare with each other."""
 
 
 def normalise(word: str) -> str:
@@ -66,6 +68,12 @@ class TextTable:
 
     def __post_init__(self) -> None:
         table = self.embeddings
+        long = next((row for row, name in enumerate(self.names) if len(name) > LONGEST_NAME), None)
+        if long is not None:
+            raise InputError(
+                f"TextTable: name {self.names[long][:LONGEST_SHOWN]!r}… in row {long} has {len(self.names[long]):,} "
+                f"characters, expected at most {LONGEST_NAME:,}"
+            )
         if not self.names or table.ndim != 2 or len(table) != len(self.names):
             raise InputError(f"TextTable: expected one embedding a name, got {len(self.names)} names and {table.shape}")
         if table.shape[1] != self.space.channels or self.mean.shape != (self.space.channels,):
@@ -76,12 +84,15 @@ class TextTable:
         norms = np.sqrt((table.astype(np.float64) ** 2).sum(axis=1))
         bad = np.flatnonzero(~(np.abs(norms - 1) <= UNIT_TOLERANCE))
         if bad.size or not np.isfinite(self.mean).all():
-            first = f"{self.names[bad[0]]!r} has norm {norms[bad[0]]:.4g}" if bad.size else "the mean is not finite"
+            first = "the mean is not finite"
+            if bad.size:
+                first = f"{self.names[bad[0]][:LONGEST_SHOWN]!r} has norm {norms[bad[0]]:.4g}"
             raise InputError(f"TextTable: expected finite unit vectors, {first} ({bad.size} bad of {len(norms)} rows)")
         for row, name in enumerate(self.names):
             key = normalise(name)
             if not key or key in self._row_of:
-                raise InputError(f"TextTable: name {name!r} in row {row} is {'repeated' if key else 'empty'}")
+                wrong = "repeated" if key else "empty"
+                raise InputError(f"TextTable: name {name[:LONGEST_SHOWN]!r} in row {row} is {wrong}")
             self._row_of[key] = row
 
     def __len__(self) -> int:
@@ -111,14 +122,15 @@ class TextTable:
         rows = [self.find(word) for word in words]
         unknown = [word for word, row in zip(words, rows, strict=True) if row is None]
         if unknown:
-            parts = [f"{word[:LONGEST_SHOWN]!r}{_did_you_mean(self.near(word))}" for word in unknown[:3]]
+            parts = [f"{word[:LONGEST_SHOWN]!r}{_did_you_mean(self.near(word[:LONGEST_NAME]))}" for word in unknown[:3]]
             more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
-            raise InputError(f"not among the {len(self)} words of {self.space.name}: {'; '.join(parts)}{more}")
+            space = self.space.name[:LONGEST_SHOWN]
+            raise InputError(f"not among the {len(self)} words of {space}: {'; '.join(parts)}{more}")
         return self.embeddings[np.array(rows, np.int64)]
 
 
 def _did_you_mean(names: Sequence[str]) -> str:
-    return f" (near: {', '.join(names)})" if names else " (no name is near)"
+    return f" (near: {', '.join(name[:LONGEST_SHOWN] for name in names)})" if names else " (no name is near)"
 
 
 def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) -> TextTable:
@@ -242,7 +254,8 @@ def _table(file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray]) ->
 
 
 def _read_npz(file: Path, encoder: str) -> TextTable:
-    arrays = read_npz(file, {"names": ("U", 1), "embeddings": ("f", 2)}, {"encoder": ("U", 0)})
+    wanted = {"names": ("U", 1), "embeddings": ("f", 2)}
+    arrays = read_npz(file, wanted, {"encoder": ("U", 0)}, longest_text=LONGEST_NAME)
     made_by = encoder or str(arrays.get("encoder", "")) or file.stem.removesuffix("_names")
     try:
         return make_text_table([str(name) for name in arrays["names"]], arrays["embeddings"], made_by)

@@ -13,7 +13,7 @@ from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import find_weights, load_weights
 from gsencoder.tracking import Track, untracked
-from gsencoder.types import GaussianFeatures, Gaussians
+from gsencoder.types import GaussianFeatures, Gaussians, check_unit
 
 
 class TorchEncoder:
@@ -63,8 +63,10 @@ def encode(
         track: wraps the loop over chunks to show progress.
 
     Raises:
-        InputError: no Gaussians, or they spread over too many cells, or features that are not finite.
+        InputError: no Gaussians, or they spread over too many cells, or features that are not finite, or a unit that
+            is not positive.
     """
+    check_unit(metres_per_unit, "metres_per_unit")
     device = choose_device(config.device)
     dtype = autocast_dtype(config.precision, device)
     encoder = encoder.to(device).eval()

@@ -16,7 +16,7 @@ from gsencoder.models.choices import Device
 from gsencoder.models.curves import Curves, curves_of
 from gsencoder.models.serialize import NEVER, check_extent
 from gsencoder.tracking import Track, untracked
-from gsencoder.types import GaussianFeatures, Gaussians
+from gsencoder.types import GaussianFeatures, Gaussians, check_unit
 
 SUFFIX = ".onnx"
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
@@ -97,8 +97,10 @@ class OnnxEncoder:
             track: wraps the loop over chunks to show progress.
 
         Raises:
-            InputError: no Gaussians, or they spread over too many cells, or features that are not finite.
+            InputError: no Gaussians, or they spread over too many cells, or features that are not finite, or a unit
+                that is not positive.
         """
+        check_unit(metres_per_unit, "metres_per_unit")
         header = self.header
         if config.precision not in ("auto", header.precision):
             raise InputError(

@@ -123,6 +123,6 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
         try:
             row = json.loads(line)
             found[str(row["id"])] = row
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: line {number} is no answer; give resume=false to ask anew") from error
     return found

@@ -1,23 +1,28 @@
 """A vision-language model behind a server that speaks OpenAI's chat protocol: vLLM, transformers serve, llama.cpp's
 server, a cloud."""
 
+import itertools
 import os
 import threading
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from gsencoder.errors import InputError
+from gsencoder.infer.vlm_http import ReplyGuard
+from gsencoder.infer.vlm_key import KeyFilter
 from gsencoder.infer.vlm_reply import Heard, Reply, ServerError, cause
 
 URL_VARIABLE, KEY_VARIABLE, MODEL_VARIABLE = "OPENAI_BASE_URL", "OPENAI_API_KEY", "GSENCODER_VLM_MODEL"
 LONGEST_TOLD = 300
 """Characters of a server's message that an error repeats."""
-LEAST_KEY = 6
-"""Keys shorter than that are placeholders, which servers at home are given; anything may hold their letters."""
+LONGEST_NAME = 200
+"""Characters of a server's name for its model, or for why an answer ended, that are written down."""
+LONGEST_LIST = 8
+"""Models of a server that an error lists."""
 
 Message = Mapping[str, Any]
 
@@ -139,17 +144,26 @@ class VlmServer:
         check_url(self.url, "base_url" if config.base_url else URL_VARIABLE)
         self._config = config
         # A key that was read from a file ends with a line break.
-        self._key = (config.key or os.environ.get(KEY_VARIABLE, "")).strip()
-        if not (self._key.isascii() and self._key.isprintable()):
+        key = (config.key or os.environ.get(KEY_VARIABLE, "")).strip()
+        if not (key.isascii() and key.isprintable()):
             raise InputError(f"vlm.key (or {KEY_VARIABLE}): holds characters that no key has")
+        self._key = KeyFilter(key)
+        self._guard = ReplyGuard(config.max_tokens)
         try:
+            # A transport of our own would have to read the settings of proxies itself; a hook does not.
+            http = openai.DefaultHttpxClient(event_hooks={"response": [self._guard]})
             # Servers at home take any key, but the client must have one.
             self._client = openai.OpenAI(
-                base_url=self.url, api_key=self._key or "none", timeout=config.timeout, max_retries=config.retries
+                base_url=self.url,
+                api_key=key or "none",
+                timeout=config.timeout,
+                max_retries=config.retries,
+                default_headers={"Accept-Encoding": "identity"},
+                http_client=http,
             )
         except Exception as error:  # settings of proxies and certificates raise whatever they like
-            told = self._clean(cause(error))
-            raise InputError(f"vlm: no connection can be set up ({told}){_proxies()}") from self._shown(error)
+            reason = self._key.clean(cause(error), LONGEST_TOLD)
+            raise InputError(f"vlm: no connection can be set up ({reason}){_proxies()}") from self._shown(error)
 
     def ask(self, body: Mapping[str, Any]) -> Reply:
         """One answer.
@@ -163,6 +177,7 @@ class VlmServer:
         """
         begun = time.monotonic()
         heard, failed = Heard(), list[BaseException]()
+        self._guard.fault = ""
 
         def listen() -> None:
             try:
@@ -170,12 +185,10 @@ class VlmServer:
             except BaseException as error:
                 failed.append(error)
 
-        # A connection that stays alive without a word is told from an answer by the clock alone, and from outside.
-        listener = threading.Thread(target=listen, daemon=True)
-        listener.start()
-        listener.join(self._config.longest)
-        if listener.is_alive():
+        if not _ends_within(self._config.longest, listen):
             raise self._fault(f"the answer took more than {self._config.longest:g} s (vlm.longest)", ServerError)
+        if self._guard.fault:
+            raise self._fault(self._guard.fault, ServerError)
         if failed:
             raise self._failure(failed[0], heard) from self._shown(failed[0])
         if not heard.parts:
@@ -185,20 +198,24 @@ class VlmServer:
         wrong = heard.wrong()
         if wrong:
             raise self._fault(wrong, InputError)
+        return self._reply(heard, str(body["model"]), time.monotonic() - begun)
+
+    def _reply(self, heard: Heard, model: str, seconds: float) -> Reply:
+        """What was heard, without the key in any of it."""
         return Reply(
-            text=self._clean(heard.text, longest=None),
-            model=heard.model or str(body["model"]),
-            finish=heard.finish,
-            tokens=heard.tokens or {},
-            seconds=time.monotonic() - begun,
+            text=self._key.clean(heard.text),
+            model=self._key.clean(heard.model or model, LONGEST_NAME),
+            finish=self._key.clean(heard.finish, LONGEST_NAME),
+            tokens={name: count for name, count in (heard.tokens or {}).items() if not self._key.is_in(str(count))},
+            seconds=seconds,
         )
 
     def _listen(self, body: Mapping[str, Any], heard: Heard) -> None:
-        found = self._client.chat.completions.create(**body)
+        completion = self._client.chat.completions.create(**body)
         if not body["stream"]:
-            heard.hear(found)
+            heard.hear(completion)
             return
-        with found as stream:
+        with completion as stream:
             for chunk in stream:
                 heard.hear(chunk)
 
@@ -236,23 +253,34 @@ class VlmServer:
 
     def _models(self) -> str:
         """The names that the server has, where it tells."""
-        try:
-            names = [each.id for each in self._client.with_options(max_retries=0).models.list()]
-        except Exception:  # it is only a hint
+        names: list[str] = []
+
+        def listen() -> None:
+            try:
+                models = self._client.with_options(max_retries=0).models.list()
+                names.extend(str(model.id) for model in itertools.islice(models, LONGEST_LIST))
+            except Exception:  # it is only a hint
+                return
+
+        if not _ends_within(self._config.timeout, listen) or self._guard.fault or not names:
             return ""
-        return f"; it has {', '.join(names[:8])}" if names else ""
+        return f"; it has {', '.join(names)}"
 
-    def _fault(self, told: str, kind: type[InputError]) -> InputError:
-        return kind(f"the server at {self.url}: {self._clean(told)}")
-
-    def _clean(self, text: str, longest: int | None = LONGEST_TOLD) -> str:
-        """What a server says, without the key, which it may repeat."""
-        clean = text.replace(self._key, "(key)") if len(self._key) >= LEAST_KEY else text
-        return clean[:longest]
+    def _fault(self, message: str, kind: type[InputError]) -> InputError:
+        return kind(self._key.clean(f"the server at {self.url}: ") + self._key.clean(message, LONGEST_TOLD))
 
     def _shown(self, error: BaseException) -> BaseException | None:
         """An error as the cause of ours, unless a traceback of it could show the key."""
-        return None if self._key and self._key in "".join(traceback.format_exception(error)) else error
+        return None if self._key.is_in("".join(traceback.format_exception(error))) else error
+
+
+def _ends_within(seconds: float, work: Callable[[], None]) -> bool:
+    """Whether work in a thread of its own has ended after so many seconds; else it is left alone. A connection that
+    stays alive without a word is told from an answer by the clock alone, and from outside."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return not thread.is_alive()
 
 
 def _proxies() -> str:

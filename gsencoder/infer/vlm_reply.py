@@ -5,6 +5,9 @@ from typing import Any
 
 from gsencoder.errors import InputError
 
+MOST_TOKENS = 1 << 53
+"""Larger counts are no counts, and no number that every reader of JSON knows."""
+
 
 class ServerError(InputError):
     """A fault of the server that another question would meet as well; any other `InputError` is about the question."""
@@ -57,7 +60,8 @@ class Heard:
         choices = getattr(part, "choices", None)
         if choices is None:
             told = getattr(part, "model_extra", None) or {}
-            raise ValueError(str(told.get("error") or told.get("message") or told.get("detail") or part)[:2000])
+            # Whole, as half a key could not be recognised; who reports it takes the key out and then cuts it.
+            raise ValueError(str(told.get("error") or told.get("message") or told.get("detail") or part))
         self.parts += 1
         self.model = str(getattr(part, "model", "") or self.model)
         self.tokens = _tokens(getattr(part, "usage", None)) or self.tokens
@@ -91,7 +95,7 @@ def _words(content: Any) -> str:
 
 def _tokens(usage: Any) -> dict[str, int]:
     counts = {"prompt": getattr(usage, "prompt_tokens", None), "answer": getattr(usage, "completion_tokens", None)}
-    return {name: count for name, count in counts.items() if isinstance(count, int)}
+    return {name: count for name, count in counts.items() if isinstance(count, int) and 0 <= count < MOST_TOKENS}
 
 
 def cause(error: BaseException) -> str:

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -265,6 +264,24 @@ def test_a_batch_that_a_fault_ends_keeps_its_answers_and_goes_on(
     assert not (tmp_path / "answers.answers").exists()
 
 
+@pytest.mark.parametrize("depth", [500, 200_000])
+def test_an_answer_that_is_nested_too_deep_is_an_error_in_one_line(
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], depth: int
+) -> None:
+    file = batch(tmp_path / "q.jsonl", {"id": "a", "question": "the cube"}, {"id": "b", "question": "the crate"})
+    answers = tmp_path / "out.answers" / "answers.jsonl"
+    with serving(crate_refused) as server:
+        words = (f"questions={file}", f"vlm.base_url={server.url}")
+        assert ask(features, tmp_path / "out", *words) == 2
+        row = answers.read_text().rstrip()
+        answers.write_text(row[:-1] + ', "x": ' + "[" * depth + "]" * depth + "}\n")
+        capsys.readouterr()
+        assert ask(features, tmp_path / "out", *words) == 2
+    told = capsys.readouterr().err
+    assert "Traceback" not in told
+    assert "give resume=false to ask anew" in told
+
+
 def crate_refused(handler: Handler, body: Any) -> None:
     text = body["messages"][0]["content"][-1]["text"]
     if "crate" in text:
@@ -474,7 +491,7 @@ def real_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str,
             pytest.fail((folder / "log").read_text()[-2000:])
         yield f"http://127.0.0.1:{port}/v1", str(folder / "model")
     finally:
-        process.send_signal(signal.SIGINT)
+        process.terminate()
         try:
             process.wait(20)
         except subprocess.TimeoutExpired:

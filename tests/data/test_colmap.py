@@ -2,6 +2,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -240,3 +241,53 @@ def test_the_plush_reprojects_after_undistortion_as_its_model_does(shared: Path)
         theirs.append(np.linalg.norm(camera.img_from_cam(points @ exact[:, :3].T + exact[:, 3]) - pixels, axis=1))
     assert np.concatenate(ours).mean() < 1.02 * np.concatenate(theirs).mean()
     assert np.concatenate(theirs).mean() < 0.8
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("old", [False, True])
+def test_a_quaternion_of_no_rotation_is_refused_with_its_image_and_file(tmp_path: Path, text: bool, old: bool) -> None:
+    sparse = write_colmap(tmp_path, text=text, old=old)
+    name = ("images" if old else "frames") + (".txt" if text else ".bin")
+    for file in (sparse / name, sparse / f"images{Path(name).suffix}"):
+        spoil(file, "0 0 0 0")
+    with pytest.raises(InputError, match=rf"image '001\.png': its quaternion .{name}. has length 0, expected 1"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_a_quaternion_that_is_not_finite_is_refused_with_its_image(tmp_path: Path, text: bool, value: str) -> None:
+    sparse = write_colmap(tmp_path, text=text, old=True)
+    spoil(sparse / ("images.txt" if text else "images.bin"), f"{value} 0 0 0")
+    with pytest.raises(
+        InputError, match=r"images\..*image '001\.png'.*not finite|image '001\.png': .*images\.bin. has length"
+    ):
+        load_scene(tmp_path)
+
+
+def spoil(file: Path, quaternion: str) -> None:
+    """Gives the first pose of a file another quaternion."""
+    frames = file.stem == "frames"
+    if file.suffix == ".bin":
+        data = bytearray(file.read_bytes())
+        struct.pack_into("<4d", data, 16 if frames else 12, *map(float, quaternion.split()))
+        file.write_bytes(data)
+        return
+    lines = file.read_text().splitlines()
+    row = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+    words, start = lines[row].split(), 2 if frames else 1
+    words[start : start + 4] = quaternion.split()
+    lines[row] = " ".join(words)
+    file.write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_name_longer_than_any_file_has_is_refused_at_once(tmp_path: Path, text: bool) -> None:
+    sparse = write_colmap(tmp_path, text=text, old=True)
+    file = sparse / ("images.txt" if text else "images.bin")
+    file.write_bytes(file.read_bytes().replace(b"002.png", b"a/" * 500_000 + b"2.png"))
+    begun = time.monotonic()
+    with pytest.raises(InputError, match="is not a path .1,000,005 characters, at most 4,096.") as caught:
+        load_scene(tmp_path)
+    assert time.monotonic() - begun < 10
+    assert len(str(caught.value)) < 1000

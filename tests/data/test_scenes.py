@@ -1,9 +1,11 @@
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scene_files import (
     photograph,
     rewrite,
@@ -17,6 +19,7 @@ from scene_files import (
 
 from gsencoder.data.posed import choose_origin
 from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.seeds import SeedConfig, seed
 from gsencoder.data.splats import save_splat
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.types import Scene
@@ -247,3 +250,38 @@ def test_a_scene_given_as_the_folder_above_has_that_folders_name(
     write_transforms(tmp_path / "kitchen")
     monkeypatch.chdir(tmp_path / "kitchen" / "images")
     assert load_scene("..").name == "kitchen"
+
+
+def test_an_object_whose_name_is_longer_than_names_are_is_refused(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    rows = [{"id": 1, "name": "x" * 1_000_000, "aabb_min": [0, 0, 0], "aabb_max": [1, 1, 1]}]
+    (tmp_path / "objects.json").write_text(json.dumps(rows))
+    with pytest.raises(InputError, match="name has 1,000,000 characters, expected at most 1,000"):
+        load_scene(tmp_path)
+
+
+def test_each_scene_has_its_own_splat_and_mesh_before_those_from_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = {"a": 1.0, "b": 2.0, ".": 3.0}
+    for name, x in places.items():
+        box = trimesh.creation.box((0.2, 0.2, 0.2), trimesh.transformations.translation_matrix((x, 0, 0)))
+        (tmp_path / name).mkdir(exist_ok=True)
+        box.export(tmp_path / name / "mesh.ply")
+        save_splat(tmp_path / name / "mine.ply", some_gaussians(np.array([[x, 0, 0]], np.float32)))
+    (tmp_path / "c").mkdir()
+    for name in "abc":
+        write_transforms(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    config = SeedConfig(source="mesh", mesh="mesh.ply", voxel_units=0.1)
+    expected = {"a": 1.0, "b": 2.0, "c": 3.0}
+    for name, x in expected.items():
+        seeds = seed(load_scene(name), config)
+        assert np.abs(seeds.means.mean(axis=0) - (x, 0, 0)).max() < 0.02
+        scene = load_scene(name, splat="mine.ply")
+        assert scene.gaussians is not None
+        assert scene.gaussians.means[0, 0] == pytest.approx(x)
+        absolute = replace(config, mesh=str(tmp_path / "b" / "mesh.ply"))
+        assert seed(load_scene(name), absolute).means[:, 0].mean() == pytest.approx(2.0, abs=0.02)
+    with pytest.raises(InputError, match=r"seeds\.mesh=none\.ply: no such file .looked in .*a and from here"):
+        seed(load_scene("a"), replace(config, mesh="none.ply"))

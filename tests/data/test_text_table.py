@@ -2,6 +2,7 @@
 
 import io
 import json
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -288,3 +289,29 @@ def test_a_page_of_text_taken_for_a_word_is_not_repeated_whole(table: TextTable)
     with pytest.raises(InputError) as caught:
         table.encode(["x" * 100_000])
     assert len(str(caught.value)) < 300
+
+
+def test_names_longer_than_words_are_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<U2000", "fortran_order": False, "shape": (4000,)})
+    path = tmp_path / "long.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("names.npy", head.getvalue() + bytes(4000 * 8000))
+        archive.writestr("embeddings.npy", npy((4000, 4), bytes(4000 * 16)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="names: entries of 2,000 characters, expected at most 1,000"):
+            load_text_table(path)
+        assert tracemalloc.get_traced_memory()[1] < 4_000_000
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("length", [900, 1_000_000])
+@pytest.mark.parametrize("wrong", ["norm", "repeated", "unknown"])
+def test_no_error_of_a_table_repeats_a_long_name(length: int, wrong: str, no_jaxtyping: None) -> None:
+    names = ["x" * length, "x" * length if wrong == "repeated" else "y"]
+    rows = np.eye(2, dtype=np.float32) * (2 if wrong == "norm" else 1)
+    with pytest.raises(InputError) as caught:
+        make_text_table(names, rows, "toy" * length).encode(["x" * (length - 1)])
+    assert len(str(caught.value)) < 1000

@@ -1,5 +1,6 @@
 import copy
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -309,3 +310,16 @@ def test_mutated_text_gives_a_scene_or_an_input_error(tmp_path: Path, no_jaxtypi
         )
     (tmp_path / "transforms.json").write_bytes(bytes(text))
     loads_or_complains(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["file_path", "depth_file_path", "mask_path", "instance_file_path"])
+@pytest.mark.parametrize("unit", ["a", "a/", "../", "é/"])
+def test_a_path_longer_than_any_file_has_is_refused_at_once(tmp_path: Path, key: str, unit: str) -> None:
+    data = write_transforms(tmp_path)
+    data["frames"][1][key] = unit * 500_000
+    rewrite(tmp_path, data)
+    begun = time.monotonic()
+    with pytest.raises(InputError, match="frame 1 .* is not a path .* characters, at most 4,096") as caught:
+        read_transforms(tmp_path / "transforms.json")
+    assert time.monotonic() - begun < 2
+    assert len(str(caught.value)) < 1000

@@ -115,6 +115,12 @@ def test_an_empty_splat_is_refused() -> None:
         encode(random_gaussians(0), encoder(), OUTPUTS, WHOLE)
 
 
+@pytest.mark.parametrize("unit", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_unit_that_is_not_positive_is_refused(unit: float) -> None:
+    with pytest.raises(InputError, match="metres_per_unit: expected a positive number of metres"):
+        encode(random_gaussians(5), encoder(), OUTPUTS, WHOLE, metres_per_unit=unit)
+
+
 def test_an_encoder_that_overflows_is_told_of() -> None:
     network = encoder()
     with torch.no_grad():

@@ -86,6 +86,7 @@ def test_each_round_shows_every_photograph_once() -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.usefixtures("interrupts")
 def test_a_signal_within_a_step_is_heard_after_it() -> None:
     whole, cut = optimizer(), optimizer()
     step = cut.adam.step

@@ -100,6 +100,7 @@ def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset: Prep
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.usefixtures("interrupts")
 def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, tmp_path: Path) -> None:
     trainer(dataset, tmp_path / "whole").run()
     cut = trainer(dataset, tmp_path / "cut")
