@@ -2,10 +2,12 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Processes that tests run in, each on one thread.
+PROCESSES ?= 2
 
-.PHONY: help setup demo test lint check clean
+.PHONY: help setup demo test test-fast lint check clean
 help:            ## what can be made
-	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
+	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
 
 setup: $(VENV)/.ready ## the virtual environment alone
 
@@ -25,7 +27,11 @@ lint: setup      ## ruff and mypy
 	$(BIN)/mypy
 
 test: setup      ## all tests; those that need real data look for it in GSENCODER_SHARED (default ../shared)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone"
+	$(BIN)/python -m pytest -q -m alone
+
+test-fast: setup ## the tests that take a second at most
+	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone and not slow"
 
 check: lint test ## what continuous integration runs
 

@@ -369,6 +369,7 @@ def run_process(*words: str, **options: Any) -> subprocess.CompletedProcess[str]
 HEAVY = ("torch", "numba", "open3d", "numpy", "hydra", "scipy", "sklearn", "rich")
 
 
+@pytest.mark.alone
 def test_help_comes_at_once_and_imports_nothing_heavy() -> None:
     code = (
         "import sys; from gsencoder.cli import main; main(['--help']);"

@@ -146,6 +146,7 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize("text", HOSTILE)
+@pytest.mark.slow
 def test_text_arrives_as_it_was_typed(conf: Path, text: str) -> None:
     config = toy(conf, f"question={text}", f"device={text}", f"query={text}", f"teacher.table={text}")
     assert config.question == text
@@ -157,6 +158,7 @@ def test_text_arrives_as_it_was_typed(conf: Path, text: str) -> None:
 
 @given(st.text(st.characters(exclude_characters="\0"), max_size=30), st.lists(st.text(max_size=8), max_size=12))
 @hypothesis_settings(max_examples=12, deadline=None)
+@pytest.mark.slow
 def test_any_text_arrives_as_it_was_typed(conf_for_hypothesis: Path, text: str, words: list[str]) -> None:
     words = [word for word in words if word]
     config = toy(conf_for_hypothesis, f"question={text}", f"query={join_list(words)}", "--", *words)
@@ -346,6 +348,7 @@ def test_yaml_and_dataclass_agree(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.slow
 def test_every_member_of_every_choice_composes(name: str) -> None:
     for group, members in choices_of(name, COMMANDS[name].load()[0]).groups.items():
         assert members, group

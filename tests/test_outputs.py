@@ -413,6 +413,7 @@ def test_a_summary_names_neither_the_machine_nor_the_user(tmp_path: Path) -> Non
     assert str(Path.home()) + os.sep not in text
 
 
+@pytest.mark.alone
 def test_peak_memory_counts_a_large_array() -> None:
     before = peak_memory_mb()
     assert 10 < before < 100_000

@@ -15,6 +15,8 @@ from gsencoder.data.splats import load_splat
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.store import load_features
 
+pytestmark = pytest.mark.slow
+
 QUICK = ("views=8", "width=160", "objects=6", "quiet=true")
 
 

@@ -15,6 +15,8 @@ from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.models.weights import SHIPPED, load_weights
 
+pytestmark = pytest.mark.slow
+
 FOLDER = SHIPPED / "house_cpu"
 
 

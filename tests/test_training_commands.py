@@ -22,6 +22,8 @@ from gsencoder.fusion.store import load_features
 from gsencoder.models.weights import load_weights
 from gsencoder.train.heads import save_heads
 
+pytestmark = pytest.mark.slow
+
 QUICK = (
     "quiet=true",
     "train.steps=6",
@@ -279,6 +281,7 @@ def test_a_sweep_trains_once_for_each_value(rooms: Path, tmp_path: Path) -> None
     assert [summary_of(tmp_path / "out" / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
 
 
+@pytest.mark.alone
 def test_the_submitit_launcher_runs_a_sweep_as_jobs(rooms: Path, tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     words, quick = f"teacher.words={rooms / 'words.safetensors'}", [word for word in QUICK if "steps" not in word]
@@ -358,6 +361,7 @@ def test_sizes_that_nobody_means_are_refused_before_the_work(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.alone
 def test_a_signal_to_all_processes_of_a_training_leaves_a_checkpoint(
     rooms: Path, trained: Path, tmp_path: Path
 ) -> None:

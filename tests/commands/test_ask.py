@@ -33,6 +33,8 @@ from gsencoder.infer.view_pictures import view_pictures
 from gsencoder.infer.view_set import ViewsConfig
 from gsencoder.printable import printable
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("openai")
 
 QUICK = ("choose.source=frames", "choose.candidates=4", "choose.count=2", "quiet=true")

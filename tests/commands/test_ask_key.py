@@ -13,6 +13,8 @@ from chat_server import Handler, completion, serving
 
 from gsencoder import cli
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("openai")
 
 KEY = "sk-never+to/be&written=0123456789"

@@ -17,6 +17,8 @@ from gsencoder.data.splats import load_splat
 from gsencoder.errors import InputError
 from gsencoder.reconstruct.judge import split
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_room_becomes_a_splat_with_a_log_and_pictures(built: Path) -> None:
     results = summary_of(built)["results"]

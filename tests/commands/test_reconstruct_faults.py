@@ -14,6 +14,8 @@ from gsencoder import cli
 from gsencoder.commands import reconstruct
 from gsencoder.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(
     room: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -11,6 +11,8 @@ from PIL import Image
 from gsencoder import cli
 from gsencoder.data.archive import open_archive
 
+pytestmark = pytest.mark.slow
+
 QUICK = ("choose.candidates=8", "choose.count=4", "choose.width=120", "choose.height=90", "quiet=true")
 
 

@@ -454,6 +454,7 @@ class TestMesh:
 
 class TestTsdf:
     @pytest.mark.usefixtures("open3d")
+    @pytest.mark.slow
     def test_a_sphere_is_fused_to_its_surface(self):
         center = np.array([0.1, -0.05, 1.6])
         cameras = [camera(p, center) for p in ((0, 0, 0.3), (1.2, 0.1, 1.1), (-1.1, 0.3, 1.0))]
@@ -556,6 +557,7 @@ class TestSeed:
         assert np.isfinite(pose).all()
 
     @pytest.mark.shared
+    @pytest.mark.slow
     def test_small_objects_keep_their_boxes(self, shared):
         """Seeds inside an object's box, on its surface by the instance maps, span at least half of its volume."""
         scene = load_scene(shared / "scenes/house/train_012")

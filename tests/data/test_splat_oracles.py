@@ -64,6 +64,7 @@ def assert_same_raw(ours: splats.RawSplat, theirs: object, opacity: float) -> No
 
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "v3.spz"])
+@pytest.mark.slow
 def test_gsply_reads_what_we_write_and_sees_the_same(tmp_path: Path, name: str, degree: int) -> None:
     import gsply
 
@@ -72,6 +73,7 @@ def test_gsply_reads_what_we_write_and_sees_the_same(tmp_path: Path, name: str, 
     assert_same_raw(read_raw(tmp_path / name), read(str(tmp_path / name)), 5e-5)
 
 
+@pytest.mark.slow
 def test_gsply_reads_our_sog_sample_as_we_do(tmp_path: Path) -> None:
     import gsply
 

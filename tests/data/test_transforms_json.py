@@ -282,6 +282,7 @@ def loads_or_complains(folder: Path) -> None:
 @pytest.mark.filterwarnings("ignore::gsencoder.errors.SceneWarning")
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
+@pytest.mark.slow
 def test_mutated_values_give_a_scene_or_an_input_error(tmp_path: Path, no_jaxtyping: None, data: st.DataObject) -> None:
     scene = write_transforms(tmp_path, 2, depth=True)
     for _ in range(data.draw(st.integers(1, 3))):

@@ -15,6 +15,8 @@ from gsencoder.errors import InputError
 from gsencoder.evaluate.tradeoff import BudgetConfig, SweepConfig, Trade, mark_front, pick, settings_of
 from gsencoder.fusion.fuse import FuseConfig
 
+pytestmark = pytest.mark.slow
+
 SMALL = SweepConfig(
     rays_per_patch=(1, 4), min_weight=(), stop_transmittance=(0.1,), energy=(), max_rank=(2,), views=(3,), rounds=1
 )

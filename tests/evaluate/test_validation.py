@@ -65,6 +65,7 @@ def test_who_always_says_the_same_is_right_about_one_kind_and_who_says_the_oppos
     assert opposite.score < 0.2
 
 
+@pytest.mark.slow
 def test_an_encoder_is_drawn_beside_the_truth(
     walls: tuple[list[PreparedScene], OutputSpace, np.ndarray],
 ) -> None:

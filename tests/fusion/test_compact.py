@@ -28,6 +28,7 @@ def test_the_budget_is_met_and_the_error_told_is_the_error_made(error: float, ba
     np.testing.assert_allclose(found.weights, features.weights, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_a_smaller_budget_takes_more_bytes_and_one_byte_less_would_not_do() -> None:
     features = make_features(n=8000)
     sizes = [compact(features, error=error).row_bytes for error in (0.1, 0.03, 0.01, 3e-3, 1e-3)]

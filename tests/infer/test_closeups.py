@@ -100,6 +100,7 @@ def test_only_what_is_clearly_closer_is_cut() -> None:
 
 @pytest.mark.parametrize("source", ["frames", "both"])
 @pytest.mark.parametrize("candidates", [8, 16, 24])
+@pytest.mark.slow
 def test_close_ups_are_chosen_where_there_are_photographs_and_nowhere_else(source: str, candidates: int) -> None:
     scene, target = photographed()
     assert scene.views is not None

@@ -28,6 +28,8 @@ from gsencoder.infer.onnx_operators import search
 from gsencoder.infer.onnx_runtime import OnnxEncoder, inputs_of
 from gsencoder.types import Gaussians
 
+pytestmark = pytest.mark.slow
+
 WORDS = ("mug", "plant", "chair")
 ALONE = EncodeConfig(chunk=0, precision="float32", device="cpu")
 

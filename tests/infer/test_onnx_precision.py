@@ -26,6 +26,8 @@ from gsencoder.infer.onnx_runtime import OnnxEncoder
 from gsencoder.models.neighbors import convolve_reference, neighbor_table
 from gsencoder.rounding import round_columns
 
+pytestmark = pytest.mark.slow
+
 CLOUD = Cloud("a sheet", random_cloud(3000, 0.05))
 ANY = EncodeConfig(chunk=0, device="cpu")
 

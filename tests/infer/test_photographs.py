@@ -130,6 +130,7 @@ def test_photographs_of_other_cameras_are_refused(tmp_path: Path) -> None:
         with_photographs(replace(scene, views=None), taken)
 
 
+@pytest.mark.slow
 def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
     taken = load_scene(write_room(tmp_path / "scene", larger=2))
     assert taken.views is not None
@@ -147,6 +148,7 @@ def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
     assert "They are photographs." in (tmp_path / "ask" / "prompt.txt").read_text()
 
 
+@pytest.mark.slow
 def test_a_photograph_counts_as_sharp_and_solid_however_rough_the_splat_is(tmp_path: Path) -> None:
     taken = load_scene(write_room(tmp_path / "taken"))
     bare = kept_room(taken, list(range(COUNT)))

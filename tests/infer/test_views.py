@@ -276,6 +276,7 @@ def test_views_that_add_nothing_are_left_out_and_that_is_said() -> None:
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e-2, 1e3])
+@pytest.mark.slow
 def test_the_same_views_are_chosen_in_scenes_of_any_unit(unit: float) -> None:
     scene, target = cube_in_room()
     g = scene.gaussians
@@ -342,6 +343,7 @@ def test_uniform_frames_are_evenly_spread_and_need_no_target() -> None:
     assert judged.chosen[-1].covered > 0.8
 
 
+@pytest.mark.slow
 def test_more_candidates_never_leave_less_to_choose_from_than_are_asked_for() -> None:
     scene, target = cube_in_room()
     for source in ("frames", "shells", "both"):

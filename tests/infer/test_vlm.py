@@ -240,6 +240,7 @@ def test_a_server_names_its_limit_and_its_temperature_as_it_likes() -> None:
     assert not {"max_tokens", "temperature"} & set(body)
 
 
+@pytest.mark.slow
 def test_a_server_that_fails_at_first_is_asked_again() -> None:
     calls: list[int] = []
 
@@ -252,6 +253,7 @@ def test_a_server_that_fails_at_first_is_asked_again() -> None:
     assert len(calls) == 3
 
 
+@pytest.mark.slow
 def test_keys_are_never_told() -> None:
     echo = serving(lambda handler, _: handler.reply(400, {"error": {"message": f"bad key {KEY}"}}))
     with echo as server, pytest.raises(InputError) as caught:

@@ -234,6 +234,7 @@ except ValueError as error:
 
 @pytest.mark.parametrize("stream", [True, False])
 @pytest.mark.parametrize("status", [200, 400])
+@pytest.mark.alone
 def test_memory_stays_bounded_whatever_a_server_sends(status: int, stream: bool) -> None:
     with serving(endless(status, "until the end", [])) as server:
         command = [sys.executable, "-c", MEASURED, server.url, str(stream)]

@@ -126,6 +126,7 @@ def test_embeddings_stay_small_at_the_ends_of_what_a_splat_may_hold() -> None:
     assert channels.abs().max() <= 9
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences() -> None:
     network = encoder(replace(CONFIG, transformer=replace(TINY, encoder_depths=(1, 1, 1))), channels=2).double()
     attributes, opacities, cloud = encoder_inputs(splat(12, extent=0.4), network.config, 0.1)
@@ -191,6 +192,7 @@ def test_in_bfloat16_features_stay_close_and_come_as_float32() -> None:
 
 # torch's own compiler instantiates an autograd function, and warns that one should not.
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+@pytest.mark.slow
 def test_compiled_it_gives_the_same(no_jaxtyping: None) -> None:
     network, one = encoder(), splat(64)
     attributes, opacities, cloud = encoder_inputs(one, CONFIG, 0.1)

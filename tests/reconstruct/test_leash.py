@@ -34,6 +34,7 @@ def strayed(one: Optimizer, leash: Leash) -> torch.Tensor:
 @pytest.mark.usefixtures("no_jaxtyping")
 @pytest.mark.parametrize("rate", [1e-4, 1e-2, 10.0])
 @pytest.mark.parametrize("reach", [1e-6, 0.3])
+@pytest.mark.slow
 def test_what_pulls_forever_moves_no_further_than_the_reach(rate: float, reach: float) -> None:
     means = torch.zeros(3, 3)
     adam = RowAdam({"means": means})
@@ -58,6 +59,7 @@ def test_only_rows_in_view_are_pulled() -> None:
     assert means[:, 0].tolist() == [4.0, 3.0, 4.0]
 
 
+@pytest.mark.slow
 def test_a_fitted_splat_stays_within_its_leash_and_strays_without() -> None:
     free, bound = held(0), held(0.3)
     leash = leash_of(free.raw, 0.3)
@@ -72,6 +74,7 @@ def test_a_fitted_splat_stays_within_its_leash_and_strays_without() -> None:
     assert strayed(bound, leash).max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_leash_is_pruned_with_its_gaussians_and_taken_up_with_them(tmp_path: Path) -> None:
     whole, cut = held(0.3), held(0.3)
     for _ in range(20):

@@ -68,6 +68,7 @@ def test_rows_in_view_are_all_that_a_picture_shows(log_scale: float) -> None:
     assert len(rows) < 600
 
 
+@pytest.mark.slow
 def test_a_splat_gets_nearer_to_photographs_that_it_was_not_fitted_to() -> None:
     one = optimizer(replace(QUICK, steps=120))
     before = score(one, [2])
@@ -104,6 +105,7 @@ def test_a_signal_within_a_step_is_heard_after_it() -> None:
         assert torch.equal(value, cut.raw[name]), name
 
 
+@pytest.mark.slow
 def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     whole, cut = optimizer(), optimizer()
     for _ in range(20):
@@ -145,6 +147,7 @@ def test_what_does_nothing_is_taken_out_and_nothing_else() -> None:
     assert len(kept) > 0.8 * len(splat)
 
 
+@pytest.mark.slow
 def test_pruning_happens_when_it_is_due() -> None:
     start = seeds()
     start.opacities[:20] = 0.001
@@ -159,6 +162,7 @@ def test_pruning_happens_when_it_is_due() -> None:
 
 
 @pytest.mark.usefixtures("no_jaxtyping")
+@pytest.mark.slow
 def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
     """Opacities at the ends, splats behind and on the camera, needles and discs, black and saturated pictures."""
     made = np.random.default_rng(0)

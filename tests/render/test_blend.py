@@ -131,6 +131,7 @@ def test_rows_are_depth_ordered_and_sum_to_alpha() -> None:
     assert float(b.weight.min()) > 0
 
 
+@pytest.mark.slow
 def test_render_and_lift_are_adjoint_and_each_is_the_others_gradient() -> None:
     b = blend(random_gaussians(150, 4), front_camera(20, 16))
     values = torch.randn(150, 3, dtype=torch.float64, requires_grad=True)

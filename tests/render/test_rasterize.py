@@ -46,6 +46,7 @@ def slopes(inputs: Inputs, config: RasterConfig) -> tuple[Raster, list[Tensor]]:
 
 
 @pytest.mark.parametrize("log_scale", [-6.0, -2.5, 0.0])
+@pytest.mark.slow
 def test_kernels_and_plain_twin_agree_in_values_and_gradients(log_scale: float) -> None:
     inputs = inputs_of(random_gaussians(200, log_scale=log_scale))
     fast, fast_slopes = slopes(inputs, CPU)
@@ -62,6 +63,7 @@ def test_gradients_in_float32_are_within_a_thousandth_of_those_in_float64() -> N
         assert float((a.double() - b).norm() / b.norm()) < 1e-3, name
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences() -> None:
     # Soft and apart: no alpha comes near 1/255 or 0.999, no ray stops, no depths change places.
     splat = random_gaussians(4, seed=3, log_scale=0.7)

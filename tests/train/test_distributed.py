@@ -109,6 +109,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("error", ["InputError('its own')", "MemoryError('its own')"])
+@pytest.mark.alone
 def test_if_one_of_two_processes_fails_in_a_block_both_do(tmp_path: Path, error: str) -> None:
     path = tmp_path / "run.py"
     path.write_text(TOGETHER.format(error=error))

@@ -66,6 +66,7 @@ def assert_same_weights(one: Path, other: Path) -> None:
         np.testing.assert_array_equal(value, second[name])
 
 
+@pytest.mark.slow
 def test_training_brings_the_loss_down(dataset: Prepared, tmp_path: Path) -> None:
     trainer(dataset, tmp_path, replace(SHORT, steps=40)).run()
     curve = losses(tmp_path)
@@ -322,6 +323,7 @@ def test_what_was_done_before_a_step_that_is_not_finite_is_kept(dataset: Prepare
 # torch's own compiler does what torch warns of: it instantiates autograd functions and looks for gradients everywhere.
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
+@pytest.mark.slow
 def test_a_compiled_encoder_learns_the_same(
     dataset: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_jaxtyping: None
 ) -> None:
@@ -351,6 +353,7 @@ def test_validation_is_asked_for_and_logged(dataset: Prepared, tmp_path: Path) -
     assert [row.get("validation/score") for row in rows] == [None] * 3 + ["0.5"] + [None] * 3 + ["1.0"]
 
 
+@pytest.mark.alone
 def test_workers_are_spawned_and_make_the_same_samples(dataset: Prepared, tmp_path: Path) -> None:
     trainer(dataset, tmp_path / "alone", replace(SHORT, steps=3)).run()
     trainer(dataset, tmp_path / "helped", replace(SHORT, steps=3, workers=1)).run()
@@ -394,6 +397,7 @@ def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int) -> P
     return path
 
 
+@pytest.mark.alone
 def test_two_processes_follow_the_losses_of_one(dataset: Prepared, tmp_path: Path) -> None:
     alone = script(dataset, tmp_path / "one", steps=6, accumulate=2)
     pair = script(dataset, tmp_path / "two", steps=6, accumulate=1)
@@ -414,6 +418,7 @@ def test_two_processes_follow_the_losses_of_one(dataset: Prepared, tmp_path: Pat
         np.testing.assert_allclose(value, one[name], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path) -> None:
     whole = script(dataset, tmp_path / "whole", steps=60, accumulate=1)
     cut = script(dataset, tmp_path / "cut", steps=60, accumulate=1)
