@@ -1,5 +1,6 @@
 """Replies are read within bounds, and redirects followed within one server."""
 
+import gc
 import gzip
 import json
 import subprocess
@@ -215,6 +216,18 @@ def test_a_fault_of_one_reply_is_not_told_of_the_next() -> None:
         assert client.ask(request_body([], config)).text == "fine"
     with pytest.raises(ServerError, match="no server answers there"):
         client.ask(request_body([], config))
+
+
+def test_connections_end_with_their_server() -> None:
+    with serving(answer("fine")) as server:
+        config = VlmConfig(base_url=server.url, model="m", retries=0, timeout=5.0)
+        client = VlmServer(config)
+        client.ask(request_body([], config))
+        http = client._client._client
+        assert not http.is_closed
+        del client
+        gc.collect()
+        assert http.is_closed
 
 
 MEASURED = """
