@@ -6,6 +6,7 @@ import os
 import threading
 import time
 import traceback
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -152,6 +153,8 @@ class VlmServer:
         try:
             # A transport of our own would have to read the settings of proxies itself; a hook does not.
             http = openai.DefaultHttpxClient(event_hooks={"response": [self._guard]})
+            # openai closes only the client that it makes itself.
+            weakref.finalize(self, http.close)
             # Servers at home take any key, but the client must have one.
             self._client = openai.OpenAI(
                 base_url=self.url,

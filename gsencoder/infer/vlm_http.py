@@ -4,8 +4,9 @@ import importlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-LARGEST_REPLY = 1 << 24
-"""Bytes of any reply: the longest error pages and lists of models take a few megabytes."""
+LARGEST_REPLY = 1 << 22
+"""Bytes of any reply: error pages and lists of models take at most a megabyte or two. JSON of empty lists takes fifty
+times its bytes when it is parsed, so this is 200 MB of memory at worst."""
 BYTES_PER_TOKEN = 1 << 10
 """Further bytes for each token of an answer: a streamed token comes in a JSON object of 200 to 500 bytes."""
 
