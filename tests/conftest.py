@@ -1,6 +1,11 @@
 """Fixtures that all tests share."""
 
 import os
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Before torch counts the cores: small arrays are slower on two threads, and another process has the other core.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import signal
 from collections.abc import Iterator
 from pathlib import Path

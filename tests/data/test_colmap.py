@@ -182,7 +182,6 @@ def test_pictures_can_be_written_after_pycolmap_came_in() -> None:
 @pytest.mark.filterwarnings("ignore::gsencoder.errors.SceneWarning")
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.slow
-@pytest.mark.slow
 def test_mutated_models_give_a_scene_or_an_input_error(tmp_path: Path, text: bool) -> None:
     source = write_colmap(tmp_path, model="OPENCV", params=(30, 31, 16, 12, 0.01, 0, 0, 0), text=text)
     original = {path.name: path.read_bytes() for path in source.iterdir()}
