@@ -17,12 +17,14 @@ class MappedArrays:
     again; values are not looked at otherwise. Files of version 1 have no checksums, and are believed.
     """
 
-    def __init__(self, path: Path, wanted: Mapping[str, tuple[str, int]]) -> None:
+    def __init__(self, path: Path, wanted: Mapping[str, tuple[str, int]], before: "MappedArrays | None" = None) -> None:
         """Maps the file.
 
         Args:
             path: of the file.
             wanted: dtype and number of axes of each array.
+            before: an earlier map of these arrays, now closed; blocks that it checked are not checked again if the
+                file has not been written since.
 
         Raises:
             InputError: missing, damaged, or without these arrays.
@@ -31,6 +33,8 @@ class MappedArrays:
         with open_archive(path) as file:
             shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in wanted.items()}
             self._checksums = file.checksums
+        state = path.stat()
+        self._stamp = (state.st_ino, state.st_size, state.st_mtime_ns)
         raw = np.memmap(path, dtype=np.uint8, mode="r")
         begin = 8 + int.from_bytes(raw[:8].tobytes(), "little")
         entries = json.loads(raw[8:begin].tobytes())
@@ -44,6 +48,13 @@ class MappedArrays:
         if self._checksums is not None:
             blocks = {name: -(-len(data) // BLOCK_BYTES) for name, data in self._bytes.items()}
             self._unchecked = {name: np.ones(count, bool) for name, count in blocks.items() if count}
+            if before is not None and before._stamp == self._stamp:
+                self._unchecked = before._unchecked
+
+    def close(self) -> None:
+        """Lets go of the file, and remembers which blocks have been checked; nothing can be read any more."""
+        self._bytes.clear()
+        self._arrays.clear()
 
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of an array."""

@@ -61,6 +61,7 @@ class PreparedScene:
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, path.stem
+        self._closed: MappedArrays | None = None
 
     def __reduce__(self) -> tuple[type["PreparedScene"], tuple[Path]]:
         return PreparedScene, (self.path,)
@@ -68,7 +69,7 @@ class PreparedScene:
     @cached_property
     def _arrays(self) -> MappedArrays:
         with self._whole():
-            arrays = MappedArrays(self.path, _ARRAYS)
+            arrays = MappedArrays(self.path, _ARRAYS, self._closed)
             _check_arrays(arrays, len(self._header[0]))
         return arrays
 
@@ -96,7 +97,10 @@ class PreparedScene:
 
     def close(self) -> None:
         """Lets go of the file, which is opened again when something is asked for."""
-        self.__dict__.pop("_arrays", None)
+        arrays: MappedArrays | None = self.__dict__.pop("_arrays", None)
+        if arrays is not None:
+            arrays.close()
+            self._closed = arrays
 
     def __len__(self) -> int:
         return self._arrays.shape("means")[0]

@@ -1,6 +1,7 @@
 """Archives: what a file says is believed only where it agrees with what was asked for."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -214,3 +215,25 @@ def test_mapped_files_of_the_first_version_are_read(mapped: Path) -> None:
     with pytest.warns(SceneWarning, match="without checksums"):
         arrays = open_mapped(mapped)
     np.testing.assert_array_equal(arrays.rows("odd", np.array([5])), SIZES["odd"][5:6])
+
+
+def test_what_was_checked_is_remembered_until_the_file_is_written_again(
+    mapped: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import gsencoder.data.checksums as checksums
+
+    looked_at: list[int] = []
+    plain = checksums._checksum
+    wanted = {name: (array.dtype.name, array.ndim) for name, array in SIZES.items()}
+    arrays = open_mapped(mapped)
+    arrays.rows("wide", np.array([0, 3]))
+    arrays.close()
+    monkeypatch.setattr(checksums, "_checksum", lambda data, block: looked_at.append(block) or plain(data, block))
+    again = MappedArrays(mapped, wanted, arrays)
+    np.testing.assert_array_equal(again.whole("wide"), SIZES["wide"])
+    assert looked_at == [1, 2]
+    again.close()
+    looked_at.clear()
+    os.utime(mapped, ns=(1, 1))
+    MappedArrays(mapped, wanted, again).whole("wide")
+    assert looked_at == [0, 1, 2, 3]
