@@ -8,7 +8,6 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeds import with_gaussians
 from gsencoder.data.text_table import load_text_table
 from gsencoder.evaluate.naming import evaluate_naming, naming_scores
-from gsencoder.evaluate.sources import encoded, opened
 from gsencoder.fusion.field_error import field_error
 from gsencoder.fusion.store import WORDS_FILE
 from gsencoder.infer.chunks import EncodeConfig
@@ -33,15 +32,14 @@ def test_they_take_less_than_ten_megabytes_and_say_how_they_were_made() -> None:
 def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, number: int) -> None:
     encoder = TorchEncoder("house_cpu")
     words = load_text_table(FOLDER / WORDS_FILE)
-    path = shared / "scenes" / "house" / f"train_{number:03d}"
+    scene = with_gaussians(load_scene(shared / "scenes" / "house" / f"train_{number:03d}"))
+    assert scene.gaussians is not None
     accuracies, features = [], []
     for chunk in (0, 80_000):
-        config = EncodeConfig(chunk=chunk)
-        named = evaluate_naming(opened([path]), encoded(encoder, config), words)
+        given = encoder.encode(scene.gaussians, EncodeConfig(chunk=chunk))
+        named = evaluate_naming([(scene, 0.0)], lambda _, given=given: (given, {}), words)
         accuracies.append(naming_scores(named)["accuracy"])
-        scene = with_gaussians(load_scene(path))
-        assert scene.gaussians is not None
-        features.append(encoder.encode(scene.gaussians, config))
+        features.append(given)
     assert accuracies[0] >= 0.7
     assert accuracies[1] >= accuracies[0] - 0.01
     whole, parts = features

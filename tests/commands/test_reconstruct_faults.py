@@ -124,6 +124,7 @@ def test_a_signal_is_ours_after_pycolmap_came(tmp_path: Path, ten: Path) -> None
         "sys.exit(cli.main(sys.argv[1:]))\n"
     )
     words = ["reconstruct", str(ten), f"out={tmp_path / 'out'}", "quiet=true", "data.image_scale=0.25"]
+    words += ["sfm.size=400", "sfm.features=2000", "dense.spacing=12"]
     done = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=False)
     assert done.returncode == 128 + signal.SIGTERM
     assert done.stderr.splitlines()[-1].startswith("stopped: SIGTERM")
