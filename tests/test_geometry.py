@@ -139,3 +139,14 @@ def test_colours_survive_the_round_trip_through_degree_zero() -> None:
 def test_a_gaussian_at_the_camera_centre_has_a_finite_colour() -> None:
     sh = torch.randn(1, 16, 3)
     assert torch.isfinite(colors_from_sh(sh, torch.zeros(1, 3), torch.zeros(3))).all()
+
+
+def test_a_colour_depends_on_the_direction_from_the_camera_and_not_on_the_distance() -> None:
+    rng = np.random.default_rng(0)
+    sh, away, center = rng.normal(size=(20, 16, 3)), rng.normal(size=(20, 3)), np.array([3.0, -1.0, 2.0])
+    basis = sh_basis(torch.from_numpy(away / np.linalg.norm(away, axis=1, keepdims=True)), 3).numpy()
+    expected = np.maximum(np.einsum("nk,nkc->nc", basis, sh) + 0.5, 0)
+    assert (expected == 0).any()
+    for distance in (0.01, 1.0, 1000.0):
+        found = colors_from_sh(*map(torch.from_numpy, (sh, center + distance * away, center)))
+        np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)

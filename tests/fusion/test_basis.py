@@ -51,6 +51,17 @@ def test_the_rank_is_the_smallest_that_keeps_the_energy(rng: np.random.Generator
         assert basis.energy_kept == pytest.approx(share[basis.rank - 1], abs=1e-6)
 
 
+@pytest.mark.parametrize("channels", [7, 10, 24])
+def test_of_equally_strong_directions_a_share_of_the_energy_takes_that_share(channels: int) -> None:
+    """The share may be off by rounding either way, as 3 · 0.1 is."""
+    space = FeatureSpace(name="s", channels=channels)
+    for rank in range(1, channels + 1):
+        for energy in (rank / channels, min(1.0, rank * (1 / channels)), min(1.0, (1 + 1e-15) * rank / channels)):
+            basis = fit_basis(np.zeros(channels), np.eye(channels), space, energy=energy)
+            assert basis.rank == rank
+            assert basis.energy_kept == pytest.approx(rank / channels)
+
+
 def test_all_the_energy_of_exactly_low_rank_vectors_needs_only_that_rank(rng: np.random.Generator) -> None:
     x = low_rank(rng, rank=5, mean=3.0)
     moments = moments_of(x)

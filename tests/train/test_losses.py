@@ -137,7 +137,9 @@ def test_units_of_numpy_and_torch_agree() -> None:
 
 
 def test_the_contrast_is_a_cross_entropy_over_squared_distances_to_the_kinds() -> None:
-    codebook, predicted, codes = typical(5), torch.randn(7, 8), torch.tensor([0, 1, 2, 3, 4, 4, 0])
+    # Kinds of different lengths: of equal ones the length takes no part.
+    codebook = typical(5) * torch.tensor([[0.2], [0.5], [1.0], [1.5], [2.0]])
+    predicted, codes = torch.randn(7, 8), torch.tensor([0, 1, 2, 3, 4, 4, 0])
     weights = torch.tensor([1.0, 2.0, 0.5, 1.0, 3.0, 1.0, 1.0])
     found = contrast_loss(predicted, codes, weights, codebook, CONFIG)
     logits = -(torch.cdist(predicted.double(), codebook.double()) ** 2) / (2 * 8 * CONFIG.temperature)
