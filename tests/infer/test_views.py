@@ -16,7 +16,7 @@ from gsencoder.infer.view_pictures import view_pictures, view_sheet
 from gsencoder.infer.view_set import ViewsConfig
 from gsencoder.infer.view_shells import shell_cameras, up_of
 from gsencoder.infer.view_targets import Target, target_of, targets_of
-from gsencoder.infer.view_worth import BLURRED, Values, worth
+from gsencoder.infer.view_worth import BLURRED, LEAST_GAIN, NOTHING, Values, worth
 from gsencoder.infer.views import choose_views
 from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
 
@@ -191,6 +191,25 @@ def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
     assert value(blur=BLURRED) == pytest.approx(value() / 2)
     for name, less in (("visible", 0.5), ("inside", 0.5), ("alpha", 0.5)):
         assert value(**{name: less}) < value()
+
+
+@pytest.mark.parametrize("best", [1.0, 0.1, 0.01])
+def test_a_view_adds_something_from_a_small_share_of_the_first_one_on_or_of_the_best_there_can_be(best: float) -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    cameras = corner_cameras(4, 32, 24)
+    (seen,) = look(scene.gaussians, cameras, [target])
+    least = max(NOTHING * best, LEAST_GAIN)
+    config = ViewsConfig(count=4, candidates=4, cover_weight=0.0, context_weight=0.0, spread_weight=0.0)
+    full = {"share": config.most_share / 2, "inside": 1.0, "alpha": 1.0, "blur": 0.0}
+    arrays = {name: np.full(4, value) for name, value in full.items()}
+    # All else being perfect, a view is worth what it shows of the target.
+    visible = np.array([0.9 * least, 1.1 * least, best, 2 * least])
+    values = Values(cameras, [target], [replace(seen, visible=visible, **arrays)], config)
+    np.testing.assert_allclose(values.worths[0], visible)
+    order, gains = values.greedy(4)
+    assert order.tolist() == [2, 3, 1]
+    np.testing.assert_allclose(gains * config.count, visible[order])
 
 
 def test_frames_that_would_show_most_are_taken_first() -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,14 +12,15 @@ from hypothesis import strategies as st
 from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_encoder
 
 from gsencoder.data.augment import AugmentConfig
-from gsencoder.data.batch import SamplingConfig
+from gsencoder.data.batch import SamplingConfig, choose_part
 from gsencoder.errors import InputError
 from gsencoder.render import BlendConfig, blend
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepared import ViewRows
+from gsencoder.train.prepared import PreparedScene, ViewRows
 from gsencoder.train.rows import restrict
-from gsencoder.train.samples import SampleDataset, StepSampler, join_samples
+from gsencoder.train.samples import SampleDataset, StepSampler, join_samples, make_sample, target_codes
+from gsencoder.types import Cameras
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +103,49 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     torch.testing.assert_close(ours.alpha, b.alpha[opaque], rtol=2e-3, atol=2e-3)
     rendered = ours.render(found.targets) / ours.alpha[:, None]
     assert torch.cosine_similarity(rendered, found.rows.targets, dim=1).mean() > 0.9
+
+
+def in_units(scene: PreparedScene, metres: float | None) -> PreparedScene:
+    """The same numbers in another unit."""
+    other = PreparedScene(scene.path)
+    cameras, _, up, names = other._header
+    other._header = (cameras, metres, up, names)
+    return other
+
+
+@pytest.mark.parametrize(("metres", "voxel"), [(0.5, 0.2), (2.0, 0.05), (None, 0.1)])
+def test_the_grid_has_the_encoders_voxel_in_metres(
+    dataset: tuple[PreparedDataset, list[str]], metres: float | None, voxel: float
+) -> None:
+    """So many metres a unit are so many times fewer units a voxel; an unknown unit is taken for the metre."""
+    assert SMALL.voxel == 0.1
+    recipe = samples(*dataset, augmentation=None).recipe
+    scene = dataset[0].scenes(dataset[1])[0]
+    found = SampleDataset([in_units(scene, metres)], recipe)[0]
+    expected = SampleDataset([in_units(scene, 1.0)], replace(recipe, encoder=replace(SMALL, voxel=voxel)))[0]
+    assert same(found, expected)
+
+
+def test_all_kinds_are_equally_often_the_centre_of_a_sample(
+    dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, drawn = samples(*dataset).recipe, list[np.ndarray]()
+
+    def record(means: np.ndarray, cameras: Cameras, chances: np.ndarray, *rest: Any) -> Any:
+        drawn.append(chances)
+        return choose_part(means, cameras, chances, *rest)
+
+    monkeypatch.setattr("gsencoder.train.samples.choose_part", record)
+    counts = recipe.rarity.counts
+    sums = np.zeros(len(counts))
+    for scene in dataset[0].scenes(dataset[1]):
+        codes = target_codes(scene, recipe.rarity)
+        make_sample(scene, codes, recipe, 200, np.random.default_rng(0))
+        assert (drawn[-1][codes < 0] == 0).all()
+        np.add.at(sums, codes[codes >= 0], drawn[-1][codes >= 0])
+    occurring = counts > 0
+    assert len(set(counts[occurring])) > 1
+    np.testing.assert_allclose(sums[occurring], sums[occurring][0], rtol=1e-5)
 
 
 def rows_of(weights: list[list[float]], valid: list[bool] | None = None) -> ViewRows:
