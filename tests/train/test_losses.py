@@ -189,3 +189,17 @@ def test_a_loss_of_no_term_and_a_temperature_of_zero_are_refused() -> None:
     LossConfig(field_weight=0.0, render_weight=0.0, contrast_weight=1.0)
     with pytest.raises(InputError, match="temperature"):
         LossConfig(temperature=0.0)
+
+
+@pytest.mark.parametrize("name", ["field_weight", "render_weight", "contrast_weight"])
+def test_any_one_term_is_a_loss(name: str) -> None:
+    nothing = {"field_weight": 0.0, "render_weight": 0.0, "contrast_weight": 0.0}
+    assert getattr(LossConfig(**{**nothing, name: 1e-3}), name) == 1e-3
+
+
+@pytest.mark.parametrize("name", ["min_alpha", "min_kept"])
+def test_shares_go_up_to_1_and_0_is_none(name: str) -> None:
+    assert getattr(LossConfig(**{name: 1.0}), name) == 1
+    for wrong in (0.0, 1 + 1e-9):
+        with pytest.raises(InputError, match=name):
+            LossConfig(**{name: wrong})
