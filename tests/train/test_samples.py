@@ -126,6 +126,22 @@ def test_the_grid_has_the_encoders_voxel_in_metres(
     assert same(found, expected)
 
 
+def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
+    dataset: tuple[PreparedDataset, list[str]],
+) -> None:
+    scene = PreparedScene(dataset[0].scenes(dataset[1])[0].path)
+    unseen = np.arange(len(scene)) % 5 == 0
+    scene._arrays = {**scene._arrays, "weights": np.where(unseen, np.float32(0), scene.weights)}
+    recipe = samples(*dataset, augmentation=None, sampling=SamplingConfig(scope="scene", gaussians=0)).recipe
+    rarity, power = recipe.rarity, recipe.losses.rarity
+    squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - rarity.codebook).sum(axis=2)
+    expected = np.where(scene.weights > 0, squares.argmin(axis=1), -1)
+    np.testing.assert_array_equal(target_codes(scene, rarity), expected)
+    found = SampleDataset([scene], recipe)[0]
+    np.testing.assert_array_equal(found.codes.numpy(), expected)
+    np.testing.assert_array_equal(found.loss_weights.numpy(), np.where(expected < 0, 0, rarity.each(power)[expected]))
+
+
 def test_all_kinds_are_equally_often_the_centre_of_a_sample(
     dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
