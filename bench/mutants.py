@@ -17,6 +17,7 @@ import os
 import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -220,6 +221,8 @@ def main() -> None:
         known[Mutant(*(row[name] for name in Mutant.__dataclass_fields__))] = row
     mutants = [mutant for module in chosen.modules for mutant in draw(module, chosen.count, chosen.seed)]
     due = [each for each in mutants if each not in known or (chosen.again and not known[each]["killed"])]
+    # Started in the background, this process ignores the signal that tests of stopping send, and so would they.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with TemporaryDirectory() as name:
         copies: Queue[Path] = Queue()
         for job in range(chosen.jobs):
