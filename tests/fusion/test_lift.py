@@ -5,7 +5,7 @@ import pytest
 import torch
 from splats import front_camera, random_gaussians
 
-from gsencoder.fusion.lift import Clock, Sums, center_matrix, view_matrix
+from gsencoder.fusion.lift import Clock, Sums, capped, center_matrix, map_rows, view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.rgb import depth_image
@@ -81,3 +81,41 @@ def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatc
         with clock(step):
             pass
     assert clock.seconds == {"blend": 5.0, "lift": 2.5}
+
+
+@pytest.mark.parametrize(
+    ("across", "down", "rays", "most"),
+    [(4, 4, 64, 16), (4, 4, 16, 16), (4, 4, 9, 9), (4, 9, 100, 36), (1, 1, 16, 1), (0.5, 0.5, 16, 1), (1, 1, 1, 1)],
+)
+def test_a_cell_has_no_more_rays_than_pixels(across: float, down: float, rays: int, most: int) -> None:
+    feature_map = FeatureMap(
+        features=np.zeros((2, 2, 1), np.float32),
+        grid_from_image=np.array([[1 / across, 0, 0], [0, 1 / down, 0]]),
+        space=FeatureSpace(name="s", channels=1),
+    )
+    config = BlendConfig(rays_per_patch=rays, near=0.5)
+    assert capped(config, feature_map) == BlendConfig(rays_per_patch=most, near=0.5)
+
+
+def test_a_coded_map_has_the_rows_of_its_table_and_none_where_there_is_no_code(rng: np.random.Generator) -> None:
+    table, codes = rng.normal(size=(3, 2)).astype(np.float32), np.array([[0, 2], [-1, 1]], np.int32)
+    space = FeatureSpace(name="s", channels=2)
+    feature_map = FeatureMap(codes=codes, table=table, grid_from_image=np.eye(2, 3), space=space)
+    np.testing.assert_array_equal(map_rows(feature_map), [table[0], table[2], [np.nan, np.nan], table[1]])
+
+
+@pytest.mark.parametrize("coded", [False, True])
+def test_sums_are_divided_by_their_weights_and_rows_of_hardly_any_weight_are_zero(
+    rng: np.random.Generator, coded: bool
+) -> None:
+    table = rng.normal(size=(3, 2)).astype(np.float32)
+    shares = np.array([[1, 2, 3], [0, 0, 0], [0, 1e-39, 0], [0.5, 0, 0.25]], np.float32)
+    sums = Sums(4, 2, None, table if coded else None)
+    if coded:
+        sums.sums[:] = shares
+    else:
+        sums.sums[:], sums.weights[:] = shares @ table, shares.sum(axis=1)
+    features, weights = sums.finish()
+    np.testing.assert_allclose(weights, [6, 0, 0, 0.75])
+    np.testing.assert_allclose(features[[0, 3]], (shares @ table)[[0, 3]] / [[6], [0.75]], rtol=1e-5)
+    assert (features[[1, 2]] == 0).all()

@@ -203,3 +203,42 @@ def test_shares_go_up_to_1_and_0_is_none(name: str) -> None:
     for wrong in (0.0, 1 + 1e-9):
         with pytest.raises(InputError, match=name):
             LossConfig(**{name: wrong})
+
+
+def test_a_head_gives_standard_units_of_its_own_space() -> None:
+    """Less the mean, and by the root mean square distance from it over √channels."""
+    vectors = torch.randn(500, 6, generator=torch.Generator().manual_seed(0)).double() * 3 + 7
+    mean = vectors.mean(dim=0)
+    scale = float((vectors - mean).square().sum(dim=1).mean().sqrt())
+    found = Head(torch.nn.Identity(), mean.float(), scale)(vectors.float())
+    torch.testing.assert_close(found.double(), (vectors - mean) / scale * 6**0.5, rtol=1e-4, atol=1e-5)
+    assert abs(found.square().mean() - 1) < 1e-4
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_head_without_a_scale_is_refused(scale: float) -> None:
+    with pytest.raises(InputError, match="positive scale"):
+        Head(torch.nn.Identity(), torch.zeros(3), scale)
+
+
+@pytest.mark.parametrize("name", ["cosine", "smooth_l1", "field_weight", "render_weight", "contrast_weight", "rarity"])
+def test_weights_may_be_0_but_neither_less_nor_infinite(name: str) -> None:
+    assert getattr(LossConfig(**{name: 0.0}), name) == 0
+    for wrong in (-1e-9, float("inf"), float("nan")):
+        with pytest.raises(InputError, match=name):
+            LossConfig(**{name: wrong})
+
+
+def test_a_matching_loss_needs_one_of_its_parts_unless_there_is_a_contrast() -> None:
+    assert LossConfig(cosine=0.0, smooth_l1=1e-3).cosine == 0
+    assert LossConfig(cosine=1e-3, smooth_l1=0.0).smooth_l1 == 0
+    assert LossConfig(cosine=0.0, smooth_l1=0.0, contrast_weight=1.0).cosine == 0
+    with pytest.raises(InputError, match="cosine and smooth_l1"):
+        LossConfig(cosine=0.0, smooth_l1=0.0)
+
+
+def test_rarity_and_temperature_have_their_limits() -> None:
+    assert LossConfig(rarity=4.0, temperature=1e-6).rarity == 4
+    for wrong in ({"rarity": 4.001}, {"temperature": -0.1}, {"temperature": float("inf")}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            LossConfig(**wrong)

@@ -105,6 +105,26 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     assert torch.cosine_similarity(rendered, found.rows.targets, dim=1).mean() > 0.9
 
 
+@pytest.mark.parametrize("most", [1, 2])
+def test_of_many_scenes_the_latest_used_are_kept_open(
+    dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    monkeypatch.setattr("gsencoder.train.samples.OPEN_SCENES", most)
+    data, used = samples(*dataset), list[str]()
+    for number in range(9):
+        used.append(data.make(number).name.split(" ")[0])
+        opened = {scene.name for scene in data.scenes if "_arrays" in vars(scene)}
+        assert opened == set(list(dict.fromkeys(reversed(used)))[:most])
+
+
+def test_samples_of_a_step_are_of_one_size_and_steps_of_many(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    crops = SamplingConfig(scope="scene", views=1, gaussians=300, smallest=20)
+    data = samples(*dataset, augmentation=None, sampling=crops, step_samples=3)
+    sizes = [len(data.make(number).attributes) for number in range(12)]
+    assert [sizes[start : start + 3] for start in range(0, 12, 3)] == [[size] * 3 for size in sizes[::3]]
+    assert len(set(sizes)) == 4
+
+
 def in_units(scene: PreparedScene, metres: float | None) -> PreparedScene:
     """The same numbers in another unit."""
     other = PreparedScene(scene.path)
