@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from splats import front_camera, random_gaussians
 
+from gsencoder.errors import InputError
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask
 from gsencoder.render import Blend, BlendConfig, blend
 
@@ -56,3 +57,19 @@ def test_a_row_counts_by_the_share_of_its_rays_that_a_mask_lets_through(rng: np.
     b, mask = patches(1), rng.random((HEIGHT, WIDTH)) < 0.5
     expected = [np.mean([mask[pixel] for pixel in pixels_of(row)]) for row in range(b.rows)]
     np.testing.assert_array_equal(row_mask(mask, b.lattice), np.array(expected, np.float32))
+
+
+@pytest.mark.parametrize("name", ["relative", "absolute"])
+def test_a_tolerance_is_neither_negative_nor_without_end(name: str) -> None:
+    for value in (0.0, 1e12):
+        assert getattr(VisibilityConfig(against=(), **{name: value}), name) == value
+    for wrong in (-1e-9, 1.01e12, float("nan")):
+        with pytest.raises(InputError, match="expected tolerances"):
+            VisibilityConfig(**{name: wrong})
+
+
+def test_a_test_needs_a_tolerance_and_no_test_needs_none() -> None:
+    nothing = {"relative": 0.0, "absolute": 0.0}
+    assert VisibilityConfig(against=(), **nothing).against == ()
+    with pytest.raises(InputError, match="needs relative or absolute"):
+        VisibilityConfig(against=("rendered",), **nothing)

@@ -292,3 +292,18 @@ def test_no_other_turn_gives_a_smaller_rectangle(rng: np.random.Generator, up: l
         areas = np.ptp(along, axis=0) * np.ptp(across, axis=0)
         assert areas[0] <= areas.min() * (1 + 1e-9)
         assert areas.max() > 1.01 * areas[0]
+
+
+def test_of_equally_small_rectangles_the_least_turned_one_is_taken() -> None:
+    """A regular octagon with sides along x, y and both diagonals."""
+    near = np.sqrt(2) - 1
+    corners = np.array([[a * x, b * y, 0] for a in (1, -1) for b in (1, -1) for x, y in ((1, near), (near, 1))])
+    np.testing.assert_allclose(oriented_axes(corners, np.array([0.0, 0, 1])), np.eye(3), atol=1e-9)
+
+
+def test_a_box_far_from_the_origin_is_as_exact_as_one_near_it(rng: np.random.Generator) -> None:
+    """Offsets and eighths are exact in float32."""
+    points, offset = rng.integers(-8, 9, (12, 3)) / 8, np.array([2.0**17, -(2.0**17), 2.0**18])
+    near, far = (bounds(part, up=np.array([0.0, 0, 1])) for part in (points, points + offset))
+    np.testing.assert_allclose(far.size, near.size, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(far.aabb_max - offset, near.aabb_max)

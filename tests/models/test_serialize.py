@@ -17,6 +17,7 @@ from gsencoder.models.serialize import (
     bits_of,
     check_extent,
     encode_cells,
+    hilbert_from_morton,
     morton_codes,
 )
 
@@ -63,6 +64,13 @@ def test_transposed_orders_are_the_orders_of_swapped_cells() -> None:
     swapped = cells[:, [1, 0, 2]]
     assert torch.equal(encode_cells(cells, "z-trans", 20), encode_cells(swapped, "z", 20))
     assert torch.equal(encode_cells(cells, "hilbert-trans", 20), encode_cells(swapped, "hilbert", 20))
+
+
+def test_orders_that_are_not_transposed_take_x_first() -> None:
+    cells = torch.randint(0, 2**20, (500, 3))
+    morton = morton_codes(cells)
+    assert torch.equal(encode_cells(cells, "z", 20), morton)
+    assert torch.equal(encode_cells(cells, "hilbert", 20), hilbert_from_morton(morton, 20))
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 2**21 - 1)] * 3), min_size=1, max_size=20))
