@@ -59,6 +59,8 @@ def test_processes_share_a_step_and_a_resumed_run_goes_on_in_the_middle(
     def numbers(rank: int, begin: int) -> list[list[int]]:
         return list(StepSampler(begin, first + steps, batch=batch, accumulate=accumulate, rank=rank, world=world))
 
+    sampler = StepSampler(first, first + steps, batch=batch, accumulate=accumulate, rank=0, world=world)
+    assert len(sampler) == len(list(sampler)) == steps * accumulate
     taken = sorted(number for rank in range(world) for micro in numbers(rank, first) for number in micro)
     size = batch * accumulate * world
     assert taken == list(range(first * size, (first + steps) * size))
