@@ -211,7 +211,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="judge the survivors once more")
     parser.add_argument("--sound", action="store_true", help="the tests are known to pass without a fault")
-    parser.add_argument("--seconds", type=float, default=300, help="for the test files of a module")
+    parser.add_argument("--seconds", type=float, default=600, help="for the test files of a module")
     parser.add_argument("--folder-seconds", type=float, default=240, help="for the rest of its folder; 0 = leave it")
     chosen = parser.parse_args()
     out: Path = chosen.out or ROOT / "outputs" / f"mutants_{chosen.seed}.jsonl"

@@ -301,9 +301,11 @@ def test_of_equally_small_rectangles_the_least_turned_one_is_taken() -> None:
     np.testing.assert_allclose(oriented_axes(corners, np.array([0.0, 0, 1])), np.eye(3), atol=1e-9)
 
 
-def test_a_box_far_from_the_origin_is_as_exact_as_one_near_it(rng: np.random.Generator) -> None:
-    """Offsets and eighths are exact in float32."""
-    points, offset = rng.integers(-8, 9, (12, 3)) / 8, np.array([2.0**17, -(2.0**17), 2.0**18])
+def test_a_box_far_from_the_origin_is_as_exact_as_one_near_it() -> None:
+    """A turned brick whose corners are exact in float32 here and there."""
+    corners = [np.array([4 * x - 3 * y, 3 * x + 4 * y, z]) / 8 for x in (0, 2) for y in (0, 1) for z in (0, 1)]
+    points, offset = np.array(corners), np.array([2.0**17, -(2.0**17), 2.0**18])
     near, far = (bounds(part, up=np.array([0.0, 0, 1])) for part in (points, points + offset))
+    np.testing.assert_allclose(np.sort(near.size), [0.125, 0.625, 1.25], rtol=0, atol=1e-12)
     np.testing.assert_allclose(far.size, near.size, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(far.aabb_max - offset, near.aabb_max)
