@@ -139,3 +139,71 @@ def test_colours_survive_the_round_trip_through_degree_zero() -> None:
 def test_a_gaussian_at_the_camera_centre_has_a_finite_colour() -> None:
     sh = torch.randn(1, 16, 3)
     assert torch.isfinite(colors_from_sh(sh, torch.zeros(1, 3), torch.zeros(3))).all()
+
+
+def test_a_colour_depends_on_the_direction_from_the_camera_and_not_on_the_distance() -> None:
+    rng = np.random.default_rng(0)
+    sh, away, center = rng.normal(size=(20, 16, 3)), rng.normal(size=(20, 3)), np.array([3.0, -1.0, 2.0])
+    basis = sh_basis(torch.from_numpy(away / np.linalg.norm(away, axis=1, keepdims=True)), 3).numpy()
+    expected = np.maximum(np.einsum("nk,nkc->nc", basis, sh) + 0.5, 0)
+    assert (expected == 0).any()
+    for distance in (0.01, 1.0, 1000.0):
+        found = colors_from_sh(*map(torch.from_numpy, (sh, center + distance * away, center)))
+        np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)
+
+
+def test_projection_is_ewa_splatting_with_the_jacobian_clamped_beyond_the_image() -> None:
+    """Written out for one Gaussian after another, in front of, beside and behind a camera."""
+    rng = np.random.default_rng(1)
+    n, width, height, near, eps2d = 300, 64, 48, 0.5, 0.3
+    K = np.array([[50.0, 0, 25], [0, 60, 30], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.random(rng=3).as_matrix(), [0.1, -0.2, 0.3]
+    local = rng.normal(size=(n, 3)) * [2, 2, 1.5] + [0, 0, 2]
+    means = (local - pose[:3, 3]) @ pose[:3, :3]
+    quats, scales = rng.normal(size=(n, 4)), rng.uniform(0.01, 0.3, (n, 3))
+    opacities = rng.choice([0.001, 1 / 255 + 1e-6, 0.3, 1.0], n)
+    arrays = (torch.from_numpy(array) for array in (means, quats, scales, opacities, pose, K))
+    found = project(*arrays, width, height, eps2d=eps2d, near=near)
+    turns = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
+    for i, (x, y, z) in enumerate(local):
+        if z <= near:
+            assert not found.valid[i]
+            continue
+        slack = 0.15 * width / 50, 0.15 * height / 60
+        tx = np.clip(x / z, -25 / 50 - slack[0], (width - 25) / 50 + slack[0])
+        ty = np.clip(y / z, -30 / 60 - slack[1], (height - 30) / 60 + slack[1])
+        half = np.array([[50, 0, -50 * tx], [0, 60, -60 * ty]]) / z @ pose[:3, :3] @ turns[i] * scales[i]
+        covariance = half @ half.T + eps2d * np.eye(2)
+        a, b, c = found.conics[i].tolist()
+        np.testing.assert_allclose([[a, b], [b, c]], np.linalg.inv(covariance), rtol=1e-9)
+        mean = np.array([50 * x / z + 25, 60 * y / z + 30])
+        np.testing.assert_allclose(found.means2d[i].numpy(), mean)
+        assert found.depths[i].item() == pytest.approx(z)
+        # At the ellipse's rim a Gaussian's alpha is just what still marks a pixel.
+        radius2 = 2 * np.log(max(opacities[i] * 255, 1))
+        assert found.mahalanobis2[i].item() == pytest.approx(radius2, abs=1e-12)
+        extent = np.sqrt(radius2 * np.diag(covariance))
+        np.testing.assert_allclose(found.extents[i].numpy(), extent, atol=1e-9)
+        touches = (mean + extent > 0).all() and (mean - extent < [width, height]).all()
+        assert found.valid[i].item() == (touches and opacities[i] > 1 / 255)
+    assert 0.1 < found.valid.double().mean() < 0.9
+
+
+def test_the_value_of_each_harmonic_in_simple_directions() -> None:
+    """Signs and order of the INRIA files: degree 1 is (−y, z, −x), degree 2 begins with xy."""
+    x, y, z = torch.eye(3, dtype=torch.float64)
+    c0, c1 = math.sqrt(1 / (4 * math.pi)), math.sqrt(3 / (4 * math.pi))
+    basis = sh_basis(torch.stack([x, y, z]), 1)
+    torch.testing.assert_close(
+        basis, torch.tensor([[c0, 0, 0, -c1], [c0, -c1, 0, 0], [c0, 0, c1, 0]], dtype=torch.float64)
+    )
+    diagonal = sh_basis(torch.stack([(x + y), (y + z), (x + z)]) / math.sqrt(2), 3)
+    assert (diagonal[0, [4, 9, 15]].sign() == torch.tensor([1, -1, 1])).all()
+    assert (diagonal[1, [5, 6, 11, 12]].sign() == torch.tensor([-1, 1, -1, -1])).all()
+    assert (diagonal[2, [7, 8, 13, 14]].sign() == torch.tensor([-1, 1, -1, 1])).all()
+    for degree in range(4):
+        assert sh_basis(x[None], degree).shape == (1, (degree + 1) ** 2)
+        torch.testing.assert_close(
+            sh_basis(diagonal[:, :3], degree), sh_basis(diagonal[:, :3], 3)[:, : (degree + 1) ** 2]
+        )

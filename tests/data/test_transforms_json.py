@@ -324,3 +324,66 @@ def test_a_path_longer_than_any_file_has_is_refused_at_once(tmp_path: Path, key:
         read_transforms(tmp_path / "transforms.json")
     assert time.monotonic() - begun < 2
     assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("up", [[0, 0, 0], [1e-7, 0, 0], [1e7, 0, 0], [1, 0], [1, 0, 0, 0], "z", [None, 0, 1]])
+def test_a_direction_that_is_none_is_refused(tmp_path: Path, up: object) -> None:
+    with pytest.raises(InputError, match="up must be three"):
+        read_transforms(rewrite(tmp_path, write_transforms(tmp_path) | {"up": up}))
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1e-5], [0, 1e5, 0], [3, 0, -4]])
+def test_up_has_unit_length_whatever_the_file_has(tmp_path: Path, up: list[float]) -> None:
+    found = read_transforms(rewrite(tmp_path, write_transforms(tmp_path) | {"up": up})).up
+    np.testing.assert_allclose(found, np.array(up) / np.linalg.norm(up))
+
+
+@pytest.mark.parametrize("metres", [0, -1.0])
+def test_a_unit_of_no_length_is_refused(tmp_path: Path, metres: float) -> None:
+    with pytest.raises(InputError, match="metres_per_unit must be positive"):
+        read_transforms(rewrite(tmp_path, write_transforms(tmp_path) | {"metres_per_unit": metres}))
+
+
+def test_the_scale_of_depth_is_the_callers_then_the_files_then_millimetres(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, 1, depth=True)
+    listed = data["frames"][0]["depth_file_path"]
+    instant = {"depth_file_path": None, "depth_path": listed}
+    for top, frame, scale, metric in (
+        ({}, {}, 0.001, False),
+        ({"depth_unit_scale_factor": 0.25}, {}, 0.25, True),
+        ({"depth_unit_scale_factor": 0.25}, {"depth_unit_scale_factor": 0.5}, 0.5, True),
+        ({"integer_depth_scale": 0.25}, {}, 0.001, False),
+        ({"integer_depth_scale": 0.25}, instant, 0.25, False),
+        ({"depth_unit_scale_factor": 0.25}, instant, 0.001, False),
+    ):
+        path = change(tmp_path, data | top, 0, **frame)
+        found = read_transforms(path)
+        assert found.images[0].depth == tmp_path / listed
+        assert found.images[0].depth_scale == scale
+        assert found.metres_per_unit == (1.0 if metric else None)
+        assert read_transforms(path, depth_scale=0.125).images[0].depth_scale == 0.125
+
+
+def test_a_field_of_view_lies_between_nothing_and_half_a_turn(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, 1)
+    bare = {key: value for key, value in data.items() if key not in ("fl_x", "fl_y")}
+    for wide in (1e-3, 0.5, 2.0, 2.4):
+        (image,) = read_transforms(rewrite(tmp_path, bare | {"camera_angle_y": wide})).images
+        np.testing.assert_allclose(image.camera.params[:2], 12 / np.tan(wide / 2))
+        both = {"camera_angle_x": 1.0, "camera_angle_y": wide}
+        (image,) = read_transforms(rewrite(tmp_path, bare | both)).images
+        np.testing.assert_allclose(image.camera.params[:2], [16 / np.tan(0.5), 12 / np.tan(wide / 2)])
+    for wrong in (0, -1.0, np.pi, 4.0):
+        with pytest.raises(InputError, match="camera_angle_x must lie between"):
+            read_transforms(rewrite(tmp_path, bare | {"camera_angle_x": wrong}))
+
+
+def test_a_matrix_may_come_without_its_last_row_and_in_no_other_size(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, 1)
+    (whole,) = read_transforms(rewrite(tmp_path, data)).images
+    rows = data["frames"][0]["transform_matrix"]
+    (upper,) = read_transforms(change(tmp_path, data, 0, transform_matrix=rows[:3])).images
+    np.testing.assert_array_equal(upper.cam_from_world, whole.cam_from_world)
+    for wrong in (rows[:2], [*rows, rows[3]], [row[:3] for row in rows], [[*row, 0] for row in rows], [*rows[:3], 1]):
+        with pytest.raises(InputError, match="transform_matrix must have 4 rows"):
+            read_transforms(change(tmp_path, data, 0, transform_matrix=wrong))

@@ -51,6 +51,17 @@ def test_the_rank_is_the_smallest_that_keeps_the_energy(rng: np.random.Generator
         assert basis.energy_kept == pytest.approx(share[basis.rank - 1], abs=1e-6)
 
 
+@pytest.mark.parametrize("channels", [7, 10, 24])
+def test_of_equally_strong_directions_a_share_of_the_energy_takes_that_share(channels: int) -> None:
+    """The share may be off by rounding either way, as 3 · 0.1 is."""
+    space = FeatureSpace(name="s", channels=channels)
+    for rank in range(1, channels + 1):
+        for energy in (rank / channels, min(1.0, rank * (1 / channels)), min(1.0, (1 + 1e-15) * rank / channels)):
+            basis = fit_basis(np.zeros(channels), np.eye(channels), space, energy=energy)
+            assert basis.rank == rank
+            assert basis.energy_kept == pytest.approx(rank / channels)
+
+
 def test_all_the_energy_of_exactly_low_rank_vectors_needs_only_that_rank(rng: np.random.Generator) -> None:
     x = low_rank(rng, rank=5, mean=3.0)
     moments = moments_of(x)
@@ -109,3 +120,47 @@ def test_bad_knobs_and_bad_vectors_are_refused() -> None:
         Moments(2).add(np.array([[0, 1], [np.nan, 1]], np.float32))
     with pytest.raises(InputError, match="no view has any cell"):
         _ = Moments(2).mean
+
+
+def test_the_largest_entry_of_every_component_is_positive(rng: np.random.Generator) -> None:
+    moments = moments_of(low_rank(rng, noise=0.2))
+    components = fit_basis(moments.mean, moments.covariance(), SPACE, energy=1.0).components
+    assert len(components) == 24
+    assert (components.max(axis=1) == np.abs(components).max(axis=1)).all()
+
+
+@pytest.mark.parametrize("most", [1, 2, 23, 24, 100])
+def test_no_more_components_are_taken_than_allowed_and_it_is_told_what_they_keep(
+    rng: np.random.Generator, most: int
+) -> None:
+    moments = moments_of(low_rank(rng, noise=0.5))
+    values = np.sort(np.linalg.eigvalsh(moments.covariance()))[::-1]
+    basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=1.0, max_rank=most)
+    assert basis.rank == min(most, 24)
+    assert basis.energy_kept == pytest.approx(values[:most].sum() / values.sum())
+
+
+@pytest.mark.parametrize("energy", [0.0, -0.5, 1 + 1e-9])
+def test_a_share_of_the_energy_is_above_0_and_at_most_1(energy: float) -> None:
+    with pytest.raises(InputError, match="energy: expected a share"):
+        fit_basis(np.zeros(24), np.eye(24), SPACE, energy=energy)
+
+
+@pytest.mark.parametrize("second", [True, False])
+def test_nothing_added_changes_no_moment_and_nothing_bad_gets_in(rng: np.random.Generator, second: bool) -> None:
+    x = low_rank(rng, noise=0.3, mean=-2.0)
+    moments = Moments(24, second=second)
+    for part in (x[:0], x[:100], x[:0], x[100:]):
+        moments.add(part)
+    assert moments.count == len(x)
+    np.testing.assert_allclose(moments.mean, x.mean(axis=0, dtype=np.float64), atol=1e-5)
+    with pytest.raises(InputError, match="1 bad rows of 3"):
+        moments.add(np.where(np.arange(3)[:, None] == 1, np.float32(np.inf), x[:3]))
+    np.testing.assert_allclose(moments.mean, x.mean(axis=0, dtype=np.float64), atol=1e-5)
+
+
+def test_a_covariance_of_nothing_but_a_mean_is_that_of_one_vector(rng: np.random.Generator) -> None:
+    x = low_rank(rng, n=1)
+    np.testing.assert_allclose(moments_of(x).covariance(), np.zeros((24, 24)), atol=1e-12)
+    basis = fit_basis(moments_of(x).mean, np.zeros((24, 24)), SPACE, energy=0.5)
+    assert (basis.rank, basis.energy_kept) == (1, 1.0)

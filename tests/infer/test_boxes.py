@@ -236,3 +236,76 @@ def test_boxes_move_with_their_points(rng: np.random.Generator) -> None:
 def test_the_axes_of_a_cube_that_stands_along_the_worlds_axes_are_the_worlds() -> None:
     corners = np.array([[x, y, z] for x in (0.0, 1) for y in (0, 1) for z in (0, 1)])
     np.testing.assert_allclose(oriented_axes(corners, np.array([0.0, 0, 1])), np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("mean", [0.5, 0.0, -0.5])
+def test_clusters_are_scored_by_their_weighted_mean_and_the_fourth_root_of_their_share(
+    rng: np.random.Generator, mean: float
+) -> None:
+    """Of a negative mean the root is divided by: a small share is never an advantage."""
+    labels, rows = rng.integers(-1, 4, 300), 10 + rng.permutation(300)
+    scores, weights = (mean + rng.normal(0, 0.1, 300)).astype(np.float32), rng.random(300).astype(np.float32)
+    expected = {}
+    for label in range(4):
+        own = labels == label
+        average = np.average(scores[own].astype(float), weights=weights[own].astype(float))
+        root = (weights[own].sum(dtype=float) / weights.sum(dtype=float)) ** 0.25
+        expected[tuple(sorted(rows[own].tolist()))] = average * root if average >= 0 else average / root
+    found = score_clusters(labels, rows, scores, weights)
+    assert {tuple(one.rows.tolist()) for one in found} == set(expected)
+    for one in found:
+        assert one.score == pytest.approx(expected[tuple(one.rows.tolist())], rel=1e-6)
+    assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
+
+
+def test_equal_clusters_come_in_the_order_of_their_rows_and_a_share_may_just_be_reached() -> None:
+    labels, rows = np.array([1, 1, 0, 0, 2]), np.array([4, 5, 8, 9, 2])
+    found = score_clusters(labels, rows, np.ones(5, np.float32), np.ones(5, np.float32), min_share=0.5)
+    assert [one.rows.tolist() for one in found] == [[4, 5], [8, 9], [2]]
+    assert found[2].weight == 0.5 * found[0].weight
+
+
+@pytest.mark.parametrize(("thickness", "flat"), [(1e-3, False), (1e-4, False), (1e-6, True)])
+def test_a_thickness_below_rounding_does_not_turn_a_box(rng: np.random.Generator, thickness: float, flat: bool) -> None:
+    """A turned rectangle with its smallest area, and as a slab with its smallest volume."""
+    corners = np.array([[x, y, z] for x in (-1.5, 1.5) for y in (-1, 1) for z in (-0.5, 0.5)])
+    turn = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
+    axes = oriented_axes(corners * [1, 1, thickness] @ turn.T)
+    assert is_rotation(axes)
+    spans = np.ptp(corners * [1, 1, thickness] @ turn.T @ axes, axis=0)
+    np.testing.assert_allclose(np.sort(spans), [thickness, 2, 3], rtol=1e-3)
+    # What is flat has its plane's normal as its last axis.
+    assert not flat or spans.argmin() == 2
+
+
+@pytest.mark.parametrize("up", [None, [0.0, 0, 1], [0.0, 0.6, -0.8]])
+def test_no_other_turn_gives_a_smaller_rectangle(rng: np.random.Generator, up: list[float] | None) -> None:
+    """Tried in steps of half a degree, for hulls of many sides; without `up` the points lie in a plane."""
+    axis = np.array([0.0, 0, 1] if up is None else up)
+    for count in (3, 5, 12):
+        points = rng.normal(size=(count, 3)) * [1, 0.6, 0.0 if up is None else 1.0]
+        first, second, third = oriented_axes(points, None if up is None else axis).T
+        assert abs(third @ axis) == pytest.approx(1)
+        turns = np.radians(np.arange(0, 90, 0.5))
+        along = points @ (np.outer(first, np.cos(turns)) + np.outer(second, np.sin(turns)))
+        across = points @ (np.outer(second, np.cos(turns)) - np.outer(first, np.sin(turns)))
+        areas = np.ptp(along, axis=0) * np.ptp(across, axis=0)
+        assert areas[0] <= areas.min() * (1 + 1e-9)
+        assert areas.max() > 1.01 * areas[0]
+
+
+def test_of_equally_small_rectangles_the_least_turned_one_is_taken() -> None:
+    """A regular octagon with sides along x, y and both diagonals."""
+    near = np.sqrt(2) - 1
+    corners = np.array([[a * x, b * y, 0] for a in (1, -1) for b in (1, -1) for x, y in ((1, near), (near, 1))])
+    np.testing.assert_allclose(oriented_axes(corners, np.array([0.0, 0, 1])), np.eye(3), atol=1e-9)
+
+
+def test_a_box_far_from_the_origin_is_as_exact_as_one_near_it() -> None:
+    """A turned brick whose corners are exact in float32 here and there."""
+    corners = [np.array([4 * x - 3 * y, 3 * x + 4 * y, z]) / 8 for x in (0, 2) for y in (0, 1) for z in (0, 1)]
+    points, offset = np.array(corners), np.array([2.0**17, -(2.0**17), 2.0**18])
+    near, far = (bounds(part, up=np.array([0.0, 0, 1])) for part in (points, points + offset))
+    np.testing.assert_allclose(np.sort(near.size), [0.125, 0.625, 1.25], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(far.size, near.size, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(far.aabb_max - offset, near.aabb_max)

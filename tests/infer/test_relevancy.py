@@ -206,3 +206,48 @@ def test_otsu_of_one_value_is_that_value() -> None:
 def test_a_threshold_out_of_range_is_named(wrong: dict[str, float], name: str) -> None:
     with pytest.raises(InputError, match=name):
         ThresholdConfig(**wrong)
+
+
+@pytest.mark.parametrize("kind", ["fixed", "relative", "quantile"])
+def test_a_threshold_may_lie_at_the_ends_of_its_range_and_no_further(kind: str) -> None:
+    low, high = {"fixed": (-1.0, 1.0), "relative": (1e-9, 1.0), "quantile": (0.0, 1.0)}[kind]
+    for value in (low, high):
+        assert getattr(ThresholdConfig(**{kind: value}), kind) == value
+    for value in (low - 1e-6, high + 1e-6):
+        with pytest.raises(InputError, match=kind):
+            ThresholdConfig(**{kind: value})
+
+
+def test_the_cosine_of_a_feature_fades_as_its_distance_from_the_mean_falls_below_a_thousandth() -> None:
+    """cos · d / √(d² + (|mean| / 1000)²): halved in power where d is a thousandth of the mean's length."""
+    mean, away = np.zeros(24), np.zeros(24)
+    mean[0], away[1] = 2.0, 1.0
+    distances = 2.0 * np.array([1e-5, 1e-3, 1e-2, 1.0])
+    rows = (mean + distances[:, None] * away).astype(np.float32)
+    features = GaussianFeatures(
+        features=rows, weights=np.ones(4, np.float32), mean=mean.astype(np.float32), space=SPACE
+    )
+    text = np.float32([[0, 0.6, 0.8, *[0] * 21]])
+    expected = 0.6 * distances / np.sqrt(distances**2 + 0.002**2)
+    np.testing.assert_allclose(relevancy(features, text, np.zeros(24, np.float32))[0], expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("bins", [8, 64, 256])
+def test_otsu_is_the_split_of_a_histogram_with_the_most_variance_between_its_sides(
+    rng: np.random.Generator, bins: int
+) -> None:
+    """By definition, split by split; of the splits in an empty gap the middle one."""
+    values = np.r_[rng.normal(0.2, 0.05, 4000), rng.normal(0.25, 0.02, 2000), rng.normal(0.9, 0.02, 200)]
+    upper = np.sort(values.astype(np.float32))[len(values) // 2 :].astype(np.float64)
+    upper = upper[upper >= np.median(values.astype(np.float32))]
+    edges = np.linspace(upper.min(), upper.max(), bins + 1)
+    middle = (edges[1:] + edges[:-1]) / 2
+    cell = np.minimum(((upper - edges[0]) / (edges[-1] - edges[0]) * bins).astype(int), bins - 1)
+    between = np.zeros(bins - 1)
+    for split in range(1, bins):
+        low, high = middle[cell[cell < split]], middle[cell[cell >= split]]
+        if len(low) and len(high):
+            between[split - 1] = len(low) * len(high) * (high.mean() - low.mean()) ** 2
+    best = 1 + np.flatnonzero(between >= between.max() * (1 - 1e-9))
+    assert len(best) > 1 or bins == 8
+    assert otsu(values.astype(np.float32), bins) == pytest.approx(edges[best[len(best) // 2]], rel=1e-6)

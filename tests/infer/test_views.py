@@ -11,12 +11,12 @@ from gsencoder.data.orbits import looking_cameras
 from gsencoder.errors import InputError, SceneWarning
 from gsencoder.infer.free_space import FreeSpace
 from gsencoder.infer.view_frames import frames_on
-from gsencoder.infer.view_judge import look
+from gsencoder.infer.view_judge import coverage, look
 from gsencoder.infer.view_pictures import view_pictures, view_sheet
 from gsencoder.infer.view_set import ViewsConfig
 from gsencoder.infer.view_shells import shell_cameras, up_of
 from gsencoder.infer.view_targets import Target, target_of, targets_of
-from gsencoder.infer.view_worth import BLURRED, Values, worth
+from gsencoder.infer.view_worth import BLURRED, LEAST_GAIN, NOTHING, Values, worth
 from gsencoder.infer.views import choose_views
 from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
 
@@ -189,8 +189,86 @@ def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
     assert value(share=0.8) < 0.6
     assert value(share=1.0) == 0
     assert value(blur=BLURRED) == pytest.approx(value() / 2)
-    for name, less in (("visible", 0.5), ("inside", 0.5), ("alpha", 0.5)):
-        assert value(**{name: less}) < value()
+    # In proportion to what is not hidden, half of it for means outside the picture, and by the opacity's square.
+    assert value(visible=0.3) == pytest.approx(0.3 * value())
+    assert value(inside=0.0) == pytest.approx(0.5 * value())
+    assert value(inside=0.5) == pytest.approx(0.75 * value())
+    assert value(alpha=0.45) == pytest.approx(value() / 4)
+    assert value(alpha=0.9) == value()
+    assert value(blur=2 * BLURRED) == pytest.approx(value() / 5)
+
+
+def test_a_target_fills_enough_from_the_least_share_on_and_too_much_beyond_the_most() -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    (seen,) = look(scene.gaussians, corner_cameras(1), [target])
+    config = ViewsConfig(least_share=0.1, most_share=0.5)
+    full = {name: np.ones(1) for name in ("visible", "inside", "alpha")} | {"blur": np.zeros(1)}
+    for share, expected in (
+        (0.05, 0.5 * (0.5 + 0.5 * 0.2)),
+        (0.1, 0.5 + 0.5 * 0.4),
+        (0.2, 0.5 + 0.5 * 0.8),
+        (0.25, 1.0),
+        (0.5, 1.0),
+        (0.75, 0.5),
+        (0.9, 0.2),
+    ):
+        assert worth(replace(seen, share=np.array([share]), **full), config)[0] == pytest.approx(expected)
+
+
+def test_a_set_is_worth_its_views_and_what_they_cover_of_targets_context_and_directions(
+    rng: np.random.Generator,
+) -> None:
+    """Written out for two targets, one of them without surroundings."""
+    scene, first = cube_in_room(cube((-0.6, 0.2, 0.8)))
+    assert scene.gaussians is not None
+    count = len(scene.gaussians)
+    second = target_of("other", scene.gaussians, np.arange(count - len(first.rows), count))
+    cameras = corner_cameras(6, 32, 24)
+    config = ViewsConfig(count=3, candidates=6, cover_weight=1.0, context_weight=0.5, spread_weight=0.25)
+    seen = []
+    for target, others in zip((first, second), (7, 0), strict=True):
+        (one,) = look(scene.gaussians, cameras, [target])
+        weights = {"target": rng.random((6, 9)), "context": rng.random((6, others))}
+        seen.append(replace(one, **{name: value.astype(np.float32) for name, value in weights.items()}))
+    values = Values(cameras, [first, second], seen, config)
+    for views in ([0], [1, 4], [0, 2, 5]):
+        total, covered = 0.0, 0.0
+        for target, each in zip((first, second), seen, strict=True):
+            own = worth(each, config)
+            good = own / max(own.max(), 0.1)
+            away = cameras.centers.astype(np.float64) - target.center
+            away /= np.linalg.norm(away, axis=1, keepdims=True)
+            parts = {
+                config.cover_weight: coverage(each.target) * good[:, None],
+                config.context_weight: coverage(each.context) * good[:, None],
+                config.spread_weight: np.clip(away @ away.T, 0, 1) * good[:, None],
+            }
+            total += own[views].sum() / 3
+            total += sum(weight * part[views].max(axis=0).mean() for weight, part in parts.items() if part.size)
+            covered += coverage(each.target)[views].max(axis=0).mean()
+        assert values.of(views) == pytest.approx(total / 2, rel=1e-5)
+        assert values.covered(np.array(views)) == pytest.approx(covered / 2, rel=1e-5)
+    assert values.greedy(6)[1].sum() == pytest.approx(values.of(values.greedy(6)[0]))
+
+
+@pytest.mark.parametrize("best", [1.0, 0.1, 0.01])
+def test_a_view_adds_something_from_a_small_share_of_the_first_one_on_or_of_the_best_there_can_be(best: float) -> None:
+    scene, target = cube_in_room()
+    assert scene.gaussians is not None
+    cameras = corner_cameras(4, 32, 24)
+    (seen,) = look(scene.gaussians, cameras, [target])
+    least = max(NOTHING * best, LEAST_GAIN)
+    config = ViewsConfig(count=4, candidates=4, cover_weight=0.0, context_weight=0.0, spread_weight=0.0)
+    full = {"share": config.most_share / 2, "inside": 1.0, "alpha": 1.0, "blur": 0.0}
+    arrays = {name: np.full(4, value) for name, value in full.items()}
+    # All else being perfect, a view is worth what it shows of the target.
+    visible = np.array([0.9 * least, 1.1 * least, best, 2 * least])
+    values = Values(cameras, [target], [replace(seen, visible=visible, **arrays)], config)
+    np.testing.assert_allclose(values.worths[0], visible)
+    order, gains = values.greedy(4)
+    assert order.tolist() == [2, 3, 1]
+    np.testing.assert_allclose(gains * config.count, visible[order])
 
 
 def test_frames_that_would_show_most_are_taken_first() -> None:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsencoder.models.curves import curves_of
-from gsencoder.models.plan import ORDERS, Level, Plan, join_plans, plan_cloud
+from gsencoder.models.plan import ORDERS, Level, Plan, _rounded, join_plans, plan_cloud
 
 VOXEL = 0.1
 
@@ -143,6 +143,18 @@ def test_clouds_side_by_side_have_the_plans_that_they_have_alone() -> None:
         for gather in joined.gathers:
             sides = (gather.view(-1, joined.width) < n).float().mean(dim=1)
             assert ((sides == 0) | (sides == 1)).all()
+
+
+def test_sizes_are_rounded_up_by_an_eighth_at_most_and_to_few() -> None:
+    counts = range(64, 5000)
+    rounded = [_rounded(count) for count in counts]
+    assert all(count <= size <= 1.125 * count for count, size in zip(counts, rounded, strict=True))
+    for power in (64, 256, 1024):
+        # Sixteenths of the next power of two; none is rounded further.
+        octave = {size for count, size in zip(counts, rounded, strict=True) if power <= count < 2 * power}
+        assert len(octave) <= 9
+        assert {_rounded(size) for size in octave} == octave
+    assert [_rounded(count) for count in (0, 1, 8, 9)] == [0, 8, 8, 16]
 
 
 def test_rounding_up_makes_few_sizes() -> None:

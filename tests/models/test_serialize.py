@@ -13,8 +13,11 @@ from gsencoder.models.cells import cells_of
 from gsencoder.models.serialize import (
     ALIGN,
     LARGEST_EXTENT,
+    NEVER,
     bits_of,
+    check_extent,
     encode_cells,
+    hilbert_from_morton,
     morton_codes,
 )
 
@@ -61,6 +64,13 @@ def test_transposed_orders_are_the_orders_of_swapped_cells() -> None:
     swapped = cells[:, [1, 0, 2]]
     assert torch.equal(encode_cells(cells, "z-trans", 20), encode_cells(swapped, "z", 20))
     assert torch.equal(encode_cells(cells, "hilbert-trans", 20), encode_cells(swapped, "hilbert", 20))
+
+
+def test_orders_that_are_not_transposed_take_x_first() -> None:
+    cells = torch.randint(0, 2**20, (500, 3))
+    morton = morton_codes(cells)
+    assert torch.equal(encode_cells(cells, "z", 20), morton)
+    assert torch.equal(encode_cells(cells, "hilbert", 20), hilbert_from_morton(morton, 20))
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 2**21 - 1)] * 3), min_size=1, max_size=20))
@@ -126,3 +136,26 @@ def test_arrays_and_tensors_have_the_same_codes(order: str) -> None:
     codes = encode_cells(cells, order, 20)
     assert isinstance(codes, np.ndarray)
     np.testing.assert_array_equal(encode_cells(torch.from_numpy(cells), order, 20).numpy(), codes)
+
+
+def test_bits_are_those_of_the_largest_coordinate() -> None:
+    for largest, bits in ((0, 1), (1, 1), (2, 2), (3, 2), (4, 3), (2**20, 21)):
+        assert bits_of(torch.tensor([[0, largest, 0], [0, 0, 0]])) == bits
+
+
+def test_an_extent_below_the_limit_is_let_through_and_no_other() -> None:
+    check_extent(LARGEST_EXTENT - 0.5, 0.1)
+    for extent in (float(LARGEST_EXTENT), float("inf"), float("nan")):
+        with pytest.raises(InputError, match="cells of 0.1 units"):
+            check_extent(extent, 0.1)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_no_cell_has_the_code_that_none_has(order: str) -> None:
+    """Coordinates have 21 bits with the room for alignment, and three of them fill an int64 to its last bit."""
+    far = LARGEST_EXTENT + ALIGN - 1
+    cells = torch.tensor(list(itertools.product((0, far), repeat=3)))
+    codes = encode_cells(cells, order, bits_of(cells))
+    assert (codes >= 0).all()
+    assert (codes < NEVER).all()
+    assert np.iinfo(np.int64).max == NEVER

@@ -137,7 +137,9 @@ def test_units_of_numpy_and_torch_agree() -> None:
 
 
 def test_the_contrast_is_a_cross_entropy_over_squared_distances_to_the_kinds() -> None:
-    codebook, predicted, codes = typical(5), torch.randn(7, 8), torch.tensor([0, 1, 2, 3, 4, 4, 0])
+    # Kinds of different lengths: of equal ones the length takes no part.
+    codebook = typical(5) * torch.tensor([[0.2], [0.5], [1.0], [1.5], [2.0]])
+    predicted, codes = torch.randn(7, 8), torch.tensor([0, 1, 2, 3, 4, 4, 0])
     weights = torch.tensor([1.0, 2.0, 0.5, 1.0, 3.0, 1.0, 1.0])
     found = contrast_loss(predicted, codes, weights, codebook, CONFIG)
     logits = -(torch.cdist(predicted.double(), codebook.double()) ** 2) / (2 * 8 * CONFIG.temperature)
@@ -187,3 +189,56 @@ def test_a_loss_of_no_term_and_a_temperature_of_zero_are_refused() -> None:
     LossConfig(field_weight=0.0, render_weight=0.0, contrast_weight=1.0)
     with pytest.raises(InputError, match="temperature"):
         LossConfig(temperature=0.0)
+
+
+@pytest.mark.parametrize("name", ["field_weight", "render_weight", "contrast_weight"])
+def test_any_one_term_is_a_loss(name: str) -> None:
+    nothing = {"field_weight": 0.0, "render_weight": 0.0, "contrast_weight": 0.0}
+    assert getattr(LossConfig(**{**nothing, name: 1e-3}), name) == 1e-3
+
+
+@pytest.mark.parametrize("name", ["min_alpha", "min_kept"])
+def test_shares_go_up_to_1_and_0_is_none(name: str) -> None:
+    assert getattr(LossConfig(**{name: 1.0}), name) == 1
+    for wrong in (0.0, 1 + 1e-9):
+        with pytest.raises(InputError, match=name):
+            LossConfig(**{name: wrong})
+
+
+def test_a_head_gives_standard_units_of_its_own_space() -> None:
+    """Less the mean, and by the root mean square distance from it over √channels."""
+    vectors = torch.randn(500, 6, generator=torch.Generator().manual_seed(0)).double() * 3 + 7
+    mean = vectors.mean(dim=0)
+    scale = float((vectors - mean).square().sum(dim=1).mean().sqrt())
+    found = Head(torch.nn.Identity(), mean.float(), scale)(vectors.float())
+    torch.testing.assert_close(found.double(), (vectors - mean) / scale * 6**0.5, rtol=1e-4, atol=1e-5)
+    assert abs(found.square().mean() - 1) < 1e-4
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_head_without_a_scale_is_refused(scale: float) -> None:
+    with pytest.raises(InputError, match="positive scale"):
+        Head(torch.nn.Identity(), torch.zeros(3), scale)
+
+
+@pytest.mark.parametrize("name", ["cosine", "smooth_l1", "field_weight", "render_weight", "contrast_weight", "rarity"])
+def test_weights_may_be_0_but_neither_less_nor_infinite(name: str) -> None:
+    assert getattr(LossConfig(**{name: 0.0}), name) == 0
+    for wrong in (-1e-9, float("inf"), float("nan")):
+        with pytest.raises(InputError, match=name):
+            LossConfig(**{name: wrong})
+
+
+def test_a_matching_loss_needs_one_of_its_parts_unless_there_is_a_contrast() -> None:
+    assert LossConfig(cosine=0.0, smooth_l1=1e-3).cosine == 0
+    assert LossConfig(cosine=1e-3, smooth_l1=0.0).smooth_l1 == 0
+    assert LossConfig(cosine=0.0, smooth_l1=0.0, contrast_weight=1.0).cosine == 0
+    with pytest.raises(InputError, match="cosine and smooth_l1"):
+        LossConfig(cosine=0.0, smooth_l1=0.0)
+
+
+def test_rarity_and_temperature_have_their_limits() -> None:
+    assert LossConfig(rarity=4.0, temperature=1e-6).rarity == 4
+    for wrong in ({"rarity": 4.001}, {"temperature": -0.1}, {"temperature": float("inf")}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            LossConfig(**wrong)

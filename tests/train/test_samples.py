@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,14 +12,15 @@ from hypothesis import strategies as st
 from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_encoder
 
 from gsencoder.data.augment import AugmentConfig
-from gsencoder.data.batch import SamplingConfig
+from gsencoder.data.batch import SamplingConfig, choose_part
 from gsencoder.errors import InputError
 from gsencoder.render import BlendConfig, blend
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepared import ViewRows
+from gsencoder.train.prepared import PreparedScene, ViewRows
 from gsencoder.train.rows import restrict
-from gsencoder.train.samples import SampleDataset, StepSampler, join_samples
+from gsencoder.train.samples import SampleDataset, StepSampler, join_samples, make_sample, target_codes
+from gsencoder.types import Cameras
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,8 @@ def test_processes_share_a_step_and_a_resumed_run_goes_on_in_the_middle(
     def numbers(rank: int, begin: int) -> list[list[int]]:
         return list(StepSampler(begin, first + steps, batch=batch, accumulate=accumulate, rank=rank, world=world))
 
+    sampler = StepSampler(first, first + steps, batch=batch, accumulate=accumulate, rank=0, world=world)
+    assert len(sampler) == len(list(sampler)) == steps * accumulate
     taken = sorted(number for rank in range(world) for micro in numbers(rank, first) for number in micro)
     size = batch * accumulate * world
     assert taken == list(range(first * size, (first + steps) * size))
@@ -101,6 +105,85 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     torch.testing.assert_close(ours.alpha, b.alpha[opaque], rtol=2e-3, atol=2e-3)
     rendered = ours.render(found.targets) / ours.alpha[:, None]
     assert torch.cosine_similarity(rendered, found.rows.targets, dim=1).mean() > 0.9
+
+
+@pytest.mark.parametrize("most", [1, 2])
+def test_of_many_scenes_the_latest_used_are_kept_open(
+    dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    monkeypatch.setattr("gsencoder.train.samples.OPEN_SCENES", most)
+    data, used = samples(*dataset), list[str]()
+    for number in range(9):
+        used.append(data.make(number).name.split(" ")[0])
+        opened = {scene.name for scene in data.scenes if "_arrays" in vars(scene)}
+        assert opened == set(list(dict.fromkeys(reversed(used)))[:most])
+
+
+def test_samples_of_a_step_are_of_one_size_and_steps_of_many(dataset: tuple[PreparedDataset, list[str]]) -> None:
+    crops = SamplingConfig(scope="scene", views=1, gaussians=300, smallest=20)
+    data = samples(*dataset, augmentation=None, sampling=crops, step_samples=3)
+    sizes = [len(data.make(number).attributes) for number in range(12)]
+    assert [sizes[start : start + 3] for start in range(0, 12, 3)] == [[size] * 3 for size in sizes[::3]]
+    assert len(set(sizes)) == 4
+
+
+def in_units(scene: PreparedScene, metres: float | None) -> PreparedScene:
+    """The same numbers in another unit."""
+    other = PreparedScene(scene.path)
+    cameras, _, up, names = other._header
+    other._header = (cameras, metres, up, names)
+    return other
+
+
+@pytest.mark.parametrize(("metres", "voxel"), [(0.5, 0.2), (2.0, 0.05), (None, 0.1)])
+def test_the_grid_has_the_encoders_voxel_in_metres(
+    dataset: tuple[PreparedDataset, list[str]], metres: float | None, voxel: float
+) -> None:
+    """So many metres a unit are so many times fewer units a voxel; an unknown unit is taken for the metre."""
+    assert SMALL.voxel == 0.1
+    recipe = samples(*dataset, augmentation=None).recipe
+    scene = dataset[0].scenes(dataset[1])[0]
+    found = SampleDataset([in_units(scene, metres)], recipe)[0]
+    expected = SampleDataset([in_units(scene, 1.0)], replace(recipe, encoder=replace(SMALL, voxel=voxel)))[0]
+    assert same(found, expected)
+
+
+def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
+    dataset: tuple[PreparedDataset, list[str]],
+) -> None:
+    scene = PreparedScene(dataset[0].scenes(dataset[1])[0].path)
+    unseen = np.arange(len(scene)) % 5 == 0
+    scene._arrays = {**scene._arrays, "weights": np.where(unseen, np.float32(0), scene.weights)}
+    recipe = samples(*dataset, augmentation=None, sampling=SamplingConfig(scope="scene", gaussians=0)).recipe
+    rarity, power = recipe.rarity, recipe.losses.rarity
+    squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - rarity.codebook).sum(axis=2)
+    expected = np.where(scene.weights > 0, squares.argmin(axis=1), -1)
+    np.testing.assert_array_equal(target_codes(scene, rarity), expected)
+    found = SampleDataset([scene], recipe)[0]
+    np.testing.assert_array_equal(found.codes.numpy(), expected)
+    np.testing.assert_array_equal(found.loss_weights.numpy(), np.where(expected < 0, 0, rarity.each(power)[expected]))
+
+
+def test_all_kinds_are_equally_often_the_centre_of_a_sample(
+    dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, drawn = samples(*dataset).recipe, list[np.ndarray]()
+
+    def record(means: np.ndarray, cameras: Cameras, chances: np.ndarray, *rest: Any) -> Any:
+        drawn.append(chances)
+        return choose_part(means, cameras, chances, *rest)
+
+    monkeypatch.setattr("gsencoder.train.samples.choose_part", record)
+    counts = recipe.rarity.counts
+    sums = np.zeros(len(counts))
+    for scene in dataset[0].scenes(dataset[1]):
+        codes = target_codes(scene, recipe.rarity)
+        make_sample(scene, codes, recipe, 200, np.random.default_rng(0))
+        assert (drawn[-1][codes < 0] == 0).all()
+        np.add.at(sums, codes[codes >= 0], drawn[-1][codes >= 0])
+    occurring = counts > 0
+    assert len(set(counts[occurring])) > 1
+    np.testing.assert_allclose(sums[occurring], sums[occurring][0], rtol=1e-5)
 
 
 def rows_of(weights: list[list[float]], valid: list[bool] | None = None) -> ViewRows:

@@ -1,0 +1,121 @@
+"""The matrix of a view and the sums over views, against what they are defined by."""
+
+import numpy as np
+import pytest
+import torch
+from splats import front_camera, random_gaussians
+
+from gsencoder.fusion.lift import Clock, Sums, capped, center_matrix, map_rows, view_matrix
+from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
+from gsencoder.render import BlendConfig, blend
+from gsencoder.render.rgb import depth_image
+from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+WIDTH, HEIGHT, STRIDE = 32, 24, 4
+CAMERA = front_camera(WIDTH, HEIGHT, 30.0)
+VIEWS = Views(cameras=CAMERA, names=("v",))
+NO_TEST = VisibilityConfig(against=())
+
+
+def map_of(features: np.ndarray, ax: float = 1 / STRIDE, bx: float = 0.0) -> FeatureMap:
+    space = FeatureSpace(name="s", channels=features.shape[-1])
+    return FeatureMap(features=features, grid_from_image=np.array([[ax, 0, bx], [0, 1 / STRIDE, 0]]), space=space)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_cells_without_a_vector_give_neither_features_nor_weight(rng: np.random.Generator, channels: int) -> None:
+    cells = rng.normal(size=(HEIGHT // STRIDE, WIDTH // STRIDE, channels)).astype(np.float32)
+    cells[1:4, 2:5] = np.nan
+    b = blend(random_gaussians(100), CAMERA, like=map_of(cells))
+    mask = rng.random((HEIGHT, WIDTH)) < 0.8
+    # Every pixel has equally many of a cell's rays.
+    share = mask.reshape(HEIGHT // STRIDE, STRIDE, WIDTH // STRIDE, STRIDE).mean(axis=(1, 3)).ravel()
+    sums = Sums(100, channels, None, None)
+    sums.add(b, map_of(cells), mask)
+    dense = b.render(torch.eye(100)).numpy().astype(np.float64)
+    vectors = cells.reshape(-1, channels)
+    share = np.where(np.isnan(vectors[:, 0]), 0, share)
+    np.testing.assert_allclose(sums.weights, dense.T @ share, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(sums.sums, dense.T @ (share[:, None] * np.nan_to_num(vectors)), rtol=1e-3, atol=1e-4)
+
+
+def test_rendered_depth_is_that_of_pixels_whatever_cells_are_lifted() -> None:
+    gaussians, config = random_gaussians(200, log_scale=-1.5), BlendConfig(rays_per_patch=1)
+    feature_map = map_of(np.zeros((HEIGHT // STRIDE, WIDTH // STRIDE, 2), np.float32))
+    visibility = VisibilityConfig(against=("rendered",), relative=0.1)
+    b = view_matrix(gaussians, VIEWS, 0, feature_map, Clock(), lift="blend", visibility=visibility, config=config)
+    plain = blend(gaussians, CAMERA, like=feature_map, config=config)
+    assert plain.lattice.side == 1
+    expected = keep_visible(plain, depth_image(blend(gaussians, CAMERA, config=config)), visibility)
+    assert 0 < len(expected.col) < len(plain.col)
+    assert torch.equal(b.crow, expected.crow)
+    assert torch.equal(b.col, expected.col)
+
+
+def test_a_centre_is_lifted_from_the_cell_that_it_projects_into() -> None:
+    """The map is a crop: the image begins a cell and a half to the left of it, and goes on for a cell below."""
+    gaussians = random_gaussians(300, center=(0.3, -0.2, 2.0))
+    feature_map = map_of(np.zeros((5, 7, 2), np.float32), bx=-1.5)
+    b = center_matrix(gaussians, VIEWS, 0, feature_map, [], NO_TEST, BlendConfig())
+    K, near = CAMERA.Ks[0].astype(np.float64), BlendConfig().near
+    expected = set()
+    for row, point in enumerate(gaussians.means.astype(np.float64)):
+        if point[2] <= near:
+            continue
+        x, y, _ = K @ point / point[2]
+        column, line = int(np.floor(x / STRIDE - 1.5)), int(np.floor(y / STRIDE))
+        if 0 <= x < WIDTH and 0 <= y < HEIGHT and 0 <= column < 7 and 0 <= line < 5:
+            expected.add((line * 7 + column, row))
+    cells = np.repeat(np.arange(b.rows), b.crow.diff().numpy())
+    assert set(zip(cells.tolist(), b.col.tolist(), strict=True)) == expected
+    assert {cell % 7 for cell, _ in expected} == set(range(7))
+    assert {cell // 7 for cell, _ in expected} == set(range(5))
+    assert (b.weight == 1).all()
+
+
+def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([10.0, 11.0, 20.0, 22.5, 30.0, 34.0])
+    monkeypatch.setattr("gsencoder.fusion.lift.time.perf_counter", lambda: next(times))
+    clock = Clock()
+    for step in ("blend", "lift", "blend"):
+        with clock(step):
+            pass
+    assert clock.seconds == {"blend": 5.0, "lift": 2.5}
+
+
+@pytest.mark.parametrize(
+    ("across", "down", "rays", "most"),
+    [(4, 4, 64, 16), (4, 4, 16, 16), (4, 4, 9, 9), (4, 9, 100, 36), (1, 1, 16, 1), (0.5, 0.5, 16, 1), (1, 1, 1, 1)],
+)
+def test_a_cell_has_no_more_rays_than_pixels(across: float, down: float, rays: int, most: int) -> None:
+    feature_map = FeatureMap(
+        features=np.zeros((2, 2, 1), np.float32),
+        grid_from_image=np.array([[1 / across, 0, 0], [0, 1 / down, 0]]),
+        space=FeatureSpace(name="s", channels=1),
+    )
+    config = BlendConfig(rays_per_patch=rays, near=0.5)
+    assert capped(config, feature_map) == BlendConfig(rays_per_patch=most, near=0.5)
+
+
+def test_a_coded_map_has_the_rows_of_its_table_and_none_where_there_is_no_code(rng: np.random.Generator) -> None:
+    table, codes = rng.normal(size=(3, 2)).astype(np.float32), np.array([[0, 2], [-1, 1]], np.int32)
+    space = FeatureSpace(name="s", channels=2)
+    feature_map = FeatureMap(codes=codes, table=table, grid_from_image=np.eye(2, 3), space=space)
+    np.testing.assert_array_equal(map_rows(feature_map), [table[0], table[2], [np.nan, np.nan], table[1]])
+
+
+@pytest.mark.parametrize("coded", [False, True])
+def test_sums_are_divided_by_their_weights_and_rows_of_hardly_any_weight_are_zero(
+    rng: np.random.Generator, coded: bool
+) -> None:
+    table = rng.normal(size=(3, 2)).astype(np.float32)
+    shares = np.array([[1, 2, 3], [0, 0, 0], [0, 1e-39, 0], [0.5, 0, 0.25]], np.float32)
+    sums = Sums(4, 2, None, table if coded else None)
+    if coded:
+        sums.sums[:] = shares
+    else:
+        sums.sums[:], sums.weights[:] = shares @ table, shares.sum(axis=1)
+    features, weights = sums.finish()
+    np.testing.assert_allclose(weights, [6, 0, 0, 0.75])
+    np.testing.assert_allclose(features[[0, 3]], (shares @ table)[[0, 3]] / [[6], [0.75]], rtol=1e-5)
+    assert (features[[1, 2]] == 0).all()
