@@ -115,7 +115,7 @@ class Server(ThreadingHTTPServer):
 def serving(behave: Callable[[Handler, Any], None]) -> Iterator[Server]:
     """A server while the block lasts."""
     server = Server(behave)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
     thread.start()
     try:
         yield server

@@ -18,6 +18,8 @@ from gsencoder.data.repair import inspect_splat, repair_splat
 from gsencoder.data.splats import RawSplat, gaussians_from_raw, load_splat, read_raw
 from gsencoder.errors import InputError, SceneWarning
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("a.ply", "a.compressed.ply", "a.spz", "v3.spz", "ascii.ply", "a.splat", "a.sog")
 FUZZ = settings(
     max_examples=100,
@@ -82,7 +84,6 @@ def assert_holds(path: Path) -> None:
 @FUZZ
 @example(edits=[(1227 / 1280, 127)], length=1.0)
 @given(edits=EDITS, length=st.one_of(st.just(1.0), st.floats(0, 1)))
-@pytest.mark.slow
 def test_changed_and_cut_bytes(
     valid: dict[str, bytes], tmp_path: Path, name: str, edits: list[Edit], length: float
 ) -> None:
@@ -143,7 +144,6 @@ FIELDS = ("", "mins", "maxs", "files", "codebook", "count", "bands")
 @example(key="scales", field="codebook", value=[10**400] * 256)
 @example(key="shN", field="count", value=2**16)
 @given(key=st.sampled_from(META_KEYS), field=st.sampled_from(FIELDS), value=JSON)
-@pytest.mark.slow
 def test_any_json_in_the_place_of_a_sog_field(tmp_path: Path, key: str, field: str, value: object) -> None:
     files = samples.sog_files(9)
     meta = json.loads(files["meta.json"])

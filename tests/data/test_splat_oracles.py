@@ -11,6 +11,8 @@ import splat_samples as samples
 from gsencoder.data import splats
 from gsencoder.data.splats import fingerprint, load_splat, read_raw, save_splat
 
+pytestmark = pytest.mark.slow
+
 
 def open3d_point_cloud(open3d: Any, path: Path) -> dict[str, np.ndarray]:
     points = open3d.t.io.read_point_cloud(str(path)).point
@@ -64,7 +66,6 @@ def assert_same_raw(ours: splats.RawSplat, theirs: object, opacity: float) -> No
 
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "v3.spz"])
-@pytest.mark.slow
 def test_gsply_reads_what_we_write_and_sees_the_same(tmp_path: Path, name: str, degree: int) -> None:
     import gsply
 
@@ -73,7 +74,6 @@ def test_gsply_reads_what_we_write_and_sees_the_same(tmp_path: Path, name: str, 
     assert_same_raw(read_raw(tmp_path / name), read(str(tmp_path / name)), 5e-5)
 
 
-@pytest.mark.slow
 def test_gsply_reads_our_sog_sample_as_we_do(tmp_path: Path) -> None:
     import gsply
 

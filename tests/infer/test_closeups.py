@@ -15,6 +15,8 @@ from gsencoder.infer.view_targets import Target, target_of
 from gsencoder.infer.views import choose_views
 from gsencoder.types import Cameras, Scene, Views
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 1280, 960
 SIZE = {"width": 320, "height": 240}
 
@@ -100,7 +102,6 @@ def test_only_what_is_clearly_closer_is_cut() -> None:
 
 @pytest.mark.parametrize("source", ["frames", "both"])
 @pytest.mark.parametrize("candidates", [8, 16, 24])
-@pytest.mark.slow
 def test_close_ups_are_chosen_where_there_are_photographs_and_nowhere_else(source: str, candidates: int) -> None:
     scene, target = photographed()
     assert scene.views is not None

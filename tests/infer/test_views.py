@@ -20,6 +20,8 @@ from gsencoder.infer.view_worth import BLURRED, LEAST_GAIN, NOTHING, Values, wor
 from gsencoder.infer.views import choose_views
 from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
 
+pytestmark = pytest.mark.slow
+
 SHELLS = ViewsConfig(source="shells", candidates=16, count=6, width=160, height=120)
 
 
@@ -354,7 +356,6 @@ def test_views_that_add_nothing_are_left_out_and_that_is_said() -> None:
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e-2, 1e3])
-@pytest.mark.slow
 def test_the_same_views_are_chosen_in_scenes_of_any_unit(unit: float) -> None:
     scene, target = cube_in_room()
     g = scene.gaussians
@@ -421,7 +422,6 @@ def test_uniform_frames_are_evenly_spread_and_need_no_target() -> None:
     assert judged.chosen[-1].covered > 0.8
 
 
-@pytest.mark.slow
 def test_more_candidates_never_leave_less_to_choose_from_than_are_asked_for() -> None:
     scene, target = cube_in_room()
     for source in ("frames", "shells", "both"):

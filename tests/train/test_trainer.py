@@ -26,6 +26,8 @@ from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.trainer import Trainer, TrainerConfig, Validated, _quiet_of_ended_connections
 
+pytestmark = pytest.mark.slow
+
 Prepared = tuple[PreparedDataset, list[str]]
 
 
@@ -66,7 +68,6 @@ def assert_same_weights(one: Path, other: Path) -> None:
         np.testing.assert_array_equal(value, second[name])
 
 
-@pytest.mark.slow
 def test_training_brings_the_loss_down(dataset: Prepared, tmp_path: Path) -> None:
     trainer(dataset, tmp_path, replace(SHORT, steps=40)).run()
     curve = losses(tmp_path)
@@ -323,7 +324,6 @@ def test_what_was_done_before_a_step_that_is_not_finite_is_kept(dataset: Prepare
 # torch's own compiler does what torch warns of: it instantiates autograd functions and looks for gradients everywhere.
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
-@pytest.mark.slow
 def test_a_compiled_encoder_learns_the_same(
     dataset: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_jaxtyping: None
 ) -> None:
@@ -418,7 +418,6 @@ def test_two_processes_follow_the_losses_of_one(dataset: Prepared, tmp_path: Pat
         np.testing.assert_allclose(value, one[name], atol=2e-3)
 
 
-@pytest.mark.slow
 def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path) -> None:
     whole = script(dataset, tmp_path / "whole", steps=60, accumulate=1)
     cut = script(dataset, tmp_path / "cut", steps=60, accumulate=1)
