@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras
 

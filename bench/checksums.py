@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gsencoder import cli
-from gsencoder.data import mapped_arrays
+from gsencoder.app import cli
+from gsencoder.core.files import mapped_arrays
 
 CHECKED = {"seconds": 0.0, "bytes": 0.0, "calls": 0.0}
 

@@ -13,16 +13,16 @@ from itertools import product
 import numpy as np
 from per_scene import labelled, quality
 
-from gsencoder.data.model_files import find_file
-from gsencoder.data.text_table import load_text_table
+from gsencoder.core.files.model_files import find_file
+from gsencoder.core.runtime.heap import keep_heap
 from gsencoder.evaluate.boxes import accuracy
-from gsencoder.evaluate.naming import naming_scores
-from gsencoder.fusion.field_error import field_error
+from gsencoder.evaluate.protocols.naming import naming_scores
+from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.chunks import EncodeConfig, cut
-from gsencoder.infer.encode import encode
-from gsencoder.models.heap import keep_heap
+from gsencoder.infer.encode.chunks import EncodeConfig, cut
+from gsencoder.infer.encode.encode import encode
 from gsencoder.models.weights import load_weights
+from gsencoder.text.table import load_text_table
 
 
 def main() -> None:

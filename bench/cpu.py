@@ -19,14 +19,14 @@ import torch
 from encoder import CHANNELS, surface
 from torch.nn import functional
 
-from gsencoder.commands.train import TrainConfig
-from gsencoder.compose import compose
-from gsencoder.models.cells import cells_of
+from gsencoder.app.commands.train import TrainConfig
+from gsencoder.app.settings.compose import compose
+from gsencoder.core.runtime.heap import keep_heap
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
-from gsencoder.models.heap import keep_heap
-from gsencoder.models.neighbors import NeighborConv, neighbor_table
-from gsencoder.models.plan import join_plans
-from gsencoder.models.serialize import morton_codes
+from gsencoder.models.grid.cells import cells_of
+from gsencoder.models.grid.neighbors import NeighborConv, neighbor_table
+from gsencoder.models.grid.plan import join_plans
+from gsencoder.models.grid.serialize import morton_codes
 from gsencoder.train.losses import LossConfig, match_loss
 
 

@@ -24,15 +24,15 @@ import numpy as np
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gsencoder.commands.train import TrainConfig
-from gsencoder.compose import compose
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import encode
-from gsencoder.models.device import autocast_dtype
+from gsencoder.app.commands.train import TrainConfig
+from gsencoder.app.settings.compose import compose
+from gsencoder.core.runtime.device import autocast_dtype
+from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
-from gsencoder.models.heap import keep_heap
+from gsencoder.models.grid.plan import plan_cloud
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.plan import plan_cloud
 from gsencoder.train import samples
 from gsencoder.train.distill import Distillation
 from gsencoder.train.prepare import PreparedDataset

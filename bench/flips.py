@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.data.text_table import load_text_table
-from gsencoder.errors import InputError
-from gsencoder.fusion.store import FEATURES_FILE, WORDS_FILE, load_features
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.store.folder import FEATURES_FILE, WORDS_FILE, load_features
 from gsencoder.models.weights import WEIGHTS_FILE, load_weights
+from gsencoder.text.table import load_text_table
 
 
 def digest(value: Any) -> str:

@@ -30,11 +30,11 @@ import numpy as np
 import torch
 from synthetic_teacher import SyntheticTeacher
 
+from gsencoder.core.runtime.peak_memory import memory_growth
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import SeedConfig, seed
-from gsencoder.evaluate.memory import memory_growth
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.fusion.basis import Moments, encode, fit_basis
-from gsencoder.fusion.field_error import field_error
+from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.lift import center_matrix
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.render import Blend, BlendConfig, blend

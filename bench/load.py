@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import seed
+from gsencoder.data.seeding.seed import seed
 from gsencoder.data.splats import load_splat
-from gsencoder.errors import SceneWarning
 
 
 def timed(work: Callable[[], Any], runs: int) -> tuple[float, Any]:

@@ -22,11 +22,11 @@ ROUNDS, PASSES = 3, 5
 
 def measure(model: str, splat: str) -> dict[str, float]:
     """One process's figures; runs in the child."""
+    from gsencoder.app.runs.summary import peak_memory_mb
+    from gsencoder.core.runtime.heap import keep_heap
     from gsencoder.data.splats import load_splat
-    from gsencoder.infer.chunks import EncodeConfig
-    from gsencoder.infer.encoders import load_encoder
-    from gsencoder.models.heap import keep_heap
-    from gsencoder.summary import peak_memory_mb
+    from gsencoder.infer.encode.chunks import EncodeConfig
+    from gsencoder.infer.load_encoder import load_encoder
 
     gaussians = load_splat(splat)
     keep_heap()
@@ -59,7 +59,7 @@ def main() -> None:
     import numpy as np
 
     from gsencoder.data.scenes import load_scene
-    from gsencoder.data.seeds import with_gaussians
+    from gsencoder.data.seeding.seed import with_gaussians
     from gsencoder.data.splats import save_splat
 
     everything = with_gaussians(load_scene(chosen.scene)).gaussians

@@ -8,13 +8,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import SeedConfig
-from gsencoder.evaluate.localization import LocalizationProtocol, ask, scores
+from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask, scores
 from gsencoder.evaluate.sources import fused, with_features
-from gsencoder.fusion.packages import PACKAGE_FILE, open_package, save_package
+from gsencoder.fusion.store.package import PACKAGE_FILE, open_package, save_package
 from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.localize.localize import LocalizeConfig
 
 
 def main() -> None:

@@ -18,21 +18,21 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsencoder.data.model_files import find_file
+from gsencoder.core.files.model_files import find_file
+from gsencoder.core.runtime.heap import keep_heap
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import seed
-from gsencoder.data.text_table import TextTable, load_text_table
+from gsencoder.data.seeding.seed import seed
 from gsencoder.evaluate.boxes import Hit, accuracy
-from gsencoder.evaluate.localization import LocalizationProtocol, ask
-from gsencoder.evaluate.naming import SceneNames, compare_names, naming_scores
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask
+from gsencoder.evaluate.protocols.naming import SceneNames, compare_names, naming_scores
 from gsencoder.evaluate.sources import encoded
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.labels import LabelsTeacher
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.models.heap import keep_heap
+from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.types import FeatureMap, GaussianFeatures, Scene
 
 

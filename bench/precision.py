@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import with_gaussians
-from gsencoder.fusion.field_error import row_cosines
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.onnx_runtime import OnnxEncoder
+from gsencoder.data.seeding.seed import with_gaussians
+from gsencoder.fusion.feature_error import row_cosines
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.onnx.runtime import OnnxEncoder
 from gsencoder.types import GaussianFeatures
 
 PASSES = 3

@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
+from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import SeedConfig, seed
-from gsencoder.data.text_table import TextTable
-from gsencoder.errors import SceneWarning
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit
-from gsencoder.evaluate.localization import LocalizationProtocol, ask, scores
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask, scores
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
-from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.infer.relevancy import ThresholdConfig
+from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize.relevancy import ThresholdConfig
+from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
 ABOVE = 0.005

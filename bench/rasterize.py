@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import seed
+from gsencoder.data.seeding.seed import seed
 from gsencoder.reconstruct.parameters import camera_of, parameters_from, rows_in_view
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.fusion.visibility import ray_pixels
-from gsencoder.render.lattice import grid_lattice
+from gsencoder.render.rays import grid_lattice
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 RAYS = 16

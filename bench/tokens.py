@@ -11,10 +11,10 @@ import time
 
 import numpy as np
 
+from gsencoder.core.even_indices import evenly
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import with_gaussians
-from gsencoder.evenly import evenly
-from gsencoder.infer.tokens import feature_tokens, token_blends
+from gsencoder.data.seeding.seed import with_gaussians
+from gsencoder.infer.views.tokens import feature_tokens, token_blends
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 PASSES = 5

@@ -16,22 +16,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsencoder.data.model_files import find_file
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.model_files import find_file
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import with_gaussians
-from gsencoder.data.text_table import load_text_table
-from gsencoder.errors import InputError, SceneWarning
+from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import asked_objects
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.infer.free_space import FreeSpace
-from gsencoder.infer.localize import localize
-from gsencoder.infer.view_judge import look
-from gsencoder.infer.view_set import ViewsConfig, ViewSet
-from gsencoder.infer.view_targets import Target, targets_of
-from gsencoder.infer.views import choose_views
+from gsencoder.infer.localize.localize import localize
+from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.free_space import FreeSpace
+from gsencoder.infer.views.scores import look
+from gsencoder.infer.views.selection import ViewsConfig, ViewSet
+from gsencoder.infer.views.targets import Target, targets_of
 from gsencoder.render import BlendConfig
+from gsencoder.text.table import load_text_table
 from gsencoder.types import Scene, SceneObject
 
 COUNT = 8

@@ -12,18 +12,18 @@ import time
 import warnings
 from pathlib import Path
 
+from gsencoder.core.errors import SceneWarning
+from gsencoder.core.files.csv_text import csv_text
 from gsencoder.data.scenes import find_scenes, load_scene
-from gsencoder.data.seeds import SeedConfig, seed
-from gsencoder.errors import SceneWarning
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit
-from gsencoder.evaluate.localization import LocalizationProtocol, ask, scores
-from gsencoder.evaluate.tables import csv_text
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask, scores
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.visibility import VisibilityConfig
-from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.infer.relevancy import ThresholdConfig
+from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize.relevancy import ThresholdConfig
 
 VISIBILITIES = {
     "none": VisibilityConfig(against=()),

@@ -6,7 +6,7 @@ python examples/find_word.py encoder.onnx room.ply mug
 import sys
 
 from gsencoder import InputError, Scene, load_splat, localize
-from gsencoder.infer.onnx_runtime import OnnxEncoder
+from gsencoder.infer.onnx.runtime import OnnxEncoder
 
 
 def main(model: str, splat: str, word: str) -> None:

@@ -13,14 +13,14 @@ _HOME = {
     "Gaussians": "gsencoder.types",
     "Cameras": "gsencoder.types",
     "Scene": "gsencoder.types",
-    "InputError": "gsencoder.errors",
+    "InputError": "gsencoder.core.errors",
     "load_splat": "gsencoder.data.splats",
     "save_splat": "gsencoder.data.splats",
     "load_scene": "gsencoder.data.scenes",
     "fuse": "gsencoder.fusion.fuse",
-    "encode": "gsencoder.infer.encode",
+    "encode": "gsencoder.infer.encode.encode",
     "load_weights": "gsencoder.models.weights",
-    "localize": "gsencoder.infer.localize",
+    "localize": "gsencoder.infer.localize.localize",
 }
 
 __all__ = [*_HOME]

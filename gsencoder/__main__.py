@@ -2,7 +2,7 @@
 
 import sys
 
-from gsencoder.cli import main
+from gsencoder.app.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Integer, UInt8
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """A colour is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction."""
@@ -464,7 +464,7 @@ class Box:
     Attributes:
         query: the word.
         rank: 0 = best of its query.
-        score: see infer/localize.py.
+        score: see infer/localize/localize.py.
         aabb_min, aabb_max: axis-aligned corners.
         obb_center, obb_rotation, obb_size: oriented box; columns of the rotation are its axes.
         rows: the Gaussians inside, as row numbers.

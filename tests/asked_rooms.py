@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from rooms import cube, room
 
-from gsencoder.data.text_table import make_text_table, save_text_table
-from gsencoder.fusion.store import WORDS_FILE, save_features
+from gsencoder.fusion.store.folder import WORDS_FILE, save_features
+from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures
 
 NAMES = ("cube", "crate", "wall", "pen holder")

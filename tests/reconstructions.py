@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gsencoder import cli
+from gsencoder.app import cli
 
 QUICK = ("quiet=true", "optimize.steps=12", "holdout=4", "seeds.voxel=0.08", "optimize.sh_degree=1")
 

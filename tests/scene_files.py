@@ -83,7 +83,7 @@ def write_colmap(
     offset: tuple[float, float, float] = (0, 0, 0),
 ) -> Path:
     """A COLMAP scene with five points that every 32×24 picture sees; `old` leaves rigs and frames away."""
-    from gsencoder.data.undistort import load_pycolmap
+    from gsencoder.data.readers.undistort import load_pycolmap
 
     pycolmap = load_pycolmap()
     made = pycolmap.Reconstruction()

@@ -18,20 +18,20 @@ from feature_fields import make_features
 from splats import front_camera, random_gaussians
 from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
-from gsencoder.data.text_table import load_text_table, make_text_table, save_text_table
-from gsencoder.errors import InputError
-from gsencoder.fusion.packages import PACKAGE_FILE, SPLAT_FILE, save_package
-from gsencoder.fusion.partial import SUMS_FILE, PartialFusion
-from gsencoder.fusion.store import FEATURES_FILE, SCENE_FILE, load_features, load_settings, save_features
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.checkpoint import SUMS_FILE, PartialFusion
+from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, load_settings, save_features
+from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_package
 from gsencoder.fusion.teacher_maps import read_map, write_map
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import load_weights, save_weights
+from gsencoder.reconstruct.anchor import leash_of
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.leash import leash_of
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.text.table import load_text_table, make_text_table, save_text_table
+from gsencoder.train.adapter_heads import load_heads, save_heads
 from gsencoder.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.heads import load_heads, save_heads
 from gsencoder.train.prepare import RARITY_FILE, SPACE_FILE
 from gsencoder.types import FeatureSpace, Scene, Views
 

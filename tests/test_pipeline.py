@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsencoder import cli
+from gsencoder.app import cli
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats import load_splat
 from gsencoder.evaluate.boxes import aabb_iou
-from gsencoder.fusion.store import load_features
+from gsencoder.fusion.store.folder import load_features
 
 pytestmark = pytest.mark.slow
 

@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeds import with_gaussians
-from gsencoder.data.text_table import load_text_table
-from gsencoder.evaluate.naming import evaluate_naming, naming_scores
-from gsencoder.fusion.field_error import field_error
-from gsencoder.fusion.store import WORDS_FILE
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import TorchEncoder
+from gsencoder.data.seeding.seed import with_gaussians
+from gsencoder.evaluate.protocols.naming import evaluate_naming, naming_scores
+from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.models.weights import SHIPPED, load_weights
+from gsencoder.text.table import load_text_table
 
 pytestmark = pytest.mark.slow
 

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsencoder import cli
-from gsencoder.data.synthetic import make_room
-from gsencoder.data.synthetic_write import write_room
-from gsencoder.data.text_table import load_text_table, make_text_table, save_text_table
-from gsencoder.fusion.field_error import field_error
-from gsencoder.fusion.store import load_features
+from gsencoder.app import cli
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.store.folder import load_features
 from gsencoder.models.weights import load_weights
-from gsencoder.train.heads import save_heads
+from gsencoder.text.table import load_text_table, make_text_table, save_text_table
+from gsencoder.train.adapter_heads import save_heads
 
 pytestmark = pytest.mark.slow
 
@@ -124,7 +124,7 @@ def test_a_training_goes_on_only_with_heads_of_the_same_content(
     prepared = f"prepared={trained.with_name('encoder.prepared')}"
     run = ["train", *scenes, "holdout=room_2", words, prepared, f"out={tmp_path / 'run'}", *QUICK, "tensorboard=false"]
     with monkeypatch.context() as patch:
-        patch.setattr("gsencoder.commands.train.write_results", interrupted)
+        patch.setattr("gsencoder.app.commands.train.write_results", interrupted)
         assert cli.main([*run, f"heads={tmp_path / 'heads'}"]) == 130
     save_heads(tmp_path / "heads", head(0.2))
     loud = [word for word in run if word != "quiet=true"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from splats import random_gaussians
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.render import blend
 from gsencoder.types import Cameras, Scene
 

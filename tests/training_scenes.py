@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.data.augment import AugmentConfig
-from gsencoder.data.batch import SamplingConfig
+from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.point_transformer import TransformerConfig
-from gsencoder.tracking import untracked
+from gsencoder.train.augment import AugmentConfig
+from gsencoder.train.crops import SamplingConfig
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
 from gsencoder.train.samples import SampleDataset, SampleRecipe

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.types import Cameras, Gaussians
 
 COVERED = 0.95

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.data.colmap import is_colmap_model, read_colmap
-from gsencoder.data.images import (
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.even_indices import evenly
+from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
+from gsencoder.data.readers.images import (
     DepthFiles,
     ImageFiles,
     InstanceFiles,
@@ -19,15 +21,19 @@ from gsencoder.data.images import (
     picture_info,
     picture_size,
 )
-from gsencoder.data.objects_json import read_objects
-from gsencoder.data.posed import PosedImage, PosedImages, choose_origin, inverse_rigid
-from gsencoder.data.scannet import is_scannet_export, read_scannet
-from gsencoder.data.scene_splat import SPLAT_SUFFIXES, file_of_scene, find_splat, read_bare_splat, warn_of_unused_splat
+from gsencoder.data.readers.objects_json import read_objects
+from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin, inverse_rigid
+from gsencoder.data.readers.scannet import is_scannet_export, read_scannet
+from gsencoder.data.readers.scene_splat import (
+    SPLAT_SUFFIXES,
+    file_of_scene,
+    find_splat,
+    read_bare_splat,
+    warn_of_unused_splat,
+)
+from gsencoder.data.readers.transforms_json import TRANSFORMS, read_transforms
+from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.data.splats import load_splat
-from gsencoder.data.transforms_json import TRANSFORMS, read_transforms
-from gsencoder.data.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
-from gsencoder.errors import InputError, SceneWarning
-from gsencoder.evenly import evenly
 from gsencoder.types import Cameras, Scene, Views
 
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")

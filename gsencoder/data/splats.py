@@ -19,20 +19,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from gsencoder.data.atomic import atomic_file
-from gsencoder.data.splat_compressed import is_compressed, morton_order, packed_bytes, read_compressed
-from gsencoder.data.splat_dotsplat import read_dotsplat
-from gsencoder.data.splat_ply import read_header, read_inria, write_inria
-from gsencoder.data.splat_raw import (
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.data.splat_formats.compressed_ply import is_compressed, morton_order, packed_bytes, read_compressed
+from gsencoder.data.splat_formats.dotsplat import read_dotsplat
+from gsencoder.data.splat_formats.ply import read_header, read_inria, write_inria
+from gsencoder.data.splat_formats.raw import (
     RawSplat,
     logits_from_opacities,
     logs_from_scales,
     opacities_from_logits,
     unusable_rows,
 )
-from gsencoder.data.splat_sog import read_sog_folder, read_sog_zip
-from gsencoder.data.splat_spz import GZIP_MAGIC, MAGIC, read_spz, write_spz
-from gsencoder.errors import InputError, SceneWarning
+from gsencoder.data.splat_formats.sog import read_sog_folder, read_sog_zip
+from gsencoder.data.splat_formats.spz import GZIP_MAGIC, MAGIC, read_spz, write_spz
 from gsencoder.types import Gaussians
 
 __all__ = ["RawSplat", "fingerprint", "gaussians_from_raw", "load_splat", "read_raw", "save_splat"]
@@ -189,7 +189,7 @@ def save_splat(
         .compressed.ply: means and log-scales half of a 1023rd of their range in a chunk, opacities ±1/510, colours
             half of a 255th of their range in a chunk, other SH ±1/64 in ±4, quaternion components 7e-4 (the left-out
             one 2e-3).
-        .spz: see `gsencoder.data.splat_spz.write_spz`.
+        .spz: see `gsencoder.data.splat_formats.spz.write_spz`.
 
     Raises:
         InputError: a suffix that cannot be written, no Gaussians, a missing folder, or a system that refuses.

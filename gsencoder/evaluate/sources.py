@@ -4,15 +4,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.seeds import SeedConfig, with_gaussians
-from gsencoder.data.spacing import unit_of
-from gsencoder.data.text_table import TextTable
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encoders import Encoder
-from gsencoder.tracking import Track, untracked
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.load_encoder import Encoder
+from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
 Source = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]

@@ -14,20 +14,20 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.peak_memory import memory_growth
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.seeds import SeedConfig, seed
-from gsencoder.data.text_table import TextTable
-from gsencoder.errors import InputError
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit, accuracy
-from gsencoder.evaluate.localization import LocalizationProtocol, ask
-from gsencoder.evaluate.memory import memory_growth
-from gsencoder.fusion.field_error import FieldError, field_error
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask
+from gsencoder.fusion.feature_error import FieldError, field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
-from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.tracking import Track, untracked
+from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
 REFERENCE = "reference"

@@ -12,17 +12,17 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from gsencoder.errors import about
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import encode
-from gsencoder.infer.pictures import contact_sheet, fit_pca_colors, pca_picture
+from gsencoder.core.errors import about
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.infer.draw.pictures import contact_sheet, fit_pca_colors, pca_picture
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.render import blend
-from gsencoder.render.rgb import render_image
-from gsencoder.tracking import Track, untracked
-from gsencoder.train.prepared import PreparedScene
-from gsencoder.train.rarity import nearest_codes
+from gsencoder.render.images import render_image
+from gsencoder.train.class_balance import nearest_codes
+from gsencoder.train.prepared_scene import PreparedScene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,7 +7,7 @@ channels. Because rows of B sum to alpha and not to 1, a rendered map decodes as
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 

@@ -15,16 +15,16 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.core.errors import InputError
+from gsencoder.core.even_indices import evenly
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.splats import fingerprint
-from gsencoder.errors import InputError
-from gsencoder.evenly import evenly
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
+from gsencoder.fusion.checkpoint import PartialFusion
 from gsencoder.fusion.lift import Clock, Sums, map_rows, view_matrix
-from gsencoder.fusion.partial import PartialFusion
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import BlendConfig
-from gsencoder.tracking import Track, untracked
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Scene, Views
 
 

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float32
 
 from gsencoder.fusion.basis import encode
-from gsencoder.fusion.partial import PartialFusion
+from gsencoder.fusion.checkpoint import PartialFusion
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
 from gsencoder.geometry import transform
 from gsencoder.render import Blend, BlendConfig, blend
-from gsencoder.render.lattice import grid_lattice
-from gsencoder.render.rgb import depth_image
+from gsencoder.render.images import depth_image
+from gsencoder.render.rays import grid_lattice
 from gsencoder.types import FeatureBasis, FeatureMap, Gaussians, Views
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.data.archive import open_archive, write_archive
-from gsencoder.errors import advised
+from gsencoder.core.errors import advised
+from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int32, Int64
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.render import Blend
-from gsencoder.render.lattice import Lattice
+from gsencoder.render.rays import Lattice
 from gsencoder.types import Views
 
 Source = Literal["auto", "sensor", "rendered"]

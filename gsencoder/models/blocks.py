@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int64, Integer
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsencoder.models.neighbors import NeighborConv
+from gsencoder.models.grid.neighbors import NeighborConv
 
 UNSEEN = -3e4
 """Added to the score of what is masked; half precision holds it."""

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsencoder.errors import InputError
-from gsencoder.models.curves import Curves
+from gsencoder.core.errors import InputError
 from gsencoder.models.embed import CHANNELS, Attribute, channels_of, embed
-from gsencoder.models.neighbors import NeighborConv
-from gsencoder.models.plan import CloudPlan, Plan, join_plans, plan_cloud
+from gsencoder.models.grid.curves import Curves
+from gsencoder.models.grid.neighbors import NeighborConv
+from gsencoder.models.grid.plan import CloudPlan, Plan, join_plans, plan_cloud
 from gsencoder.models.point_transformer import PointTransformer, TransformerConfig
 from gsencoder.types import Gaussians
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.data.archive import Archive
-from gsencoder.data.archived import read_space, space_parts
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import Archive
+from gsencoder.data.archive_records import read_space, space_parts
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 

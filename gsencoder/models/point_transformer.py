@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.models.blocks import Block, Pool, Unpool
-from gsencoder.models.plan import ORDERS, Level, Plan
-from gsencoder.models.serialize import ALIGN, Order
+from gsencoder.models.grid.plan import ORDERS, Level, Plan
+from gsencoder.models.grid.serialize import ALIGN, Order
 
 MOST_CHANNELS, MOST_BLOCKS, MOST_RATIO = 1 << 14, 1000, 64
 """Beyond any network that was ever trained on points: such sizes are slips, or a file that wants the memory."""

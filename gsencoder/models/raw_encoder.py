@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from gsencoder.models.embed import embed
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.neighbors import AHEAD
+from gsencoder.models.grid.neighbors import AHEAD
+from gsencoder.models.grid.plan import Level, Plan
+from gsencoder.models.grid.serialize import ALIGN, MOST_LEVELS, NEVER, Order, hilbert_from_morton, morton_codes, swapped
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.plan import Level, Plan
 from gsencoder.models.point_transformer import TransformerConfig
-from gsencoder.models.serialize import ALIGN, MOST_LEVELS, NEVER, Order, hilbert_from_morton, morton_codes, swapped
 
 
 class Tokens(NamedTuple):

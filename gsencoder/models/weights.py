@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from gsencoder.data.archive import open_archive, write_archive
-from gsencoder.data.model_files import find_file
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.model_files import find_file
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from gsencoder.data.archive import first_difference, open_archive, write_archive
-from gsencoder.errors import InputError, advised
-from gsencoder.reconstruct.leash import Leash
+from gsencoder.core.errors import InputError, advised
+from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.reconstruct.anchor import Leash
 from gsencoder.reconstruct.parameters import shapes_of
 from gsencoder.reconstruct.row_adam import RowAdam
 

@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.geometry import transform
 from gsencoder.reconstruct.photographs import Photographs, Shot
 from gsencoder.reconstruct.stereo import (
@@ -31,7 +32,6 @@ from gsencoder.reconstruct.stereo import (
     window_mean,
     world_points,
 )
-from gsencoder.tracking import Track, untracked
 from gsencoder.types import Cameras
 
 FILLED_SPACING = 2.0

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsencoder.errors import InputError
-from gsencoder.reconstruct.leash import Leash
+from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.signals import held_back
+from gsencoder.reconstruct.anchor import Leash
 from gsencoder.reconstruct.parameters import (
     Parameters,
     camera_of,
@@ -21,10 +22,9 @@ from gsencoder.reconstruct.parameters import (
 from gsencoder.reconstruct.photographs import Photographs, Shot
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.render.quality import WINDOW as SSIM_WINDOW
-from gsencoder.render.quality import ssim
+from gsencoder.render.image_metrics import WINDOW as SSIM_WINDOW
+from gsencoder.render.image_metrics import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
-from gsencoder.stopping import held_back
 from gsencoder.types import Gaussians
 
 LARGEST_RATE = 10.0

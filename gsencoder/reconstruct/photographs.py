@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsencoder.errors import InputError
-from gsencoder.tracking import Track, untracked
+from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.types import Cameras, Views
 
 

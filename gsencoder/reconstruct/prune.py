@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.reconstruct.parameters import Parameters, camera_of, rows_in_view
 from gsencoder.reconstruct.photographs import Shot
 from gsencoder.render.rasterize import RasterConfig, rasterize

@@ -11,10 +11,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from gsencoder.data.atomic import atomic_file
-from gsencoder.data.images import check_picture
-from gsencoder.data.undistort import load_pycolmap
-from gsencoder.errors import InputError, SceneWarning, listed
+from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.data.readers.images import check_picture
+from gsencoder.data.readers.undistort import load_pycolmap
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")
 OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".nef", ".arw", ".mp4", ".mov", ".avi")

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gsencoder.data.seeds import SeedConfig, seed
-from gsencoder.data.seeds_points import colors_or_grey, seed_from_points
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.reconstruct.dense import Dense, DenseConfig, densify
 from gsencoder.reconstruct.photographs import Photographs
-from gsencoder.tracking import Track, untracked
 from gsencoder.types import Gaussians, Scene, Views
 
 MEASURED = ("depth", "mesh", "tsdf")

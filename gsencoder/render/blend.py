@@ -14,9 +14,9 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from gsencoder import geometry
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.render import reference
-from gsencoder.render.lattice import Lattice, grid_lattice, patch_lattice, pixel_lattice
+from gsencoder.render.rays import Lattice, grid_lattice, patch_lattice, pixel_lattice
 from gsencoder.types import Cameras, FeatureMap, Gaussians
 
 Backend = Literal["auto", "cpu", "reference"]
@@ -94,7 +94,7 @@ class Blend:
     def transposed(self) -> tuple[Int64[Tensor, " M"], Int64[Tensor, " M_plus_1"], Int32[Tensor, " nnz"], Tensor]:
         """The M columns that occur, and Bᵀ restricted to them: (columns, crow, row, weight)."""
         if self.weight.device.type == "cpu":
-            from gsencoder.render import products
+            from gsencoder.render import sparse_cpu as products
 
             arrays = (self.crow.numpy(), self.col.numpy(), self.weight.numpy())
             columns, crow, row, weight = map(torch.from_numpy, products.transpose(*arrays, self.gaussians))
@@ -159,7 +159,7 @@ class Blend:
         """
         columns, crow, row, weight = self.transposed
         if codes.device.type == "cpu":
-            from gsencoder.render import products
+            from gsencoder.render import sparse_cpu as products
 
             products.count_codes(*(part.numpy() for part in (crow, row, weight, codes, columns, sums)))
         else:
@@ -176,7 +176,7 @@ class Blend:
     def keep_between(self, least: Float[Tensor, " P"], most: Float[Tensor, " P"]) -> "Blend":
         """The same blend with only the Gaussians whose depth lies from `least` to `most` of their row."""
         if self.crow.device.type == "cpu":
-            from gsencoder.render import products
+            from gsencoder.render import sparse_cpu as products
 
             arrays = (self.crow, self.col, self.weight, self.depths, least, most)
             kept = products.keep_between(*(array.numpy() for array in arrays))
@@ -189,7 +189,7 @@ class Blend:
 
 def _multiply_into(crow: Tensor, col: Tensor, weight: Tensor, values: Tensor, targets: Tensor, out: Tensor) -> None:
     if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
-        from gsencoder.render import products
+        from gsencoder.render import sparse_cpu as products
 
         arrays = (crow, col, weight, values.detach().contiguous(), targets, out)
         products.product(*(array.numpy() for array in arrays))
@@ -293,7 +293,7 @@ def _project(
 
 
 def _blend_cpu(gaussians: Gaussians, cameras: Cameras, view: int, lattice: Lattice, config: BlendConfig) -> Blend:
-    from gsencoder.render import cpu
+    from gsencoder.render import blend_cpu as cpu
 
     size = int(cameras.widths[view]), int(cameras.heights[view])
     projected, index = cpu.project(

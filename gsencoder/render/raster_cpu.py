@@ -6,7 +6,7 @@ S − Σ_{j≤i} w_j v_j, and
 
     ∂L/∂α_i = T_i v_i − (S − Σ_{j≤i} w_j v_j) / (1 − α_i).
 
-Along a line of pixels exp(−quadratic) is a product of two geometric sequences, as in cpu.py.
+Along a line of pixels exp(−quadratic) is a product of two geometric sequences, as in blend_cpu.py.
 """
 
 import math
@@ -15,8 +15,8 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Float, Float64, Int32, Int64
 
+from gsencoder.core.runtime.threads import PIECES, even_cuts, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
-from gsencoder.render.threads import PIECES, even_cuts, kernel, parallel
 
 TILE = 16
 CHANNELS = 5

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from torch import Tensor
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 
 if TYPE_CHECKING:
     from gsencoder.render.rasterize import RasterConfig

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsencoder import geometry
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.geometry import Projected
 from gsencoder.render import reference
-from gsencoder.render.lattice import pixel_lattice
+from gsencoder.render.rays import pixel_lattice
 
 RasterBackend = Literal["auto", "cpu", "reference", "gsplat"]
 

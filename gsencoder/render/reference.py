@@ -11,7 +11,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN, Projected
-from gsencoder.render.lattice import Lattice
+from gsencoder.render.rays import Lattice
 
 
 def blend_weights(

@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from gsencoder.data.archive import Archive, first_difference, open_archive, write_archive
-from gsencoder.errors import InputError, advised
+from gsencoder.core.errors import InputError, advised
+from gsencoder.core.files.archive import Archive, first_difference, open_archive, write_archive
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.errors import InputError
-from gsencoder.evenly import evenly
+from gsencoder.core.errors import InputError
+from gsencoder.core.even_indices import evenly
 from gsencoder.fusion.basis import Moments, encode, fit_basis, table_basis
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import map_rows

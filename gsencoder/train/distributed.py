@@ -14,9 +14,9 @@ from datetime import timedelta
 import torch
 from torch import Tensor, distributed
 
-from gsencoder.errors import InputError
-from gsencoder.models.choices import Device
-from gsencoder.models.device import choose_device
+from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.device import choose_device
+from gsencoder.core.runtime.device_names import Device
 
 STOPPED_ELSEWHERE = "training: another process stopped; its own message says why"
 

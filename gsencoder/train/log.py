@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gsencoder.data.atomic import atomic_file
-from gsencoder.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.atomic import atomic_file
 
 LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
 

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from gsencoder.data.archive import first_difference, open_archive, write_archive
-from gsencoder.data.atomic import atomic_file
-from gsencoder.errors import InputError, advised
+from gsencoder.core.errors import InputError, advised
+from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.runtime.tracking import Track
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import capped
@@ -24,10 +25,9 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
 from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
 from gsencoder.render import blend
-from gsencoder.tracking import Track
+from gsencoder.train.class_balance import Rarity, cluster_targets, count_targets
 from gsencoder.train.dataset_space import dataset_space
-from gsencoder.train.prepared import PreparedScene, ViewRows, write_prepared
-from gsencoder.train.rarity import Rarity, cluster_targets, count_targets
+from gsencoder.train.prepared_scene import PreparedScene, ViewRows, write_prepared
 from gsencoder.types import FeatureMap, Scene
 
 SPACE_FILE, SETTINGS_FILE, RARITY_FILE = "space.safetensors", "settings.json", "rarity.safetensors"

@@ -16,15 +16,15 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from gsencoder.data.augment import AugmentConfig, augment
-from gsencoder.data.batch import SamplingConfig, choose_part, crop_size, thin_out
-from gsencoder.errors import InputError, about
+from gsencoder.core.errors import InputError, about
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
-from gsencoder.models.plan import CloudPlan, Plan, join_plans
+from gsencoder.models.grid.plan import CloudPlan, Plan, join_plans
+from gsencoder.train.augment import AugmentConfig, augment
+from gsencoder.train.class_balance import Rarity, nearest_codes
+from gsencoder.train.crops import SamplingConfig, choose_part, crop_size, thin_out
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepared import PreparedScene
-from gsencoder.train.rarity import Rarity, nearest_codes
-from gsencoder.train.rows import Rows, join_rows, no_rows, restrict, rows_of
+from gsencoder.train.prepared_scene import PreparedScene
+from gsencoder.train.render_rows import Rows, join_rows, no_rows, restrict, rows_of
 
 OPEN_SCENES = 256
 """Scenes that a process keeps open, the latest used."""

@@ -18,12 +18,12 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from gsencoder.errors import InputError
-from gsencoder.models.choices import Precision
-from gsencoder.models.device import autocast_dtype
+from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.device import autocast_dtype
+from gsencoder.core.runtime.device_names import Precision
+from gsencoder.core.runtime.signals import held_back, stop_of
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.stopping import held_back, stop_of
-from gsencoder.tracking import Track, untracked
 from gsencoder.train.checkpoint import CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
 from gsencoder.train.distributed import STOPPED_ELSEWHERE, Place, sum_over_processes, together

@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scene_files import photograph, save, world_from_cams, write_colmap
 
-from gsencoder.data.colmap import read_colmap
-from gsencoder.data.colmap_binary import CAMERA_PARAMS, check_binary_model
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.colmap import read_colmap
+from gsencoder.data.readers.colmap_binary import CAMERA_PARAMS, check_binary_model
+from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.undistort import load_pycolmap
-from gsencoder.errors import InputError, SceneWarning
 
 FILES = ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"]
 
@@ -171,15 +171,15 @@ def test_the_parameter_counts_are_those_of_pycolmap() -> None:
 def test_pictures_can_be_written_after_pycolmap_came_in() -> None:
     """pycolmap's zlib and the system's must not meet (see load_pycolmap): the process would abort."""
     code = (
-        "from gsencoder.data.undistort import load_pycolmap; load_pycolmap(); import io, zlib; from PIL import Image; "
-        "Image.new('RGB', (64, 48)).save(io.BytesIO(), 'PNG'); print(len(zlib.compress(b'a' * 1000)))"
+        "from gsencoder.data.readers.undistort import load_pycolmap; load_pycolmap(); "
+        "import io, zlib; from PIL import Image; Image.new('RGB', (64, 48)).save(io.BytesIO(), 'PNG'); print(len(zlib.compress(b'a' * 1000)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) < 100
 
 
-@pytest.mark.filterwarnings("ignore::gsencoder.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::gsencoder.core.errors.SceneWarning")
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.slow
 def test_mutated_models_give_a_scene_or_an_input_error(tmp_path: Path, text: bool) -> None:

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from scene_files import photograph, save
 
-from gsencoder.data.images import (
+from gsencoder.core.errors import InputError
+from gsencoder.data.readers.images import (
     DepthFiles,
     ImageFiles,
     InstanceFiles,
@@ -19,8 +20,7 @@ from gsencoder.data.images import (
     read_integers,
     read_rgba,
 )
-from gsencoder.data.undistort import CameraModel, RemapCache, pinhole_for
-from gsencoder.errors import InputError
+from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
 
 PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))
 

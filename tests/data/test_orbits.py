@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scene_files import some_gaussians
 
+from gsencoder.core.errors import InputError
 from gsencoder.data.orbits import orbit_cameras, robust_ball
-from gsencoder.errors import InputError
 from gsencoder.types import Gaussians
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import splat_samples as samples
 
-from gsencoder.data.repair import FIXES, inspect_splat, repair_splat
+from gsencoder.core.errors import InputError
+from gsencoder.data.splat_formats.repair import FIXES, inspect_splat, repair_splat
 from gsencoder.data.splats import RawSplat, gaussians_from_raw, read_raw
-from gsencoder.errors import InputError
 
 Plant = Callable[[RawSplat], RawSplat]
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scene_files import photograph, save, write_scannet
 
-from gsencoder.data.scannet import read_scannet
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.scannet import read_scannet
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.errors import InputError, SceneWarning
 
 
 def test_depth_is_metres_and_the_world_is_upright(tmp_path: Path) -> None:

@@ -17,11 +17,11 @@ from scene_files import (
     write_transforms,
 )
 
-from gsencoder.data.posed import choose_origin
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.posed import choose_origin
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.seeds import SeedConfig, seed
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats import save_splat
-from gsencoder.errors import InputError, SceneWarning
 from gsencoder.types import Scene
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import splat_samples as samples
 
+from gsencoder.core.errors import InputError
 from gsencoder.data import splats
 from gsencoder.data.splats import load_splat, read_raw, save_splat
-from gsencoder.errors import InputError
 
 
 def spz4(count: int, sizes: list[tuple[int, int]], body: bytes = b"", degree: int = 0) -> bytes:

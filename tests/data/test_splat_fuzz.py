@@ -14,9 +14,9 @@ import splat_samples as samples
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from gsencoder.data.repair import inspect_splat, repair_splat
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.splat_formats.repair import inspect_splat, repair_splat
 from gsencoder.data.splats import RawSplat, gaussians_from_raw, load_splat, read_raw
-from gsencoder.errors import InputError, SceneWarning
 
 pytestmark = pytest.mark.slow
 

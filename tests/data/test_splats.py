@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import splat_samples as samples
 
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data import splats
 from gsencoder.data.splats import fingerprint, load_splat, read_raw, save_splat
-from gsencoder.errors import InputError, SceneWarning
 
 C0 = 0.28209479177387814
 

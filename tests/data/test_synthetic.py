@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.synthetic import color_words, make_room, plan_room, write_room
-from gsencoder.data.synthetic_plan import _CATALOGUE, COLORS, FIRST_ID, HALF_ROOM, SHELF, TABLE
-from gsencoder.data.synthetic_shapes import Solid
-from gsencoder.errors import InputError
+from gsencoder.data.synthetic.plan import _CATALOGUE, COLORS, FIRST_ID, HALF_ROOM, SHELF, TABLE
+from gsencoder.data.synthetic.room import color_words, make_room, plan_room, write_room
+from gsencoder.data.synthetic.shapes import Solid
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scene_files import OPENGL, photograph, rewrite, save, world_from_cams, write_transforms
 
-from gsencoder.data.posed import inverse_rigid, rigid_pose
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.posed import inverse_rigid, rigid_pose
+from gsencoder.data.readers.transforms_json import read_transforms
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.transforms_json import read_transforms
-from gsencoder.errors import InputError, SceneWarning
 
 
 def change(folder: Path, data: dict[str, Any], frame: int = 1, **values: Any) -> Path:
@@ -279,7 +279,7 @@ def loads_or_complains(folder: Path) -> None:
     assert "\n" not in said
 
 
-@pytest.mark.filterwarnings("ignore::gsencoder.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::gsencoder.core.errors.SceneWarning")
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 @pytest.mark.slow
@@ -299,7 +299,7 @@ def test_mutated_values_give_a_scene_or_an_input_error(tmp_path: Path, no_jaxtyp
     loads_or_complains(tmp_path)
 
 
-@pytest.mark.filterwarnings("ignore::gsencoder.errors.SceneWarning")
+@pytest.mark.filterwarnings("ignore::gsencoder.core.errors.SceneWarning")
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_mutated_text_gives_a_scene_or_an_input_error(tmp_path: Path, no_jaxtyping: None, data: st.DataObject) -> None:

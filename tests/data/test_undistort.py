@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scene_files import save
 
-from gsencoder.data.images import DepthFiles, ImageFiles, MaskFiles, PixelGrid
-from gsencoder.data.undistort import CameraModel, Pinhole, RemapCache, build_remap, check_camera, pinhole_for
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
+from gsencoder.data.readers.images import DepthFiles, ImageFiles, MaskFiles, PixelGrid
+from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, build_remap, check_camera, pinhole_for
 
 MODELS = {
     "SIMPLE_RADIAL": (600, 360, 270, 0.03),
@@ -35,7 +35,7 @@ def model(name: str, width: int = 720, height: int = 540) -> CameraModel:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_every_invertible_model_maps_pinhole_pixels_to_their_rays(name: str) -> None:
-    from gsencoder.data.undistort import load_pycolmap
+    from gsencoder.data.readers.undistort import load_pycolmap
 
     camera = model(name)
     pinhole = pinhole_for(camera, "test")
@@ -62,7 +62,7 @@ def test_a_straight_camera_is_not_resampled() -> None:
 
 def test_undistorting_a_drawn_grid_makes_its_lines_straight(tmp_path: Path) -> None:
     """Paints a vertical edge of the scene through the distorted model and looks for it in the undistorted picture."""
-    from gsencoder.data.undistort import load_pycolmap
+    from gsencoder.data.readers.undistort import load_pycolmap
 
     camera = model("OPENCV")
     oracle = load_pycolmap().Camera(model="OPENCV", width=720, height=540, params=list(camera.params))

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsencoder.errors import InputError
-from gsencoder.evaluate.naming import NamingProtocol, SceneNames, naming_scores, nearest_words
+from gsencoder.core.errors import InputError
+from gsencoder.evaluate.protocols.naming import NamingProtocol, SceneNames, naming_scores, nearest_words
 from gsencoder.evaluate.validation import nearest_names
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 

@@ -5,12 +5,12 @@ import time
 import numpy as np
 import pytest
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.csv_text import csv_text
+from gsencoder.core.runtime.peak_memory import memory_growth
 from gsencoder.evaluate.boxes import Hit, aabb_iou, accuracy, asked_objects, score_boxes
-from gsencoder.evaluate.localization import scores, scores_by_name
-from gsencoder.evaluate.memory import memory_growth
-from gsencoder.evaluate.tables import csv_text
-from gsencoder.fusion.field_error import field_error
+from gsencoder.evaluate.protocols.localization import scores, scores_by_name
+from gsencoder.fusion.feature_error import field_error
 from gsencoder.types import Box, FeatureBasis, FeatureSpace, GaussianFeatures, Localization, Scene, SceneObject
 
 SPACE = FeatureSpace(name="s", channels=4)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsencoder import cli
-from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.data.text_table import make_text_table, save_text_table
-from gsencoder.errors import InputError
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError
+from gsencoder.data.synthetic.room import make_room, write_room
 from gsencoder.evaluate.tradeoff import BudgetConfig, SweepConfig, Trade, mark_front, pick, settings_of
 from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.text.table import make_text_table, save_text_table
 
 pytestmark = pytest.mark.slow
 

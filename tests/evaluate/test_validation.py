@@ -6,9 +6,9 @@ from training_scenes import prepared, small_encoder
 
 from gsencoder.evaluate import validation
 from gsencoder.evaluate.validation import KindAccuracy, nearest_names, validate_encoder
-from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.prepared import PreparedScene
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import GaussianFeatures
 
 

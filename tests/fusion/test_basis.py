@@ -5,7 +5,7 @@ import pytest
 import torch
 from splats import front_camera, random_gaussians
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.fusion.basis import Moments, decode_map, encode, fit_basis, table_basis
 from gsencoder.render import blend
 from gsencoder.types import FeatureSpace

@@ -8,7 +8,7 @@ from splats import front_camera, random_gaussians
 from gsencoder.fusion.lift import Clock, Sums, capped, center_matrix, map_rows, view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import BlendConfig, blend
-from gsencoder.render.rgb import depth_image
+from gsencoder.render.images import depth_image
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 WIDTH, HEIGHT, STRIDE = 32, 24, 4

@@ -15,13 +15,13 @@ from feature_fields import make_features
 from safetensors.numpy import load_file, save_file
 from splats import front_camera, random_gaussians
 
-from gsencoder import cli
-from gsencoder.data.archive import open_archive, write_archive
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.data.splats import load_splat, save_splat
-from gsencoder.data.text_table import make_text_table, save_text_table
-from gsencoder.errors import InputError, SceneWarning
-from gsencoder.fusion.packages import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
-from gsencoder.fusion.store import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
+from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene, Views
 
 N = 600
@@ -128,7 +128,7 @@ def test_a_package_of_another_version_is_refused(package: Path) -> None:
 
 
 def test_a_package_of_the_first_version_is_held_against_its_one_sum(package: Path) -> None:
-    from gsencoder.data.archive import _sum_of_version_1
+    from gsencoder.core.files.archive import _sum_of_version_1
 
     file = package / PACKAGE_FILE
     arrays, header = load_file(file), header_of(file)
@@ -245,7 +245,7 @@ def test_a_folder_of_two_kinds_of_features_is_refused(folder: Path, package: Pat
 
 def test_a_package_loads_without_torch(package: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from gsencoder.fusion.store import load_features; "
+        "import sys; from pathlib import Path; from gsencoder.fusion.store.folder import load_features; "
         f"load_features(Path({str(package)!r})); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from splats import front_camera
 
-from gsencoder.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Views
 

@@ -9,8 +9,8 @@ from archives import rewrite
 from safetensors.numpy import load_file
 from splats import front_camera, random_gaussians
 
-from gsencoder.errors import InputError
-from gsencoder.fusion.store import FEATURES_FILE, SCENE_FILE, load_features, load_settings, save_features
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, load_settings, save_features
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=8, teacher="test", text_encoder="words")

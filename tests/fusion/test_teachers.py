@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from splats import front_camera
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteConfig, PaletteTeacher, lab_from_rgb

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from splats import front_camera, random_gaussians
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask
 from gsencoder.render import Blend, BlendConfig, blend
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 from symbolic import symbolic_sizes
 
-from gsencoder import cli
-from gsencoder.data.text_table import make_text_table, save_text_table
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.export_onnx import lower
+from gsencoder.app import cli
+from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.onnx.export import lower
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.point_transformer import TransformerConfig
 from gsencoder.models.weights import save_weights
+from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 SHAPE = TransformerConfig(
@@ -61,7 +61,7 @@ def lowered(weights: Path) -> Any:
 def exported(weights: Path, lowered: Any) -> Path:
     """The same folder, and in it what the command exported the encoder to."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsencoder.commands.export.lower", lambda _: lowered)
+        patch.setattr("gsencoder.app.commands.export.lower", lambda _: lowered)
         words = [f"weights={weights}", f"out={weights / 'encoder.onnx'}", "sizes=[1,50]", "quiet=true"]
         assert cli.main(["export", *words]) == 0
     return weights

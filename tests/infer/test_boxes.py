@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gsencoder.data.spacing import scene_spacing
-from gsencoder.infer.boxes import Extents, box_around, cluster, oriented_axes, score_clusters
+from gsencoder.data.seeding.spacing import scene_spacing
+from gsencoder.infer.localize.boxes import Extents, box_around, cluster, oriented_axes, score_clusters
 from gsencoder.types import Gaussians
 
 
@@ -51,7 +51,7 @@ def test_the_spacing_of_a_sample_does_not_depend_on_order(
 ) -> None:
     points = rng.random((4000, 3)).astype(np.float32)
     whole = scene_spacing(points)
-    monkeypatch.setattr("gsencoder.data.spacing.SPACING_SAMPLE", 500)
+    monkeypatch.setattr("gsencoder.data.seeding.spacing.SPACING_SAMPLE", 500)
     sampled = scene_spacing(points)
     assert sampled == scene_spacing(rng.permutation(points))
     assert sampled == pytest.approx(whole, rel=0.1)
@@ -72,7 +72,7 @@ def two_groups(rng: np.random.Generator) -> np.ndarray:
 def test_two_groups_and_a_floater_are_told_apart_on_the_grid_and_without(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, grid_above: int
 ) -> None:
-    monkeypatch.setattr("gsencoder.infer.boxes.GRID_ABOVE", grid_above)
+    monkeypatch.setattr("gsencoder.infer.localize.boxes.GRID_ABOVE", grid_above)
     labels = cluster(two_groups(rng), 0.2, 3)
     assert len(set(labels[:200])) == 1
     assert len(set(labels[200:300])) == 1
@@ -86,7 +86,7 @@ def test_clusters_on_the_grid_are_those_of_dbscan_on_a_surface(
     centers = rng.random((30, 3)) * 4
     points = (centers[rng.integers(0, 30, 6000)] + rng.normal(0, 0.03, (6000, 3))).astype(np.float32)
     exact = cluster(points, 0.08, 3)
-    monkeypatch.setattr("gsencoder.infer.boxes.GRID_ABOVE", 0)
+    monkeypatch.setattr("gsencoder.infer.localize.boxes.GRID_ABOVE", 0)
     coarse = cluster(points, 0.08, 3)
     from sklearn.metrics import adjusted_rand_score
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from rooms import corner_cameras, room
 
-from gsencoder.infer.free_space import in_picture
-from gsencoder.infer.photographs import photograph_cameras, photograph_of, with_photographs
-from gsencoder.infer.view_closeups import LEAST_WIDTH, MOST_SHARE, closeups
-from gsencoder.infer.view_pictures import picture_kinds, view_pictures
-from gsencoder.infer.view_set import ViewsConfig
-from gsencoder.infer.view_targets import Target, target_of
-from gsencoder.infer.views import choose_views
+from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.closeups import LEAST_WIDTH, MOST_SHARE, closeups
+from gsencoder.infer.views.free_space import in_picture
+from gsencoder.infer.views.photographs import photograph_cameras, photograph_of, with_photographs
+from gsencoder.infer.views.pictures import picture_kinds, view_pictures
+from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.views.targets import Target, target_of
 from gsencoder.types import Cameras, Scene, Views
 
 pytestmark = pytest.mark.slow

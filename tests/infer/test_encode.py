@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from splats import random_gaussians
 from training_scenes import SMALL
 
-from gsencoder.errors import InputError
-from gsencoder.infer.chunks import EncodeConfig, cut
-from gsencoder.infer.encode import encode
+from gsencoder.core.errors import InputError
+from gsencoder.infer.encode.chunks import EncodeConfig, cut
+from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.point_transformer import TransformerConfig

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rooms import HALF, HEIGHT, STEP, corner_cameras, room, sheet, splat
 
-from gsencoder.infer.free_space import FreeSpace
-from gsencoder.infer.patches import SIGMAS
+from gsencoder.infer.views.free_space import FreeSpace
+from gsencoder.infer.views.split_gaussians import SIGMAS
 from gsencoder.types import Gaussians
 
 

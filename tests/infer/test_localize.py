@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsencoder.data.text_table import TextTable, make_text_table
-from gsencoder.errors import InputError, SceneWarning
-from gsencoder.infer.boxes_ply import EDGES, box_corners, write_boxes_ply
-from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
-from gsencoder.infer.relevancy import ThresholdConfig
-from gsencoder.infer.text import TextEncoder
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.infer.draw.boxes_ply import EDGES, box_corners, write_boxes_ply
+from gsencoder.infer.localize.localize import LocalizeConfig, localization_to_json, localize
+from gsencoder.infer.localize.relevancy import ThresholdConfig
+from gsencoder.text.encoder import TextEncoder
+from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import Box, FeatureBasis, GaussianFeatures, Gaussians, Localization, Scene
 
 WORDS = ("mug", "chair", "lamp", "spoon", "rug", "door")

@@ -16,16 +16,16 @@ import onnxruntime
 import pytest
 from splats import random_gaussians
 
-from gsencoder import cli
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats import save_splat
-from gsencoder.errors import InputError, SceneWarning
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.encoders import Encoder, load_encoder
-from gsencoder.infer.export_onnx import TOLERANCE, Cloud, check_parity, lower, random_cloud
-from gsencoder.infer.onnx_header import KEY, SUM, OnnxHeader, from_metadata, to_metadata, with_sum
-from gsencoder.infer.onnx_operators import search
-from gsencoder.infer.onnx_runtime import OnnxEncoder, inputs_of
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.load_encoder import Encoder, load_encoder
+from gsencoder.infer.onnx.export import TOLERANCE, Cloud, check_parity, lower, random_cloud
+from gsencoder.infer.onnx.header import KEY, SUM, OnnxHeader, from_metadata, to_metadata, with_sum
+from gsencoder.infer.onnx.operators import search
+from gsencoder.infer.onnx.runtime import OnnxEncoder, inputs_of
 from gsencoder.types import Gaussians
 
 pytestmark = pytest.mark.slow
@@ -321,12 +321,12 @@ def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_p
         "        if name.partition('.')[0] == 'torch':\n"
         "            raise ModuleNotFoundError('no torch here', name=name)\n"
         "sys.meta_path.insert(0, NoTorch())\n"
-        "from gsencoder.cli import main\n"
+        "from gsencoder.app.cli import main\n"
         f"splat, weights, out = {str(tmp_path / 'room.ply')!r}, {str(folder / 'encoder.onnx')!r}, {str(tmp_path)!r}\n"
         "assert main(['encode', splat, f'weights={weights}', f'out={out}/features']) == 0\n"
         "from gsencoder import load_splat, localize\n"
-        "from gsencoder.fusion.store import load_features\n"
-        "from gsencoder.infer.onnx_runtime import OnnxEncoder\n"
+        "from gsencoder.fusion.store.folder import load_features\n"
+        "from gsencoder.infer.onnx.runtime import OnnxEncoder\n"
         "scene = load_features(__import__('pathlib').Path(out) / 'features')\n"
         "assert len(localize(scene, ['mugs'], OnnxEncoder(weights).words).boxes) > 0\n"
     )

@@ -13,18 +13,18 @@ import torch
 from onnx import helper
 from symbolic import symbolic_sizes
 
-from gsencoder import cli
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError
+from gsencoder.core.int8 import round_columns
 from gsencoder.data.splats import save_splat
-from gsencoder.errors import InputError
-from gsencoder.fusion.field_error import field_error
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.export_onnx import Cloud, check_cosines, export_onnx, lower, random_cloud
-from gsencoder.infer.onnx_operators import OPSET, OURS, in_standard_operators
-from gsencoder.infer.onnx_precision import step_and_zero
-from gsencoder.infer.onnx_runtime import OnnxEncoder
-from gsencoder.models.neighbors import convolve_reference, neighbor_table
-from gsencoder.rounding import round_columns
+from gsencoder.fusion.feature_error import field_error
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.onnx.export import Cloud, check_cosines, export_onnx, lower, random_cloud
+from gsencoder.infer.onnx.operators import OPSET, OURS, in_standard_operators
+from gsencoder.infer.onnx.precision import step_and_zero
+from gsencoder.infer.onnx.runtime import OnnxEncoder
+from gsencoder.models.grid.neighbors import convolve_reference, neighbor_table
 
 pytestmark = pytest.mark.slow
 
@@ -205,7 +205,7 @@ def test_the_command_judges_what_it_writes(
     save_splat(tmp_path / "room.ply", CLOUD.gaussians)
     out = tmp_path / "small.onnx"
     words = [str(tmp_path / "room.ply"), f"weights={exported}", f"out={out}", "sizes=[1]", "precision=int8_static"]
-    monkeypatch.setattr("gsencoder.commands.export.lower", lambda _: lowered)
+    monkeypatch.setattr("gsencoder.app.commands.export.lower", lambda _: lowered)
     assert cli.main(["export", *words, "cosine=0.999999"]) == 2
     assert "on room int8_static gives features whose mean centred cosine" in capsys.readouterr().err
     assert not out.exists()

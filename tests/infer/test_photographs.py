@@ -11,15 +11,15 @@ from PIL import Image
 from rooms import corner_cameras, room
 from scene_files import OPENGL, rewrite, save
 
-from gsencoder import cli
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import load_scene
-from gsencoder.errors import InputError
-from gsencoder.infer.photographs import with_photographs
-from gsencoder.infer.view_pictures import picture_kinds, view_pictures
-from gsencoder.infer.view_set import ViewsConfig
-from gsencoder.infer.view_targets import target_of
-from gsencoder.infer.views import choose_views
-from gsencoder.render.rgb import render_image
+from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.photographs import with_photographs
+from gsencoder.infer.views.pictures import picture_kinds, view_pictures
+from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.views.targets import target_of
+from gsencoder.render.images import render_image
 from gsencoder.types import Scene
 
 COUNT = 12

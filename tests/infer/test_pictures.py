@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.errors import InputError
-from gsencoder.infer.boxes_ply import box_corners
-from gsencoder.infer.pictures import (
+from gsencoder.core.errors import InputError
+from gsencoder.infer.draw.boxes_ply import box_corners
+from gsencoder.infer.draw.pictures import (
     color_bar,
     contact_sheet,
     depth_picture,

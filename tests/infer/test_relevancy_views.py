@@ -4,8 +4,8 @@ import numpy as np
 from splats import random_gaussians
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.infer.relevancy_views import best_views, relevancy_pictures
+from gsencoder.infer.draw.relevancy_views import best_views, relevancy_pictures
+from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.types import Cameras, Gaussians, Localization, Scene, Views
 
 UP = np.array([0.0, 0.0, 1.0])

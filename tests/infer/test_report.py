@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from gsencoder.errors import InputError
-from gsencoder.infer.report import HtmlReport
+from gsencoder.core.errors import InputError
+from gsencoder.infer.draw.report import HtmlReport
 
 VOID = {"meta", "img", "br"}
 

@@ -12,9 +12,9 @@ from rooms import corner_cameras, room
 from splats import random_gaussians
 from tiny_vlm import PATCH, SIDE, save_tiny_vlm, tokenizer
 
+from gsencoder.core.errors import InputError
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.errors import InputError
-from gsencoder.infer.tokens import feature_tokens, token_blends, tower_grid
+from gsencoder.infer.views.tokens import feature_tokens, token_blends, tower_grid
 from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Gaussians
 
 

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from rooms import CUBE, HALF, HEIGHT, UP, corner_cameras, cube, room, sheet, splat, walls
 
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.errors import InputError, SceneWarning
-from gsencoder.infer.free_space import FreeSpace
-from gsencoder.infer.view_frames import frames_on
-from gsencoder.infer.view_judge import coverage, look
-from gsencoder.infer.view_pictures import view_pictures, view_sheet
-from gsencoder.infer.view_set import ViewsConfig
-from gsencoder.infer.view_shells import shell_cameras, up_of
-from gsencoder.infer.view_targets import Target, target_of, targets_of
-from gsencoder.infer.view_worth import BLURRED, LEAST_GAIN, NOTHING, Values, worth
-from gsencoder.infer.views import choose_views
+from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.frames import frames_on
+from gsencoder.infer.views.free_space import FreeSpace
+from gsencoder.infer.views.pictures import view_pictures, view_sheet
+from gsencoder.infer.views.scores import coverage, look
+from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.views.shells import shell_cameras, up_of
+from gsencoder.infer.views.targets import Target, target_of, targets_of
+from gsencoder.infer.views.utility import BLURRED, LEAST_GAIN, NOTHING, Values, worth
 from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
 
 pytestmark = pytest.mark.slow

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.geometry import rotmats_from_quats
 from gsencoder.models.embed import CHANNELS, channels_of, embed
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, encoder_inputs, merge
-from gsencoder.models.plan import join_plans, plan_cloud
+from gsencoder.models.grid.plan import join_plans, plan_cloud
 from gsencoder.models.point_transformer import TransformerConfig
 from gsencoder.types import Gaussians
 

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.models.curves import curves_of
-from gsencoder.models.plan import ORDERS, Level, Plan, _rounded, join_plans, plan_cloud
+from gsencoder.models.grid.curves import curves_of
+from gsencoder.models.grid.plan import ORDERS, Level, Plan, _rounded, join_plans, plan_cloud
 
 VOXEL = 0.1
 

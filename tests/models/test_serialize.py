@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsencoder.errors import InputError
-from gsencoder.models.cells import cells_of
-from gsencoder.models.serialize import (
+from gsencoder.core.errors import InputError
+from gsencoder.models.grid.cells import cells_of
+from gsencoder.models.grid.serialize import (
     ALIGN,
     LARGEST_EXTENT,
     NEVER,

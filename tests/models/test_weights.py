@@ -8,7 +8,7 @@ import torch
 from archives import header_of, rewrite
 from training_scenes import SMALL
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import load_weights, save_weights

@@ -5,7 +5,7 @@ import pytest
 import torch
 from walls import DEPTH, TILT, cameras, seen, wall_points, wall_views
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.reconstruct.dense import DenseConfig, carve, coverage, densify, interpolate, splat_depths, thin
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.stereo import DepthMap, agreeing, neighbours_of, sweep, world_points

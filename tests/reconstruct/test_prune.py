@@ -7,7 +7,7 @@ import pytest
 import torch
 from splats import front_camera, random_gaussians
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.photographs import Shot
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from walls import DEPTH, TILT, wall_points, wall_views
 
-from gsencoder.data.seeds import SeedConfig, seed_from_depth
-from gsencoder.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.seeding.seed import SeedConfig, seed_from_depth
 from gsencoder.reconstruct.dense import DenseConfig
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.start import Start, start_of

@@ -7,9 +7,9 @@ import pytest
 import torch
 from splats import front_camera, one_gaussian, random_gaussians, random_rotation
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.render import Blend, BlendConfig, blend
-from gsencoder.render.rgb import render_image
+from gsencoder.render.images import render_image
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians
 
 

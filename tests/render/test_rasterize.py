@@ -7,7 +7,7 @@ import torch
 from splats import front_camera, random_gaussians
 from torch import Tensor
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.render import blend
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Gaussians

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.train.distributed import Place, first_host, gpu_of, joined, place_from, together
 
 SLURM = {
@@ -94,7 +94,7 @@ def test_an_unknown_device_is_refused(no_jaxtyping: None) -> None:
 TOGETHER = """
 from pathlib import Path
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.train.distributed import joined, together
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.train.log import LOG_FILE, Log, read_log
 
 

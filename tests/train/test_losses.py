@@ -7,7 +7,7 @@ import pytest
 import torch
 from splats import front_camera, random_gaussians
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.render import blend
 from gsencoder.train.losses import Head, LossConfig, contrast_loss, field_loss, match_loss, render_loss
 

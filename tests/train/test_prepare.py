@@ -11,14 +11,14 @@ from archives import rewrite
 from safetensors.numpy import load_file
 from training_scenes import PREPARE, SPACE, TABLE, DenseSideTeacher, SideTeacher, prepared, scene
 
-from gsencoder.data.archive import write_archive
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import write_archive
+from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.tracking import untracked
+from gsencoder.train.class_balance import Rarity, cluster_targets, count_targets, nearest_codes
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.prepare import RARITY_FILE, SETTINGS_FILE, SPACE_FILE, PreparedDataset
-from gsencoder.train.prepared import PreparedScene
-from gsencoder.train.rarity import Rarity, cluster_targets, count_targets, nearest_codes
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 

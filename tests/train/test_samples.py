@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from safetensors.numpy import load_file
 from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_encoder
 
-from gsencoder.data.augment import AugmentConfig
-from gsencoder.data.batch import SamplingConfig, choose_part
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.render import BlendConfig, blend
+from gsencoder.train.augment import AugmentConfig
+from gsencoder.train.crops import SamplingConfig, choose_part
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepared import PreparedScene, ViewRows
-from gsencoder.train.rows import restrict
+from gsencoder.train.prepared_scene import PreparedScene, ViewRows
+from gsencoder.train.render_rows import restrict
 from gsencoder.train.samples import SampleDataset, StepSampler, join_samples, make_sample, target_codes
 from gsencoder.types import Cameras
 

@@ -16,14 +16,14 @@ from archives import header_of
 from safetensors.numpy import load_file
 from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
-from gsencoder.data.archive import open_archive, write_archive
-from gsencoder.errors import InputError, SceneWarning
-from gsencoder.stopping import Stopped
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.runtime.signals import Stopped
 from gsencoder.train.checkpoint import CHECKPOINT_FILE
 from gsencoder.train.log import LOG_FILE, read_log
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepared import PreparedScene
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.trainer import Trainer, TrainerConfig, Validated, _quiet_of_ended_connections
 
 pytestmark = pytest.mark.slow
@@ -368,7 +368,7 @@ sys.path.insert(0, {tests!r})
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.train.distributed import joined
 from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepared import PreparedScene
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.trainer import Trainer
 
 if __name__ == "__main__":

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from gsencoder.data.model_files import find_file
-from gsencoder.data.text_table import TextTable, load_text_table, make_text_table
+from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteConfig, PaletteTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.text.table import TextTable, load_text_table, make_text_table
 from gsencoder.types import Scene
 
 TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.types import FeatureMap, FeatureSpace, SceneObject, Views
 
 

@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.data.model_files import find_file
-from gsencoder.data.npz import read_npz
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files.npz import read_npz
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from gsencoder.errors import InputError
+from gsencoder.core.errors import InputError
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 # The eleven basic colour terms of English (Berlin & Kay 1969) and typical sRGB values, several where a name is wide.

@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsencoder.data.model_files import find_file
-from gsencoder.errors import InputError, SceneWarning, listed
+from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 

@@ -1,0 +1,224 @@
+"""The command line: `gsencoder COMMAND [PATH…] [key=value …]`.
+
+Exit codes: 0 done; 1 a defect of the program (with its traceback); 2 a wrong input, told in one line; 130 interrupted;
+143 terminated. Warnings and errors go to standard error, one line each; results go to standard output.
+"""
+
+import errno
+import os
+import signal
+import sys
+import textwrap
+import threading
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from types import FrameType
+from typing import Any
+
+import gsencoder
+from gsencoder.app.commands import COMMANDS, Command
+from gsencoder.app.runs.printable import clipped, one_line, printable
+from gsencoder.app.settings.options import near, without_value
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.runtime.signals import Stopped, stop_of
+
+FLAGS = {
+    "--help": "show this help (-h)",
+    "--version": "show the version",
+    "--cfg": "print the settings that the command would run with, as YAML, and stop",
+    "--debug": "show where an error or a warning came from",
+    "--multirun": "run every combination of values, key=1,2,3 (-m); run k writes to OUT/k",
+}
+SHORT = {"-h": "--help", "-m": "--multirun"}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command line (that of the process unless given); the exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words[: words.index("--") if "--" in words else None]
+    for stream in (sys.stdout, sys.stderr):
+        # File names may hold bytes that the terminal's encoding has no character for.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        with _stop_signals():
+            code = _dispatch(words)
+            sys.stdout.flush()
+            return code
+    except InputError as error:
+        _report("error", str(error), debug)
+        return 2
+    except (KeyboardInterrupt, Stopped) as stop:
+        return _stopped(stop, debug)
+    except SystemError as error:
+        inner = stop_of(error)
+        if inner is None:
+            raise
+        return _stopped(inner, debug)
+    except BrokenPipeError:
+        _discard_stdout()
+        return 1
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        _report("error", f"{error.filename or 'standard output'}: no space left on the device", debug)
+        _discard_stdout()
+        return 2
+
+
+def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:
+    if isinstance(stop, KeyboardInterrupt):
+        _report("interrupted", "", debug)
+        return 128 + signal.SIGINT
+    _report("stopped", signal.Signals(stop.number).name, debug)
+    return 128 + stop.number
+
+
+def _report(kind: str, message: str, debug: bool) -> None:
+    if debug:
+        # Messages of other programs and servers are in it.
+        for line in traceback.format_exc().splitlines():
+            print(printable(clipped(line)), file=sys.stderr)
+    print(f"{kind}: {one_line(message)}" if message else kind, file=sys.stderr)
+
+
+def _discard_stdout() -> None:
+    """Nobody reads it any more; without this the interpreter would complain when it flushes at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def _stop_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the run as an exception does, unless they are ignored (nohup)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, _: FrameType | None) -> None:
+        raise Stopped(number)
+
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in (getattr(signal, name) for name in names)}
+    try:
+        for number, handler in before.items():
+            if handler == signal.SIG_DFL:
+                signal.signal(number, stop)
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler == signal.SIG_DFL:
+                signal.signal(number, handler)
+
+
+def _split_flags(words: Sequence[str]) -> tuple[set[str], list[str]]:
+    flags: set[str] = set()
+    rest: list[str] = []
+    for index, word in enumerate(words):
+        if word == "--":
+            return flags, rest + list(words[index:])
+        if not word.startswith("-") or word == "-":
+            rest.append(word)
+        elif SHORT.get(word, word) in FLAGS:
+            flags.add(SHORT.get(word, word))
+        else:
+            shown = without_value(word)
+            hint = f"; settings are written {shown.lstrip('-')}" if "=" in word else near(word, FLAGS)
+            raise InputError(f"{shown}: no such flag{hint}")
+    return flags, rest
+
+
+def _dispatch(words: Sequence[str]) -> int:
+    flags, rest = _split_flags(words)
+    if "--version" in flags:
+        print(f"gsencoder {gsencoder.__version__}")
+        return 0
+    if not rest:
+        print(_overview())
+        return 0
+    name, *words = rest
+    if name not in COMMANDS:
+        shown = without_value(name)
+        raise InputError(f"{shown}: no such command{near(shown, COMMANDS)} (gsencoder --help lists them)")
+    command = COMMANDS[name]
+    cls, _ = command.load()
+    if "--help" in flags:
+        from gsencoder.app.settings.help import command_help
+
+        print(command_help(command.name, command.help, cls, FLAGS))
+        return 0
+    if "--multirun" in flags:
+        if "--cfg" in flags:
+            raise InputError("--cfg: shows one run; leave out -m")
+        from gsencoder.app.settings.multirun import run_many
+
+        return run_many(name, cls, words, partial(_run_one, command, debug="--debug" in flags))
+    from gsencoder.app.settings.compose import compose
+    from gsencoder.app.settings.config import settings
+
+    config = compose(name, cls, words)
+    if "--cfg" in flags:
+        from omegaconf import OmegaConf
+
+        print(OmegaConf.to_yaml(settings(config)), end="")
+        return 0
+    _run(command, config, "--debug" in flags)
+    return 0
+
+
+def _run(command: Command, config: Any, debug: bool) -> None:
+    from gsencoder.app.runs.output_folder import refuse_to_replace_inputs
+    from gsencoder.app.runs.summary import Summary
+    from gsencoder.app.settings.config import check_required, settings
+
+    cls, run = command.load()
+    check_required(cls, config)
+    given = settings(config)
+    refuse_to_replace_inputs(config.out, given)
+    summary = Summary(command.name, given)
+    with _collected_warnings(summary.warnings, debug):
+        run(config, summary)
+
+
+def _run_one(command: Command, config: Any, debug: bool) -> int:
+    """One run of many: its error is told, and the others go on."""
+    try:
+        _run(command, config, debug)
+    except InputError as error:
+        _report("error", f"{config.out}: {error}", debug)
+        return 2
+    return 0
+
+
+@contextmanager
+def _collected_warnings(found: list[str], debug: bool) -> Iterator[None]:
+    """Each `SceneWarning` becomes one line on standard error and one entry of `found`."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", SceneWarning)
+        usual = warnings.showwarning
+
+        def show(message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None) -> None:
+            if not issubclass(category, SceneWarning):
+                usual(message, category, filename, lineno, file, line)
+                return
+            text = one_line(str(message))
+            found.append(text)
+            print(f"warning: {text}" + (f" ({filename}:{lineno})" if debug else ""), file=sys.stderr)
+
+        warnings.showwarning = show
+        yield
+
+
+def _overview() -> str:
+    lines = ["usage: gsencoder COMMAND [PATH…] [key=value …]", "", "commands:"]
+    lines += [f"  {command.name:<12}{command.help}" for command in COMMANDS.values()]
+    lines += ["", "flags:"]
+    lines += [f"  {name:<12}{text}" for name, text in FLAGS.items()]
+    lines += ["", *textwrap.wrap("gsencoder COMMAND --help lists the settings of a command.", 100)]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

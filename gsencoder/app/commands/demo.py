@@ -1,0 +1,141 @@
+"""`gsencoder demo`: the whole pipeline on a built-in scene, offline, ending in one HTML report with pictures."""
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.app.commands.demo_report import Asked, write_report
+from gsencoder.app.runs.output_folder import output_folder, write_json
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.core.errors import InputError
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.seed import SeedConfig, seed
+from gsencoder.data.splats import save_splat
+from gsencoder.data.synthetic.room import color_words, make_room, write_room
+from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers.build import text_table_of
+from gsencoder.fusion.teachers.labels import LabelsTeacher
+from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
+from gsencoder.infer.draw.boxes_ply import write_boxes_ply
+from gsencoder.infer.localize.localize import LocalizeConfig, localization_to_json, localize
+from gsencoder.text.table import TextTable, make_text_table, save_text_table
+from gsencoder.types import Scene, SceneObject
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoConfig(CommonConfig):
+    """Settings of `demo`."""
+
+    seed: int = field(default=0, metadata={"help": "which room is made"})
+    objects: int = field(default=8, metadata={"help": "named objects in it"})
+    views: int = field(default=16, metadata={"help": "pictures taken of it"})
+    width: int = field(default=320, metadata={"help": "of the pictures, pixels; the height is three quarters of it"})
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    fusion: FuseConfig = field(default_factory=FuseConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+
+    def __post_init__(self) -> None:
+        for name, least in (("seed", 0), ("objects", 1), ("views", 1), ("width", 16)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+
+
+def run(config: DemoConfig, summary: Summary) -> None:
+    """Makes a room, reads it back, seeds, fuses two teachers, finds words, and reports it all in OUT/report.html."""
+    out = config.out or Path("outputs") / "demo"
+    screen = console(config.quiet)
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+        scene = photographed_room(config, folder, summary)
+        screen.print(f"scene: {len(scene.objects)} objects in {config.views} views with depth")
+        with summary.step("seeds"):
+            scene = replace(scene, gaussians=seed(scene, config.seeds))
+        assert scene.gaussians is not None
+        save_splat(folder / "splat.ply", scene.gaussians, origin=scene.origin)
+        screen.print(f"seeds: {len(scene.gaussians):,} Gaussians, no optimisation")
+        named = [thing for thing in scene.objects if thing.placed and thing.name]
+        names = room_words(scene)
+        labels = LabelsTeacher(scene.objects, names.names, names.embeddings, text_encoder=names.space.text_encoder)
+        palette, colors = PaletteTeacher(), text_table_of(PaletteConfig())
+        assert colors is not None
+        hues = color_words(config.seed, objects=config.objects)
+        by_name = [(thing.name, thing) for thing in named if thing.name]
+        by_color = [(hues[thing.id], thing) for thing in named]
+        asked = (
+            search(scene, labels, names, by_name, config, folder / "names", summary),
+            search(scene, palette, colors, unrepeated(by_color), config, folder / "colors", summary),
+        )
+        for one in asked:
+            screen.print(
+                f"{one.title}: features of {one.features.features.shape[1]} of {one.features.space.channels} channels; "
+                f"{one.found_count} of {len(one.words)} words found (IoU ≥ 0.5), mean IoU {one.mean_iou:.2f}"
+            )
+        summary.results.update(
+            gaussians=len(scene.gaussians),
+            views=config.views,
+            report="report.html",
+            **{one.title: one.to_dict() for one in asked},
+        )
+        with summary.step("report"):
+            write_report(folder / "report.html", scene, asked, summary)
+    screen.print(f"{out}/report.html shows it all; {out}/room is a scene folder to try the other commands on")
+
+
+def photographed_room(config: DemoConfig, folder: Path, summary: Summary) -> Scene:
+    """Makes a room and writes it as a capture would be, then reads that: nothing but files reaches what follows."""
+    with summary.step("make the scene"):
+        height = config.width * 3 // 4
+        room = make_room(config.seed, objects=config.objects, views=config.views, width=config.width, height=height)
+        write_room(room, folder / "room")
+    with summary.step("read it"):
+        return load_scene(folder / "room")
+
+
+def room_words(scene: Scene) -> TextTable:
+    """One unit vector a name: a vocabulary in which no two words are alike, as small as the scene needs."""
+    names = sorted({thing.name for thing in scene.objects if thing.name})
+    return make_text_table(names, np.eye(len(names), dtype=np.float32), "demo-words")
+
+
+def unrepeated(pairs: list[tuple[str, SceneObject]]) -> list[tuple[str, SceneObject]]:
+    """The pairs whose word stands for one object only."""
+    words = [word for word, _ in pairs]
+    return [(word, thing) for word, thing in pairs if words.count(word) == 1]
+
+
+def search(
+    scene: Scene,
+    teacher: Teacher,
+    words: TextTable,
+    pairs: list[tuple[str, SceneObject]],
+    config: DemoConfig,
+    folder: Path,
+    summary: Summary,
+) -> Asked:
+    """Fuses a teacher, stores the features, reads them back, asks for words, and holds boxes against the truth."""
+    title = folder.name
+    fusion = fuse(scene, teacher, config.fusion, track=Progress(quiet=config.quiet))
+    summary.timings[f"fuse {title}"] = sum(fusion.seconds.values())
+    folder.mkdir()
+    with summary.step("store"):
+        save_features(
+            folder, scene, fusion.features, {"fusion": settings(config.fusion), "teacher": teacher.settings()}
+        )
+        save_text_table(folder / WORDS_FILE, words)
+        stored = load_features(folder)
+    start = time.perf_counter()
+    found = localize(stored, [word for word, _ in pairs], words, config.localize)
+    summary.timings[f"localize {title}"] = time.perf_counter() - start
+    write_json(folder / "boxes.json", localization_to_json(found))
+    write_boxes_ply(folder / "boxes.ply", stored, found)
+    ious = []
+    for word, thing in pairs:
+        box = next((box for box in found.boxes if box.query == word), None)
+        ious.append(aabb_iou(box.aabb_min, box.aabb_max, thing.aabb_min, thing.aabb_max) if box is not None else 0.0)
+    return Asked(title=title, words=tuple(word for word, _ in pairs), ious=tuple(ious), fusion=fusion, found=found)

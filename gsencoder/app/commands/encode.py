@@ -1,0 +1,91 @@
+"""`gsencoder encode SPLAT weights=FILE`: features on every Gaussian in one pass, without photographs or teacher."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.core.errors import about
+from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.seeding.spacing import unit_of
+from gsencoder.data.splats import READABLE
+from gsencoder.fusion.store.folder import WORDS_FILE, save_features
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.load_encoder import Encoder, load_encoder
+from gsencoder.text.table import save_text_table
+from gsencoder.types import Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncodeCommandConfig(CommonConfig):
+    """Settings of `encode`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "splats, scenes, or folders of scenes", "metavar": "SPLAT", "required": True},
+    )
+    weights: str = field(
+        default="house_cpu",
+        metadata={"help": "what `train` or `export` wrote, or a name that comes with gsencoder"},
+    )
+    splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    encode: EncodeConfig = field(default_factory=EncodeConfig)
+
+
+def run(config: EncodeCommandConfig, summary: Summary) -> None:
+    """Encodes one scene into out=, or each of several into a folder of its name below out=."""
+    keep_heap()
+    paths = find_scenes(config.paths)
+    check_names(paths)
+    with summary.step("weights"):
+        encoder = load_encoder(config.weights, config.encode.device)
+    screen = console(config.quiet)
+    for path in paths:
+        one = summary if len(paths) == 1 else Summary(summary.command, summary.settings)
+        with one.step("load"):
+            scene = load_scene(path, splat=config.splat or None, options=config.data)
+        if scene.gaussians is None:
+            with one.step("seeds"):
+                scene = with_gaussians(scene, config.seeds)
+        out = config.out or Path("outputs") / scene.name / "features"
+        if len(paths) > 1:
+            out = out / scene.name
+        with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
+            with about(scene.name):
+                _encode_into(folder, scene, encoder, config, one)
+            if encoder.words is not None:
+                save_text_table(folder / WORDS_FILE, encoder.words)
+        screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
+
+
+def _encode_into(
+    folder: Path,
+    scene: Scene,
+    encoder: Encoder,
+    config: EncodeCommandConfig,
+    summary: Summary,
+) -> None:
+    assert scene.gaussians is not None
+    unit = unit_of(scene, encoder.voxel)
+    with summary.step("encode"):
+        features = encoder.encode(
+            scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
+        )
+    with summary.step("write"):
+        save_features(folder, scene, features, {"encode": settings(config.encode), "weights": config.weights})
+    summary.results.update(
+        gaussians=len(features),
+        seen=int(features.seen.sum()),
+        views=len(scene.views) if scene.views is not None else 0,
+        channels=features.space.channels,
+        rank=features.features.shape[1],
+        metres_per_unit=unit,
+        space=features.space.describe(),
+        features="features.safetensors",
+    )

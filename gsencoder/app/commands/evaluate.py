@@ -1,0 +1,184 @@
+"""`gsencoder evaluate SCENE… protocol=…`: a metric on labelled scenes, of fused features or of an encoder's."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from rich.table import Table
+
+from gsencoder.app.runs.output_folder import output_folder, write_bytes
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.csv_text import csv_text
+from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.data.splats import READABLE
+from gsencoder.evaluate.protocols.localization import (
+    LocalizationProtocol,
+    SceneOutcome,
+    evaluate_localization,
+    scores,
+    scores_by_name,
+)
+from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming, naming_scores
+from gsencoder.evaluate.sources import Source, encoded, fused, opened
+from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.load_encoder import load_encoder
+from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.text.table import TextTable
+from gsencoder.types import Scene
+
+SHOWN_NAMES = 15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateConfig(CommonConfig):
+    """Settings of `evaluate`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "labelled scenes, or folders of scenes", "metavar": "SCENE", "required": True},
+    )
+    weights: str = field(
+        default="", metadata={"help": "encoder whose features are judged (see encode); empty = the teacher's, fused"}
+    )
+    protocol: LocalizationProtocol | NamingProtocol = field(default_factory=LocalizationProtocol)
+    splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    fusion: FuseConfig = field(default_factory=FuseConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    encode: EncodeConfig = field(default_factory=EncodeConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+
+
+def run(config: EvaluateConfig, summary: Summary) -> None:
+    """Evaluates, prints the scores, and writes them with their details beside them."""
+    words = text_table_of(config.teacher)
+    if words is None:
+        raise InputError(
+            f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words="
+        )
+    if config.weights:
+        keep_heap()
+        source = encoded(load_encoder(config.weights, config.encode.device), config.encode)
+    else:
+        source = fused(config.teacher, words, config.fusion)
+    out = config.out or Path("outputs") / "evaluate" / config.protocol.name
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+        if isinstance(config.protocol, NamingProtocol):
+            _naming(config, config.protocol, source, words, folder, summary)
+        else:
+            _localization(config, config.protocol, source, words, folder, summary)
+    screen = console(config.quiet)
+    screen.print(names_table(summary.results))
+    screen.print(f"{out}: {scores_line(summary.results)}")
+
+
+def _scenes(config: EvaluateConfig) -> Iterator[tuple[Scene, float]]:
+    return opened(find_scenes(config.paths), config.data, config.splat, Progress(quiet=config.quiet))
+
+
+def _localization(
+    config: EvaluateConfig,
+    protocol: LocalizationProtocol,
+    source: Source,
+    words: TextTable,
+    folder: Path,
+    summary: Summary,
+) -> None:
+    outcomes = evaluate_localization(
+        _scenes(config), source, words, protocol=protocol, seeds=config.seeds, localization=config.localize
+    )
+    record(outcomes, summary)
+    hits = [hit for outcome in outcomes for hit in outcome.hits]
+    rows = [{"scene": h.scene, "name": h.name, "iou": h.iou, "oracle_iou": h.oracle_iou} for h in hits]
+    write_bytes(folder / "hits.csv", csv_text(rows).encode())
+    names = [{"name": name, **row} for name, row in scores_by_name(hits).items()]
+    write_bytes(folder / "names.csv", csv_text(names).encode())
+
+
+def _naming(
+    config: EvaluateConfig,
+    protocol: NamingProtocol,
+    source: Source,
+    words: TextTable,
+    folder: Path,
+    summary: Summary,
+) -> None:
+    scenes = evaluate_naming(_scenes(config), source, words, seeds=config.seeds, fusion=config.fusion)
+    scores = naming_scores(scenes, protocol)
+    for scene in scenes:
+        summary.add_seconds(scene.seconds)
+    each = []
+    for scene in scenes:
+        counted = {name: count for name, count in scene.total.items() if name in scores["names"]}
+        own = naming_scores([replace(scene, total=counted)]) if counted else {}
+        each.append({"scene": scene.scene, "gaussians": sum(scene.total.values()), **own})
+    summary.results.update(protocol="naming", **scores, names_table="names.csv", scenes=each)
+    rows = [{"name": name, **row} for name, row in scores["names"].items()]
+    write_bytes(folder / "names.csv", csv_text(rows).encode())
+
+
+def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
+    """Puts scores, scenes and seconds into the summary."""
+    hits = [hit for outcome in outcomes for hit in outcome.hits]
+    for outcome in outcomes:
+        summary.add_seconds(outcome.seconds)
+    summary.results.update(
+        protocol="localization",
+        **scores(hits),
+        boxless=sum(outcome.boxless for outcome in outcomes),
+        names=scores_by_name(hits),
+        scenes=[
+            {
+                "scene": outcome.scene,
+                "gaussians": outcome.gaussians,
+                "seen": outcome.seen,
+                "rank": outcome.rank,
+                "seconds": sum(outcome.seconds.values()),
+                **scores(outcome.hits),
+            }
+            for outcome in outcomes
+        ],
+        hits="hits.csv",
+        names_table="names.csv",
+    )
+
+
+def scores_line(results: dict) -> str:
+    """The main figures in one line."""
+    if results["protocol"] == "naming":
+        return (
+            f"{len(results['names'])} names in {len(results['scenes'])} scenes: accuracy {results['accuracy']:.3f} "
+            f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centred cosine "
+            f"{results['cosine']:.3f}"
+        )
+    return (
+        f"{results['objects']} objects in {len(results['scenes'])} scenes: Acc@0.25 {results['acc_25']:.3f}, "
+        f"Acc@0.5 {results['acc_50']:.3f}, mean IoU {results['mean_iou']:.3f} (best of all boxes: "
+        f"{results['oracle_acc_25']:.3f}, {results['oracle_acc_50']:.3f}, {results['oracle_mean_iou']:.3f})"
+    )
+
+
+def names_table(results: dict) -> Table:
+    """The names that were found worst."""
+    naming = results["protocol"] == "naming"
+    names = results["names"]
+    table = Table(title="hardest names" if len(names) > SHOWN_NAMES else "names", title_justify="left")
+    columns = ("gaussians", "accuracy") if naming else ("objects", "Acc@0.25", "Acc@0.5", "mean IoU", "best box")
+    for title in ("name", *columns):
+        table.add_column(title, justify="left" if title == "name" else "right")
+    for name, row in list(names.items())[:SHOWN_NAMES]:
+        if naming:
+            table.add_row(name, f"{row['gaussians']:,}", f"{row['accuracy']:.3f}")
+            continue
+        figures = (row["acc_25"], row["acc_50"], row["mean_iou"], row["oracle_mean_iou"])
+        table.add_row(name, str(row["objects"]), *(f"{figure:.3f}" for figure in figures))
+    return table

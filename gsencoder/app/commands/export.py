@@ -1,0 +1,154 @@
+"""`gsencoder export weights=… out=FILE.onnx`: an encoder as one file that runs without torch."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gsencoder.app.runs.output_folder import refuse_existing, write_json
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.runtime.device_names import Stored
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.seeding.spacing import unit_of
+from gsencoder.data.splats import READABLE
+from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.onnx.export import (
+    COSINE,
+    TOLERANCE,
+    Cloud,
+    check_cosines,
+    check_parity,
+    export_onnx,
+    lower,
+    random_cloud,
+)
+from gsencoder.infer.onnx.runtime import SUFFIX
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportConfig(CommonConfig):
+    """Settings of `export`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "help": "splats or scenes to compare on, beside random clouds, and to calibrate int8_static on",
+            "metavar": "SPLAT",
+        },
+    )
+    weights: str = field(
+        default="house_cpu",
+        metadata={"help": "what `train` wrote: its folder or file, or a name that comes with gsencoder"},
+    )
+    out: Path | None = field(
+        default=None,
+        metadata={
+            "help": "the .onnx file to write; FILE.summary.json beside it says how well it agrees",
+            "metavar": "FILE",
+            "required": True,
+        },
+    )
+    precision: Stored = field(
+        default="float32",
+        metadata={
+            "help": "what the graph computes in; int8_weights = stored in 8 bits, computed in float32; int8_dynamic, "
+            "int8_static = products of 8-bit integers, their ranges found for each cloud, or once from SPLATs"
+        },
+    )
+    sizes: tuple[int, ...] = field(
+        default=(1, 2, 31, 1000, 20000), metadata={"help": "Gaussians of the random clouds to compare on"}
+    )
+    tolerance: float = field(
+        default=TOLERANCE,
+        metadata={"help": "largest difference of the float32 graph from torch, as a share of the largest output"},
+    )
+    cosine: float = field(
+        default=COSINE,
+        metadata={
+            "help": "smallest mean centred cosine of another precision's features to float32's, on each SPLAT, or on "
+            "each random cloud where there is none"
+        },
+    )
+    splat: str = field(default="", metadata={"help": f"Gaussians of scenes; empty = seeds. {READABLE}"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+
+    def __post_init__(self) -> None:
+        if not self.sizes or min(self.sizes) < 1:
+            raise InputError(f"sizes: expected one or more numbers from 1, got {list(self.sizes)}")
+        if not 0 < self.tolerance < 1:
+            raise InputError(f"tolerance: expected a share between 0 and 1, got {self.tolerance}")
+        if not -1 <= self.cosine <= 1:
+            raise InputError(f"cosine: expected -1 to 1, got {self.cosine}")
+        if self.precision == "int8_static" and not self.paths:
+            raise InputError("precision=int8_static: give splats or scenes to calibrate on, of the kind that it is for")
+
+
+def run(config: ExportConfig, summary: Summary) -> None:
+    """Exports, compares, and writes only what agrees."""
+    assert config.out is not None
+    if config.out.suffix.lower() != SUFFIX:
+        raise InputError(f"out: expected a file that ends in {SUFFIX}, got {config.out.name}")
+    refuse_existing(config.out, config.overwrite)
+    track = Progress(quiet=config.quiet)
+    with summary.step("load"):
+        encoder = TorchEncoder(config.weights)
+        clouds = [Cloud(f"{size} random Gaussians", random_cloud(size, encoder.voxel)) for size in config.sizes]
+        scenes = _scenes(config, encoder.voxel)
+    screen = console(config.quiet)
+    screen.print("translating the graph, which takes about a minute")
+    with summary.step("export"):
+        lowered = lower(encoder)
+        exact = model = export_onnx(encoder, lowered)
+    with summary.step("compare"):
+        parity = check_parity(exact, encoder, [*clouds, *scenes], tolerance=config.tolerance, track=track)
+    told = f"within {max(parity.values()):.1g} of torch's largest output"
+    cosines: dict[str, float] = {}
+    if config.precision != "float32":
+        with summary.step("convert"):
+            if config.precision == "float16":
+                lowered = lower(encoder, half=True)
+            model = export_onnx(encoder, lowered, config.precision, scenes=scenes, track=track)
+        with summary.step("judge"):
+            cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=track)
+        told = (
+            f"{config.precision}, {len(model) / len(exact):.2f} of float32's size, mean centred cosine to it "
+            f"{min(cosines.values()):.4f} or more"
+        )
+    with summary.step("write"), atomic_file(config.out) as stream:
+        stream.write(model)
+    sizes = {cloud.name: len(cloud.gaussians) for cloud in (*clouds, *scenes)}
+    compared = [sizes[name] for name in cosines or parity]
+    summary.results.update(
+        onnx=str(config.out),
+        precision=config.precision,
+        bytes=len(model),
+        bytes_float32=len(exact),
+        parity=parity,
+        cosines=cosines,
+        gaussians=sizes,
+        channels=encoder.outputs.space.channels,
+        rank=encoder.outputs.channels,
+        words=0 if encoder.words is None else len(encoder.words),
+        space=encoder.outputs.space.describe(),
+    )
+    write_json(f"{config.out}.summary.json", summary.to_dict())
+    screen.print(
+        f"{config.out}: {len(model) / 1e6:.1f} MB; {told} on {len(compared)} clouds of {min(compared):,} to "
+        f"{max(compared):,} Gaussians"
+    )
+
+
+def _scenes(config: ExportConfig, voxel: float) -> list[Cloud]:
+    """The user's own clouds."""
+    clouds = []
+    for path in find_scenes(config.paths) if config.paths else ():
+        scene = load_scene(path, splat=config.splat or None, options=config.data)
+        if scene.gaussians is None:
+            scene = with_gaussians(scene, config.seeds)
+        assert scene.gaussians is not None
+        clouds.append(Cloud(scene.name, scene.gaussians, unit_of(scene, voxel)))
+    return clouds

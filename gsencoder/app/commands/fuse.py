@@ -1,0 +1,122 @@
+"""`gsencoder fuse SCENE… teacher=…`: per-Gaussian features from a teacher's maps of the views."""
+
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.splats import READABLE
+from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
+from gsencoder.fusion.orbit_views import check_orbits, with_views
+from gsencoder.fusion.store.folder import WORDS_FILE, save_features
+from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.text.table import TextTable, save_text_table
+from gsencoder.types import Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FuseCommandConfig(CommonConfig):
+    """Settings of `fuse`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "scenes, or folders of scenes: views, or a bare splat", "metavar": "SCENE", "required": True},
+    )
+    splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
+    orbits: int = field(default=24, metadata={"help": "cameras put around a splat that has no views"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    fusion: FuseConfig = field(default_factory=FuseConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
+
+    def __post_init__(self) -> None:
+        check_orbits(self.orbits)
+
+
+def run(config: FuseCommandConfig, summary: Summary) -> None:
+    """Fuses one scene into out=, or each of several into a folder of its name below out=."""
+    paths = find_scenes(config.paths)
+    check_names(paths)
+    with summary.step("teacher"):
+        words = text_table_of(config.teacher)
+    screen = console(config.quiet)
+    for path in paths:
+        one = summary if len(paths) == 1 else Summary(summary.command, summary.settings)
+        scene = load_fusable(path, config, one)
+        out = config.out or Path("outputs") / scene.name / "features"
+        if len(paths) > 1:
+            out = out / scene.name
+        with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
+            fusion = fuse_scene(scene, config.teacher, words, config, one, out)
+            write_features(folder, scene, fusion, words, config, one)
+        shutil.rmtree(work_folder(out), ignore_errors=True)
+        seen, total = one.results["seen"], one.results["gaussians"]
+        screen.print(
+            f"{out}: {seen:,} of {total:,} Gaussians have features, {one.results['channels']} channels "
+            f"(rank {one.results['rank']}, keeps {one.results['energy_kept']:.4f} of the energy), "
+            f"from {one.results['views']} views"
+        )
+
+
+def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Scene:
+    """A scene with Gaussians and views: seeds where it has no splat, orbits where it has no views."""
+    with summary.step("load"):
+        scene = load_scene(path, splat=config.splat or None, options=config.data)
+    if scene.gaussians is None:
+        with summary.step("seeds"):
+            scene = with_gaussians(scene, config.seeds)
+    return with_views(scene, config.orbits, config.fusion.blend)
+
+
+def work_folder(out: Path) -> Path:
+    """Where a fusion under way keeps its maps and sums, until `out` is whole."""
+    return out.parent / f".{out.name}.fusing"
+
+
+def fuse_scene(
+    scene: Scene,
+    teacher: TeacherConfig,
+    words: TextTable | None,
+    config: FuseCommandConfig,
+    summary: Summary,
+    out: Path,
+) -> Fusion:
+    """Fuses, and adds the steps' seconds to the summary."""
+    built = build_teacher(teacher, scene, words)
+    work = None if built.cheap else work_folder(out)
+    fusion = fuse(scene, built, config.fusion, work=work, track=Progress(quiet=config.quiet))
+    summary.add_seconds(fusion.seconds)
+    return fusion
+
+
+def write_features(
+    folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, config: FuseCommandConfig, summary: Summary
+) -> None:
+    """Writes features, scene and words, and says in the summary what was chosen and what it cost."""
+    features = fusion.features
+    with summary.step("write"):
+        chosen = {"teacher": settings(config.teacher), "fusion": settings(config.fusion)}
+        save_features(folder, scene, features, chosen)
+        if words is not None:
+            save_text_table(folder / WORDS_FILE, words)
+    summary.results.update(
+        gaussians=len(features),
+        seen=int(features.seen.sum()),
+        views=len(fusion.views),
+        visibility=list(fusion.tested),
+        channels=features.space.channels,
+        rank=features.features.shape[1],
+        energy_kept=features.basis.energy_kept if features.basis is not None else 1.0,
+        truncation=fusion.truncation,
+        median_weight=float(np.median(features.weights[features.seen])),
+        space=features.space.describe(),
+        features="features.safetensors",
+    )

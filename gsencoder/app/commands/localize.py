@@ -1,0 +1,75 @@
+"""`gsencoder localize FEATURES query=…`: boxes, scores and pictures for words."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.app.commands.query_words import asked_words, words_of
+from gsencoder.app.runs.output_folder import output_folder, write_json
+from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.store.folder import load_features
+from gsencoder.infer.draw.boxes_ply import write_boxes_ply
+from gsencoder.infer.draw.relevancy_views import relevancy_pictures
+from gsencoder.infer.localize.localize import LocalizeConfig, localization_to_json, localize
+from gsencoder.types import Localization
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalizeCommandConfig(CommonConfig):
+    """Settings of `localize`."""
+
+    paths: tuple[str, ...] = field(
+        default=(), metadata={"help": "a folder that fuse or encode made", "metavar": "FEATURES", "required": True}
+    )
+    query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
+    queries: str = field(default="", metadata={"help": "a text file with one query a line"})
+    words: str = field(default="", metadata={"help": "text table; empty = the one beside the features"})
+    space: str = field(default="", metadata={"help": "which features, where the folder holds several"})
+    pictures: int = field(default=4, metadata={"help": "views drawn for each word; 0 = no pictures"})
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+
+    def __post_init__(self) -> None:
+        if len(self.paths) > 1:
+            raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        if self.pictures < 0:
+            raise InputError(f"pictures: expected 0 or more, got {self.pictures}")
+
+
+def run(config: LocalizeCommandConfig, summary: Summary) -> None:
+    """Reads features, finds each word, writes boxes as JSON and .ply, and draws them."""
+    folder = Path(config.paths[0])
+    words = asked_words(config.query, config.queries)
+    with summary.step("load"):
+        scene = load_features(folder)
+        table = words_of(folder, config.words)
+    with summary.step("localize"):
+        found = localize(scene, words, table, config.localize, space=config.space or None)
+    out = config.out or Path("outputs") / scene.name / "boxes"
+    boxes = localization_to_json(found)
+    summary.results.update(boxes=boxes, thresholds=dict(zip(words, found.thresholds.tolist(), strict=True)))
+    summary.results["metres_per_unit"] = scene.metres_per_unit
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
+        write_json(target / "boxes.json", boxes)
+        write_boxes_ply(target / "boxes.ply", scene, found)
+        if config.pictures and scene.views is not None:
+            with summary.step("pictures"):
+                for name, picture in relevancy_pictures(scene, found, per_word=config.pictures):
+                    picture.save(target / f"{name}.png")
+    screen = console(config.quiet)
+    for word in words:
+        screen.print(f"{word}: {_first_box(found, word)}")
+    screen.print(f"{out}: boxes.json, boxes.ply and pictures; boxes are drawn around Gaussian {config.localize.extent}")
+
+
+def _first_box(found: Localization, word: str) -> str:
+    boxes = [box for box in found.boxes if box.query == word]
+    if not boxes:
+        return "not found"
+    best = boxes[0]
+    center = ", ".join(f"{value:.3f}" for value in best.center)
+    size = " × ".join(f"{value:.3f}" for value in np.asarray(best.aabb_max - best.aabb_min))
+    return f"at ({center}), {size}, score {best.score:.3f}, {len(best.rows):,} Gaussians ({len(boxes)} boxes)"

@@ -1,0 +1,102 @@
+"""`gsencoder pack FEATURES form=…`: a splat and its features as a small package, or as other programs read them."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from shutil import copyfile
+
+from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.store.folder import WORDS_FILE, load_features
+from gsencoder.fusion.store.package import PACKAGE_FILE, Form, save_arrays, save_package, save_ply
+from gsencoder.text.table import load_text_table, save_text_table
+from gsencoder.types import GaussianFeatures, Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PackConfig(CommonConfig):
+    """Settings of `pack`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "a folder that fuse, encode or pack made", "metavar": "FEATURES", "required": True},
+    )
+    form: Form = field(
+        default="compact",
+        metadata={
+            "help": "compact = a few bytes a Gaussian, for gsencoder; npz, safetensors = arrays; ply = properties "
+            "feature_0 … of the splat"
+        },
+    )
+    error: float = field(
+        default=0.01,
+        metadata={
+            "help": "of form=compact: the mean loss of centred cosine that is allowed, over Gaussians and over kinds"
+        },
+    )
+    decoded: bool = field(
+        default=False,
+        metadata={
+            "help": "of the other forms: whole vectors in place of coordinates in a basis; in float16, but for ply"
+        },
+    )
+
+    def __post_init__(self) -> None:
+        if len(self.paths) > 1:
+            raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        if not 0 < self.error < 1:
+            raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
+        if self.decoded and self.form == "compact":
+            raise InputError("decoded=true: form=compact holds codes; take form=npz, safetensors or ply")
+
+
+def run(config: PackConfig, summary: Summary) -> None:
+    """Reads features, and writes them with their splat into out=."""
+    source = Path(config.paths[0])
+    with summary.step("load"):
+        scene = load_features(source)
+    features = next(iter(scene.features.values()))
+    out = config.out or Path("outputs") / scene.name / "package"
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+        with summary.step("pack"):
+            told = _write(folder, scene, features, config, summary)
+        if (source / WORDS_FILE).is_file():
+            if config.form == "compact":
+                save_text_table(folder / WORDS_FILE, load_text_table(source / WORDS_FILE), dtype="float16")
+            else:
+                copyfile(source / WORDS_FILE, folder / WORDS_FILE)
+    console(config.quiet).print(f"{out}: {told}")
+
+
+def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
+    seen, dense = int(features.seen.sum()), 2 * features.space.channels
+    summary.results.update(form=config.form, gaussians=len(features), seen=seen, space=features.space.describe())
+    if config.form == "ply":
+        save_ply(folder, scene, features, decoded=config.decoded)
+    elif config.form != "compact":
+        save_arrays(folder, scene, features, config.form, decoded=config.decoded)
+    if config.form != "compact":
+        return f"the splat, and features of {seen:,} of its {len(features):,} Gaussians as {config.form}"
+    made = save_package(folder, scene, features, error=config.error)
+    size = (folder / PACKAGE_FILE).stat().st_size
+    share = size / (dense * len(features))
+    summary.results.update(
+        bytes=size,
+        row_bytes=made.row_bytes,
+        rank=made.basis.rank,
+        error=made.error,
+        lowest=made.lowest,
+        weight_error=(made.heaviest / made.lightest) ** (1 / 510) - 1,
+        share_of_float16=share,
+    )
+    return (
+        f"features of {seen:,} of {len(features):,} Gaussians in {size / 1e6:.3g} MB, {_ratio(share)} of float16 "
+        f"vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centred cosines lose "
+        f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
+    )
+
+
+def _ratio(share: float) -> str:
+    return f"1/{1 / share:.0f}" if share < 0.5 else f"{share:.2f}"

@@ -1,0 +1,52 @@
+"""The words that a command is asked about, and what turns them into features' space."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.text.table import TextTable, load_text_table
+
+LARGEST_QUERIES = 1 << 20
+"""Bytes of a file of queries."""
+
+
+def asked_words(query: Sequence[str], queries: str) -> list[str]:
+    """The words of query= and of the file queries=, blanks stripped, each once, in order.
+
+    Raises:
+        InputError: no words, or a file that is no text.
+    """
+    lines = list(query)
+    if queries:
+        lines += _lines_of(Path(queries))
+    words = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+    if not words:
+        raise InputError("query= is missing: one or several words, separated by commas (or queries=FILE)")
+    return words
+
+
+def _lines_of(file: Path) -> list[str]:
+    """The lines of a text file, which may begin with a byte order mark."""
+    if not file.is_file():
+        raise InputError(f"queries: {file} is no file; expected a text file with one query a line")
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(LARGEST_QUERIES + 1)
+        if len(data) > LARGEST_QUERIES:
+            raise InputError(f"queries: {file} holds more than {LARGEST_QUERIES:,} bytes; expected one word a line")
+        return data.decode("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"queries: {file} cannot be read as text: {error}") from error
+
+
+def words_of(folder: Path, given: str) -> TextTable:
+    """The text table that was given, or the one that lies beside the features."""
+    if given:
+        return load_text_table(given)
+    path = folder / WORDS_FILE
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: no words lead into these features; fuse with a teacher that has words, or give words="
+        )
+    return load_text_table(path)

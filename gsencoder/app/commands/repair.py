@@ -1,0 +1,74 @@
+"""`gsencoder repair SPLAT out=FILE fix=…`: mends the named defects of a splat file, and says what it changed."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.app.runs.output_folder import refuse_existing, write_json
+from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.data.splat_formats.repair import repair_splat
+from gsencoder.data.splats import READABLE, WRITABLE, RawSplat, gaussians_from_raw, read_raw, save_splat
+
+Fix = Literal["nonfinite", "quats", "scales", "opacities", "huge", "duplicates", "floaters", "all"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RepairConfig(CommonConfig):
+    """Settings of `repair`."""
+
+    paths: tuple[str, ...] = field(
+        default=(), metadata={"help": f"one splat file: {READABLE}", "metavar": "SPLAT", "required": True}
+    )
+    out: Path | None = field(
+        default=None,
+        metadata={
+            "help": f"the file to write: {WRITABLE}; FILE.summary.json beside it says what changed",
+            "metavar": "FILE",
+            "required": True,
+        },
+    )
+    fix: tuple[Fix, ...] = field(
+        default=("nonfinite", "quats", "scales", "opacities"),
+        metadata={"help": "defects to mend: the four that stop loading, and huge, duplicates, floaters, or all"},
+    )
+
+    def __post_init__(self) -> None:
+        if len(self.paths) > 1:
+            raise InputError(f"paths: expected one splat file, got {len(self.paths)}")
+        if not self.fix:
+            raise InputError("fix: expected the name of a defect, got none (gsencoder inspect lists them)")
+
+
+def run(config: RepairConfig, summary: Summary) -> None:
+    """Reads, mends, writes, and tells each change with its count."""
+    assert config.out is not None
+    refuse_existing(config.out, config.overwrite)
+    with summary.step("read"):
+        raw = read_raw(config.paths[0])
+    with summary.step("repair"):
+        mended, report = repair_splat(raw, config.fix)
+        origin = float64_origin(mended)
+        gaussians = gaussians_from_raw(
+            mended, origin=origin, where=f"{config.paths[0]} after fix={','.join(config.fix)}"
+        )
+    with summary.step("write"):
+        save_splat(config.out, gaussians, origin=origin)
+    summary.results.update(report.to_dict(), path=str(config.out))
+    write_json(f"{config.out}.summary.json", summary.to_dict())
+    screen = console(config.quiet)
+    for change in report.changes:
+        screen.print(f"{change.fix}: {change.count:,} rows {change.action}")
+    screen.print(f"{config.out}: {report.rows_after:,} of {report.rows_before:,} Gaussians")
+
+
+def float64_origin(raw: RawSplat) -> Float64[np.ndarray, "3"] | None:
+    """Whole coordinates near the splat's middle if float32 cannot hold its positions, so that none is rounded."""
+    if np.array_equal(raw.means, raw.means.astype(np.float32)):
+        return None
+    return np.floor(np.median(raw.means, axis=0))

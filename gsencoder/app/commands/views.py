@@ -1,0 +1,163 @@
+"""`gsencoder views FEATURES query=…`: the views that show best what was found, rendered, and why they were chosen."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsencoder.app.commands.query_words import asked_words, words_of
+from gsencoder.app.runs.output_folder import output_folder, write_json
+from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import write_archive
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.fusion.store.folder import load_features
+from gsencoder.infer.draw.pictures import Picture
+from gsencoder.infer.localize.localize import LocalizeConfig, asked_features, box_to_json, localize
+from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.photographs import with_photographs
+from gsencoder.infer.views.pictures import picture_kinds, told, view_pictures, view_sheet
+from gsencoder.infer.views.selection import ViewsConfig, ViewSet
+from gsencoder.infer.views.targets import Target, best_boxes, targets_of
+from gsencoder.infer.views.tokens import Fit, feature_tokens, token_blends, tower_grid
+from gsencoder.render import BlendConfig
+from gsencoder.types import Box, Scene
+
+SHEET, VIEWS, TOKENS = "sheet.png", "views.json", "tokens.safetensors"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewsCommandConfig(CommonConfig):
+    """Settings of `views`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "a folder that fuse, encode or pack made", "metavar": "FEATURES", "required": True},
+    )
+    query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
+    queries: str = field(default="", metadata={"help": "a text file with one query a line"})
+    words: str = field(default="", metadata={"help": "text table; empty = the one beside the features"})
+    space: str = field(default="", metadata={"help": "which features, where the folder holds several"})
+    photos: str = field(
+        default="", metadata={"help": "the scene that was fused: frames are shown as its photographs, not as renders"}
+    )
+    boxes: int = field(default=1, metadata={"help": "boxes of each word that are looked at, best first"})
+    grid: tuple[int, ...] = field(
+        default=(),
+        metadata={"help": "lines and columns of a vision tower's patches: features are rendered on them, too"},
+    )
+    fit: Fit = field(
+        default="stretch", metadata={"help": "how the tower's preprocessing brings a picture to its own shape"}
+    )
+    choose: ViewsConfig = field(default_factory=ViewsConfig)
+    data: SceneConfig = field(default_factory=SceneConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+
+    def __post_init__(self) -> None:
+        if len(self.paths) > 1:
+            raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        if self.boxes < 1:
+            raise InputError(f"boxes: expected 1 or more, got {self.boxes}")
+        if len(self.grid) not in (0, 2):
+            raise InputError(f"grid: expected lines and columns, such as [27,27], got {list(self.grid)}")
+        if self.grid:
+            tower_grid(1, 1, (self.grid[0], self.grid[1]))
+
+
+def run(config: ViewsCommandConfig, summary: Summary) -> None:
+    """Finds the words, chooses views of them, renders these, and writes what was chosen and why."""
+    folder = Path(config.paths[0])
+    with summary.step("load"):
+        scene = shown_scene(folder, config.photos, config.data)
+    boxes: tuple[Box, ...] = ()
+    targets: tuple[Target, ...] = ()
+    if config.query or config.queries or config.choose.method == "greedy":
+        with summary.step("localize"):
+            words = asked_words(config.query, config.queries)
+            found = localize(scene, words, words_of(folder, config.words), config.localize, space=config.space or None)
+            assert scene.gaussians is not None
+            targets = targets_of(scene.gaussians, found, config.boxes)
+        if not targets:
+            raise InputError(f"views: none of {', '.join(words)} was found in scene {scene.name}")
+        boxes = best_boxes(found, config.boxes)
+        summary.results.update(boxes=[box_to_json(box) for box in boxes])
+    with summary.step("choose"):
+        views = choose_views(scene, targets, config.choose)
+    out = config.out or Path("outputs") / scene.name / "views"
+    rows = views_to_json(scene, views)
+    summary.results.update(views=rows, judged=views.judged)
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
+        with summary.step("render"):
+            pictures, _ = view_pictures(scene, views)
+            write_pictures(target, scene, views, rows, pictures, boxes)
+        write_json(target / VIEWS, rows)
+        if config.grid:
+            with summary.step("tokens"):
+                write_tokens(target / TOKENS, scene, views, config)
+    screen = console(config.quiet)
+    for number, each in enumerate(views.chosen):
+        screen.print(f"{number:2d}  {told(each)}")
+    screen.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))
+
+
+def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
+    """The scene of a folder of features, with photographs where a scene that has them is given."""
+    scene = load_features(folder)
+    return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
+
+
+def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
+    """What was chosen and why, best first: names and pictures, sights, gains, and cameras in world coordinates with the
+    origin added back (cam_from_world and K as OpenCV has them)."""
+    rows = []
+    for number, (each, kind) in enumerate(zip(views.chosen, picture_kinds(scene, views), strict=True)):
+        pose = views.cameras.cam_from_world[number].astype(np.float64)
+        pose[:3, 3] -= pose[:3, :3] @ scene.origin
+        rows.append(
+            {
+                "name": each.name,
+                "picture": f"view_{number:02d}.png",
+                "kind": kind,
+                "frame": each.frame,
+                "clearance": each.clearance,
+                "gain": each.gain,
+                "covered": each.covered,
+                "sights": [
+                    {name: getattr(sight, name) for name in type(sight).__dataclass_fields__} for sight in each.sights
+                ],
+                "cam_from_world": pose.tolist(),
+                "K": views.cameras.Ks[number].tolist(),
+                "width": int(views.cameras.widths[number]),
+                "height": int(views.cameras.heights[number]),
+            }
+        )
+    return rows
+
+
+def write_pictures(
+    folder: Path,
+    scene: Scene,
+    views: ViewSet,
+    rows: Sequence[Mapping[str, Any]],
+    pictures: Sequence[Picture],
+    boxes: Sequence[Box],
+) -> None:
+    """Each picture under the name that its row gives it, and the sheet of all."""
+    for picture, row in zip(pictures, rows, strict=True):
+        Image.fromarray(picture).save(folder / row["picture"])
+    Image.fromarray(view_sheet(scene, views, pictures, boxes)).save(folder / SHEET)
+
+
+def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:
+    """Rendered features as tokens [V, lines · columns, D] float32, under the name "tokens"."""
+    assert scene.gaussians is not None
+    _, features = asked_features(scene, config.space or None)
+    grid = (config.grid[0], config.grid[1])
+    blends = token_blends(scene.gaussians, views.cameras, grid, fit=config.fit, config=BlendConfig(near=views.near))
+    tokens = feature_tokens(blends, features).numpy()
+    write_archive(path, {"tokens": tokens}, {"space": features.space.describe(), "grid": list(grid), "fit": config.fit})

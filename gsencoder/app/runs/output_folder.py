@@ -1,0 +1,279 @@
+"""Folders and files that appear whole or not at all, and the summary that every run leaves in its folder."""
+
+import ctypes
+import errno
+import os
+import re
+import secrets
+import shutil
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from hashlib import sha1
+from pathlib import Path
+from typing import Any
+
+from gsencoder.app.runs.summary import SUMMARY_NAME, Summary, json_bytes
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.atomic import atomic_file, is_full_disk, locked
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Writes a file that appears whole or not at all, in place of what had its name.
+
+    Raises:
+        InputError: the folder is missing, the disk is full, or the system refuses.
+    """
+    with atomic_file(path) as stream:
+        stream.write(data)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Writes JSON, atomically. numpy values, paths and dataclasses become what JSON has for them.
+
+    Numbers that are not finite become null, with one counted `SceneWarning` that names them.
+
+    Raises:
+        InputError: as `write_bytes`.
+    """
+    data, lost = json_bytes(value)
+    if lost:
+        warnings.warn(
+            f"{path}: {len(lost)} numbers are not finite and were written as null: {', '.join(lost[:5])}",
+            SceneWarning,
+            stacklevel=2,
+        )
+    write_bytes(path, data)
+
+
+@contextmanager
+def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary | None = None) -> Iterator[Path]:
+    """A folder to write into, which takes the name `path` when the block ends without an error.
+
+    Until then it is a hidden folder beside it, `.NAME.partial-XXXXXXXX`. Whatever ends the block early, an interrupt
+    included, removes it; what a killed run left is removed by the next run that writes to the same path. Everything
+    is synced to disk before the folder gets its name.
+
+    Args:
+        path: the folder to make; its parents are made too. It may exist if it is empty.
+        overwrite: replace the output of an earlier run, recognised by its summary.json. Where the system can (Linux),
+            old and new change places in one step.
+        summary: written into the folder at the end, as summary.json.
+
+    Raises:
+        InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
+            or the disk is full.
+    """
+    # Through a symbolic link the folder that it points to is replaced, not the link.
+    target = Path(os.path.realpath(path))
+    _check_target(path, target, overwrite)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        partial, lock = _begin(target)
+    except BlockingIOError:
+        told = f"{path}: another run is writing this folder now; wait for it or give another out="
+        raise InputError(told) from None
+    except FileExistsError as error:
+        raise InputError(f"{path}: {error.filename} is a file, so no folder can be made in it") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
+    try:
+        yield partial
+        if summary is not None:
+            write_bytes(partial / SUMMARY_NAME, json_bytes(summary.to_dict())[0])
+        _sync(partial)
+        _check_target(path, target, overwrite)
+        _take_place(partial, target)
+    except Exception as error:
+        message = _refusal(error, partial, target, path)
+        if message is None:
+            raise
+        raise InputError(message) from error
+    finally:
+        # After a swap this is the old output.
+        shutil.rmtree(partial, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _begin(target: Path) -> tuple[Path, int | None]:
+    """The hidden folder, and its lock. Runs that begin in one moment do so one after the other: a folder that has been
+    made and not yet locked would be taken for one that a killed run left.
+
+    Raises:
+        BlockingIOError: a living run is writing `target`.
+    """
+    turn = locked(target.parent, wait=True)
+    try:
+        if _remove_stale(target):
+            raise BlockingIOError
+        partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
+        partial.mkdir()
+        return partial, locked(partial)
+    finally:
+        if turn is not None:
+            os.close(turn)
+
+
+def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
+    try:
+        os.lstat(target)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
+    if not target.is_dir():
+        raise InputError(f"{path}: is a file, and the results are a folder; give another out=")
+    if os.path.ismount(target):
+        raise InputError(f"{path}: is a mount point, which cannot be exchanged for the results; give a folder in it")
+    with suppress(OSError):
+        if not any(target.iterdir()):
+            return
+    if not (target / SUMMARY_NAME).is_file():
+        raise InputError(
+            f"{path}: is a folder with other contents (no {SUMMARY_NAME}), which is never replaced; give another out="
+        )
+    if not overwrite:
+        raise InputError(f"{path}: holds the results of an earlier run; give another out= or overwrite=true")
+
+
+def refuse_existing(path: str | Path, overwrite: bool) -> None:
+    """For commands whose result is one file: complains if it exists and may not be replaced.
+
+    Raises:
+        InputError: it exists.
+    """
+    if os.path.isdir(path):
+        raise InputError(f"{path}: is a folder; give the name of a file to write")
+    if os.path.lexists(path) and not overwrite:
+        raise InputError(f"{path}: exists; give another out= or overwrite=true")
+
+
+def refuse_to_replace_inputs(out: Path | None, given: Mapping[str, Any]) -> None:
+    """Complains if a folder that is about to be replaced holds one of the inputs.
+
+    Args:
+        out: the folder.
+        given: the settings of the run; every text in them that names an existing file or folder is an input.
+
+    Raises:
+        InputError: it does.
+    """
+    if out is None or not os.path.isdir(out):
+        return
+    for key, name in _texts({key: value for key, value in given.items() if key != "out"}):
+        if os.path.exists(name) and lies_in(name, out):
+            raise InputError(f"{out}: holds the input {key}={name}, so it cannot be replaced; give another out=")
+
+
+def lies_in(path: str | Path, folder: str | Path) -> bool:
+    """Whether a path is a folder, or lies in it, whatever names and links lead there."""
+    inner, outer = os.path.realpath(path), os.path.realpath(folder)
+    return os.path.commonpath([inner, outer]) == outer
+
+
+def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """All texts in nested settings that could be paths, with their keys."""
+    if isinstance(value, str) and 0 < len(value) < 4096 and "\0" not in value:
+        yield key, value
+    elif isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _texts(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _texts(item, key)
+
+
+def _short(name: str) -> str:
+    """The name, or a digest of it where the temporary name would grow longer than file systems allow."""
+    raw = os.fsencode(name)
+    return name if len(raw) <= 200 else sha1(raw).hexdigest()
+
+
+def _remove_stale(target: Path) -> bool:
+    """Removes what killed runs left beside `target`; whether a living run is writing it now.
+
+    Where folders cannot be locked (some network file systems) nothing is removed and nobody is seen.
+    """
+    pattern = re.compile(re.escape(f".{_short(target.name)}.partial-") + "[0-9a-f]{8}")
+    for entry in list(os.scandir(target.parent)):
+        if not pattern.fullmatch(entry.name) or not entry.is_dir(follow_symlinks=False):
+            continue
+        try:
+            descriptor = locked(entry.path)
+        except BlockingIOError:
+            return True
+        except OSError:
+            continue
+        if descriptor is not None:
+            shutil.rmtree(entry.path, ignore_errors=True)
+            os.close(descriptor)
+    return False
+
+
+def _sync(folder: Path) -> None:
+    for root, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            path = os.path.join(root, name)
+            if not os.path.islink(path):
+                _sync_one(path)
+        _sync_one(root)
+
+
+def _sync_one(path: str | Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        # Some file systems cannot sync a folder; a file that cannot be synced is an error.
+        if os.path.isfile(path) or error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _take_place(partial: Path, target: Path) -> None:
+    """Gives `partial` the name `target`; what had it before, if anything, is then called `partial`."""
+    old = target.is_dir() and any(target.iterdir())
+    if not old:
+        os.rename(partial, target)
+    elif not _exchange(partial, target):
+        aside = partial.with_name(f"{partial.name[:-8]}{secrets.token_hex(4)}")
+        os.rename(target, aside)
+        try:
+            os.rename(partial, target)
+        except BaseException:
+            os.rename(aside, target)
+            raise
+        os.rename(aside, partial)
+    _sync_one(target.parent)
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Lets two names change places in one step, where the system knows how."""
+    try:
+        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError, TypeError):
+        return False
+    return bool(renameat2(AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(second), RENAME_EXCHANGE) == 0)
+
+
+def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) -> str | None:
+    """What to tell the user if it was the system that refused to write, or None."""
+    if isinstance(error, InputError) and str(partial) not in str(error):
+        # What lies elsewhere, such as the state of a run that can go on, was not given up.
+        return str(error)
+    if (isinstance(error, OSError) and error.errno == errno.EFBIG) or os.strerror(errno.EFBIG) in str(error):
+        return f"{path}: a file would grow larger than this system or shell allows (ulimit -f): no result was written"
+    if is_full_disk(error):
+        return f"{path}: no space left on the device: no result was written"
+    if isinstance(error, InputError):
+        return str(error).replace(str(partial), str(path))
+    named = str(getattr(error, "filename", None) or "")
+    if isinstance(error, OSError) and named.startswith(str(partial)):
+        return f"{named.replace(str(partial), str(path))}: cannot write: {error.strerror or error}"
+    if isinstance(error, OSError) and named == str(target):
+        return f"{path}: cannot be replaced by the results: {error.strerror or error}"
+    return None

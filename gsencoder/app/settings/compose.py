@@ -1,0 +1,270 @@
+"""From the words of a command line to a command's settings: Hydra composes the YAML files, the user's text stays text.
+
+Hydra's override grammar is made for numbers and sweeps. In it `query=mug,banana` is a sweep, `question=What's red?` a
+syntax error, `query=1` a number, `query=${oc.env:HOME}` a look-up. Options whose type is text, a path, or a list of
+those therefore never pass through it: their characters travel as hexadecimal digits inside an interpolation,
+`${text:x6d7567}`, which OmegaConf resolves to the very same characters when the settings are complete.
+
+Rules for words: one of the form `KEY=VALUE` sets an option if KEY is one; otherwise it is a path if a file of that
+name exists, and an error if not. Every other word is a path. After `--` all words are paths. KEY may leave out the
+sections before the last dot where that is unambiguous (`voxel=` for `fusion.voxel=`).
+"""
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gsencoder.app.settings.config import typed
+from gsencoder.app.settings.options import (
+    Option,
+    is_list_of_words,
+    join_list,
+    near,
+    options_by_key,
+    options_of,
+    without_value,
+    wrong_value,
+)
+from gsencoder.core.errors import InputError
+
+T = TypeVar("T")
+
+SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
+"""Under -m, and only there, a text option is swept where its value has this form."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """What a command may be told.
+
+    Attributes:
+        options: by full key.
+        members: for each key the members of a choice that have it; none where the option always applies.
+        groups: the names that a choice of YAML file may take, by the choice's key.
+        chosen: the default of each choice.
+    """
+
+    options: Mapping[str, Option]
+    members: Mapping[str, tuple[str, ...]]
+    groups: Mapping[str, tuple[str, ...]]
+    chosen: Mapping[str, str | None]
+
+
+def conf_folder() -> Path:
+    """Where the YAML files are: inside an installed package, beside it in a source tree."""
+    package = Path(__file__).resolve().parents[2]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def seal(text: str) -> str:
+    """The text as a value of Hydra's grammar that resolves to exactly this text."""
+    digits = text.encode("utf-8", "surrogatepass").hex()
+    return f"'${{text:x{digits}}}'"
+
+
+def unseal(digits: str) -> str:
+    """The text that `seal` wrote as these digits."""
+    return bytes.fromhex(digits[1:]).decode("utf-8", "surrogatepass")
+
+
+@contextmanager
+def open_hydra(conf: Path | None) -> Iterator[Any]:
+    """Hydra over a folder of YAML files (ours unless given); its errors become ours, in one line."""
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    OmegaConf.register_new_resolver("text", unseal, replace=True)
+    folder = str((conf or conf_folder()).resolve())
+    try:
+        with initialize_config_dir(config_dir=folder, job_name="gsencoder", version_base="1.3"):
+            yield GlobalHydra.instance().hydra
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(" ".join(str(error).split())) from error
+
+
+def choices_of(command: str, cls: type, conf: Path | None = None) -> Choices:
+    """The options and choices of a command."""
+    from hydra.types import RunMode
+
+    groups: dict[str, tuple[str, ...]] = {}
+    chosen: dict[str, str | None] = {}
+
+    def walk(tree: Any) -> None:
+        node = getattr(tree, "node", tree)
+        if hasattr(node, "group") and not node.get_override_key().startswith("hydra/"):
+            groups[node.get_override_key()] = tuple(loader.get_group_options(node.get_group_path()))
+            chosen[node.get_override_key()] = node.get_name()
+        for child in getattr(tree, "children", None) or ():
+            walk(child)
+
+    with open_hydra(conf) as hydra:
+        loader = hydra.config_loader
+        walk(loader.compute_defaults_list(command, [], RunMode.RUN).defaults_tree)
+    members: dict[str, tuple[str, ...]] = {}
+    for option in options_of(cls):
+        members[option.key] = (*members.get(option.key, ()), option.member) if option.member else ()
+    return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=chosen)
+
+
+def _full_key(key: str, choices: Choices) -> str | None:
+    """The option or choice that `key` stands for, or None."""
+    known = [*choices.options, *choices.groups]
+    if key in known:
+        return key
+    ends = [name for name in known if re.split(r"[./]", name)[-1] == key]
+    if len(ends) > 1:
+        raise InputError(f"{key}: stands for more than one option; write {' or '.join(f'{end}=' for end in ends)}")
+    return ends[0] if ends else None
+
+
+def read_words(
+    words: Sequence[str], choices: Choices, *, sweep: bool = False
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Sorts a command line into paths and settings, by the rules at the head of this file.
+
+    Raises:
+        InputError: a word that is neither, a setting given twice, or paths for a command that takes none.
+    """
+    paths: list[str] = []
+    given: dict[str, str] = {}
+    only_paths = False
+    for word in words:
+        key, equals, value = word.partition("=")
+        if only_paths or not equals:
+            if word == "--" and not only_paths:
+                only_paths = True
+                continue
+            if not only_paths and not os.path.lexists(word) and _full_key(word, choices):
+                raise InputError(f"{word}: needs a value: {word}=…")
+            if not word:
+                raise InputError("a path is empty; leave it out or name a file")
+            paths.append(word)
+            continue
+        full = key if sweep and re.match(r"hydra[./]", key) else _full_key(key, choices)
+        if full is None and os.path.lexists(word):
+            paths.append(word)
+        elif full is None:
+            raise InputError(_unknown(word, key, choices))
+        elif full in given:
+            secret = full in choices.options and choices.options[full].secret
+            told = "" if secret else f", as {given[full]!r} and {value!r}"
+            raise InputError(f"{full}: given twice{told}; give it once")
+        elif sweep and full in choices.options and choices.options[full].secret:
+            raise InputError(f"{full}: is not taken with -m, which writes down what it was given")
+        else:
+            given[full] = value
+    if paths and "paths" not in choices.options:
+        known = [*choices.options, *choices.groups]
+        first = without_value(paths[0])
+        raise InputError(f"{first}: this command takes no path{near(first, known)}")
+    if paths and "paths" in given:
+        raise InputError(f"paths: given both as paths= and as the word {without_value(paths[0])!r}; give one of them")
+    return tuple(paths), given
+
+
+def _unknown(word: str, key: str, choices: Choices) -> str:
+    known, shown = [*choices.options, *choices.groups], without_value(word)
+    sections = [name for name in known if name.startswith(key + ".")]
+    if sections:
+        return f"{key}: is a section; set its options one by one: {', '.join(f'{name}=' for name in sections[:4])}"
+    if not re.fullmatch(r"[A-Za-z_][\w.]*", key):
+        return f"{shown}: is neither an option (KEY=VALUE) nor an existing file"
+    if key.startswith("hydra"):
+        return f"{key}: settings of Hydra itself are taken only with -m"
+    return f"{shown.removesuffix('=…')}: no such option, and no file has this name{near(shown, known)}"
+
+
+def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:
+    """The settings in Hydra's grammar, text sealed, each one parsed on its own so that errors name it.
+
+    Raises:
+        InputError: an unknown member of a choice, or a value that is none of its option's type.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser = OverridesParser.create()
+    found = []
+    for key, value in given.items():
+        option = choices.options.get(key)
+        written = value
+        if key in choices.groups:
+            names = choices.groups[key]
+            secret = any(name.startswith(f"{key}.") and each.secret for name, each in choices.options.items())
+            if value not in names and (secret or not sweep):
+                got = "" if secret else f", got {value!r}{near(value, names)}"
+                raise InputError(f"{key}: expected one of {', '.join(names)}{got}")
+        elif option is not None and option.kind != "value":
+            if not (sweep and SWEPT_TEXT.fullmatch(value)):
+                # Whoever knows Hydra writes brackets around a list; text may begin with one, words of a set do not.
+                bracketed = is_list_of_words(option.annotation) and re.fullmatch(r"\[(.*)\]", value)
+                written = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
+        elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
+            written = f"[{value}]"
+        try:
+            parsed = parser.parse_override(f"{key}={written}")
+            swept = parsed.is_sweep_override()
+        except HydraException as error:
+            message = wrong_value(option, value) if option else f"{key}={value}: {str(error).partition(chr(10))[0]}"
+            raise InputError(message) from error
+        if swept and not sweep and option is not None:
+            raise InputError(f"{wrong_value(option, value)}; several values, one run each, need -m")
+        found.append(f"{key}={written}")
+    return found
+
+
+def _is_list(option: Option) -> bool:
+    return getattr(option.annotation, "__origin__", None) is tuple
+
+
+def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) -> str:
+    """Hydra's complaint in our words where it is about an option of a member that was not chosen."""
+    match = re.search(r"Could not override '([^']+)'", str(error))
+    if match and match[1] in given:
+        key = match[1]
+        section = key.rpartition(".")[0]
+        group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
+        now = given.get(group, choices.chosen.get(group))
+        return f"{key}: is an option of {' and '.join(choices.members[key]) or section}, and {group} is {now}"
+    return " ".join(str(error).split())
+
+
+def compose(
+    command: str, cls: type[T], words: Sequence[str], conf: Path | None = None, choices: Choices | None = None
+) -> T:
+    """The settings of one run: YAML files, then the words of the command line.
+
+    Raises:
+        InputError: the words, or what they come to together, are not settings of this command.
+    """
+    from hydra.errors import HydraException
+    from hydra.types import RunMode
+
+    choices = choices or choices_of(command, cls, conf)
+    paths, given = read_words(words, choices)
+    if paths:
+        given["paths"] = join_list(paths)
+    written = overrides(given, choices)
+    with open_hydra(conf) as hydra:
+        try:
+            composed = hydra.compose_config(command, written, RunMode.RUN, from_shell=False)
+        except HydraException as error:
+            raise InputError(hydra_error(error, given, choices)) from error
+        return typed(cls, plain_settings(composed))
+
+
+def plain_settings(composed: Any) -> dict[str, Any]:
+    """Hydra's result as plain dicts, lists and scalars, its own part left out."""
+    from omegaconf import OmegaConf
+
+    own = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
+    data = OmegaConf.to_container(own, resolve=True)
+    assert isinstance(data, dict)
+    return {str(key): value for key, value in data.items()}

@@ -1,0 +1,154 @@
+"""Settings of the commands: frozen dataclasses, described once, checked against what the user and the YAML files say.
+
+Each command owns a `@dataclass(frozen=True, slots=True, kw_only=True)` whose fields carry `metadata={"help": …}`;
+that text is what `gsencoder COMMAND --help` shows. Further metadata: `required=True` (the command cannot run without
+it), `metavar` (the word that stands for the value in the help) and `secret=True` (the value is never shown or
+written). A field whose type is a dataclass is a section, and its options are written `section.name=value`. A field
+whose type is a union of dataclasses is a choice: every member has a field `name: Literal["…"]`, and a folder of YAML
+files, one a member, makes it `section=member`.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_origin
+
+from gsencoder.app.settings.options import (
+    allows_none,
+    field_types,
+    kind_of,
+    member_name,
+    near,
+    options_by_key,
+    options_of,
+    section_classes,
+    split_list,
+    union_members,
+    wrong_value,
+)
+from gsencoder.core.errors import InputError
+
+T = TypeVar("T")
+
+HIDDEN = "(not shown)"
+"""What stands for the value of a secret option wherever settings are shown or written."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommonConfig:
+    """What every command takes."""
+
+    out: Path | None = field(default=None, metadata={"help": "where the results go", "metavar": "PATH"})
+    overwrite: bool = field(default=False, metadata={"help": "replace what an earlier run wrote to out="})
+    quiet: bool = field(default=False, metadata={"help": "print nothing but warnings and errors"})
+
+
+def _strict(wanted: type, accepted: tuple[type, ...]) -> Any:
+    """A dacite hook: turns what is really such a value into `wanted`, and anything else into a wrong type."""
+    from dacite.exceptions import WrongTypeError
+
+    def convert(value: Any) -> Any:
+        if not isinstance(value, accepted) or isinstance(value, bool) or value != value:
+            raise WrongTypeError(field_type=wanted, value=value)
+        return wanted(value)
+
+    return convert
+
+
+def _prepare(value: Any, annotation: Any) -> Any:
+    """Text lists become lists, one value where a list belongs becomes a list of one, an empty path becomes none."""
+    if value is None:
+        return None
+    if isinstance(value, str) and kind_of(annotation) == "list":
+        return split_list(value)
+    members = union_members(annotation)
+    if all(get_origin(member) is tuple for member in members) and not isinstance(value, (list, tuple, dict)):
+        return (value,)
+    return None if value == "" and Path in members and allows_none(annotation) else value
+
+
+def _section(annotation: Any, value: Any, key: str) -> Any:
+    classes = section_classes(annotation)
+    if not classes or (value is None and allows_none(annotation)):
+        return value
+    if not isinstance(value, Mapping):
+        raise InputError(f"{key}: is a section with options of its own ({key}.NAME=…), got {value!r}")
+    if len(classes) == 1:
+        return typed(classes[0], value, key + ".")
+    by_name = {member_name(section): section for section in classes}
+    name = str(value.get("name"))
+    if name not in by_name:
+        raise InputError(f"{key}.name: expected one of {', '.join(by_name)}, got {name!r}{near(name, by_name)}")
+    return typed(by_name[name], value, key + ".")
+
+
+def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
+    """The settings that `data` (plain dicts, lists and scalars) describes; what it leaves out has its default.
+
+    Numbers are taken as numbers only where they are written as such, and not-a-number is refused.
+
+    Raises:
+        InputError: an unknown key, a wrong type, or a value that the class refuses; the full key is named.
+    """
+    import dacite
+    from dacite.exceptions import DaciteFieldError
+
+    types = field_types(cls)
+    values: dict[str, Any] = {}
+    for name, value in data.items():
+        if name not in types:
+            known = [prefix + known for known in types]
+            raise InputError(f"{prefix}{name}: no such option{near(f'{prefix}{name}', known)}")
+        values[name] = _prepare(_section(types[name], value, prefix + name), types[name])
+    hooks: dict[Any, Any] = {
+        int: _strict(int, (int,)),
+        float: _strict(float, (int, float)),
+        Path: lambda value: Path(value) if isinstance(value, str) and value else value,
+    }
+    try:
+        return dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
+    except DaciteFieldError as error:
+        name = str(error.field_path).partition(".")[0]
+        raise InputError(wrong_value(options_by_key(cls, prefix)[prefix + name], data.get(name))) from error
+    except InputError as error:
+        raise InputError(_named(str(error), prefix, types)) from error
+
+
+def _named(message: str, prefix: str, names: Iterable[str]) -> str:
+    """A complaint of a settings class, with the section's name before the field's."""
+    if not prefix or message.partition(":")[0].split("[")[0] in names:
+        return prefix + message
+    return f"{prefix.rstrip('.')}: {message}"
+
+
+def check_required(cls: type, config: object) -> None:
+    """Complains about the first required option that was left empty."""
+    for option in options_of(cls):
+        if option.required and not option.member:
+            value: Any = config
+            for name in option.key.split("."):
+                value = getattr(value, name)
+            if value is None or value == "" or value == ():
+                if option.key == "paths":
+                    raise InputError(f"{option.metavar or 'PATH'} is missing: {option.help}")
+                raise InputError(f"{option.key}= is missing: {option.help}")
+
+
+def settings(config: object) -> dict[str, Any]:
+    """The settings as plain values, as YAML and JSON write them."""
+
+    def plain(value: Any) -> Any:
+        if is_dataclass(value) and not isinstance(value, type):
+            return {
+                item.name: HIDDEN
+                if item.metadata.get("secret") and getattr(value, item.name)
+                else plain(getattr(value, item.name))
+                for item in fields(value)
+            }
+        if isinstance(value, (list, tuple)):
+            return [plain(item) for item in value]
+        if isinstance(value, Mapping):
+            return {str(key): plain(item) for key, item in value.items()}
+        return str(value) if isinstance(value, Path) else value
+
+    return plain(config)

@@ -1,0 +1,63 @@
+"""What `gsencoder COMMAND --help` prints, read off the settings classes and the folder of YAML files."""
+
+import shutil
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gsencoder.app.settings.compose import choices_of
+from gsencoder.app.settings.options import Option, describe, join_list, options_of
+
+RULES = (
+    "A word KEY=VALUE is a setting if KEY is one of those above (the part after the last dot is enough where only one "
+    "has it), else a path if such a file exists; every other word is a path, and so is every word after --. "
+    "In lists of text commas separate and \\, is a comma."
+)
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (list, tuple)):
+        return join_list(map(str, value)) if value else "none"
+    return str(value) if value != "" else "empty"
+
+
+def _entry(head: str, text: str, width: int) -> list[str]:
+    body = textwrap.wrap(text, width - 6) or [""]
+    return [f"  {head}", *(f"      {line}" for line in body)]
+
+
+def _option(option: Option, width: int) -> list[str]:
+    kind = option.metavar or describe(option.annotation)
+    return _entry(f"{option.key}={kind}", f"{option.help} [{_shown(option.default)}]", width)
+
+
+def command_help(name: str, meaning: str, cls: type, flags: Mapping[str, str], conf: Path | None = None) -> str:
+    """The help of one command: usage, paths, settings with type, meaning and default, choices, flags."""
+    width = min(shutil.get_terminal_size((100, 24)).columns, 110)
+    options = options_of(cls)
+    choices = choices_of(name, cls, conf)
+    paths = next((option for option in options if option.key == "paths"), None)
+    word = f" {paths.metavar or 'PATH'}…" if paths else ""
+    lines = [f"usage: gsencoder {name}{word} [key=value …]", "", *textwrap.wrap(meaning, width)]
+    if paths:
+        lines += ["", "paths:", *_entry(paths.metavar or "PATH", paths.help, width)]
+    if choices.groups:
+        lines += ["", "choices:"]
+        for group, members in choices.groups.items():
+            lines += _entry(f"{group}={'|'.join(members)}", f"[{_shown(choices.chosen[group])}]", width)
+    lines += ["", "settings [default]:"]
+    for option in options:
+        if option.key != "paths" and not option.member:
+            lines += _option(option, width)
+    for member in dict.fromkeys(option.member for option in options if option.member):
+        lines += ["", f"settings with {member} [default]:"]
+        for option in options:
+            if option.member == member:
+                lines += _option(option, width)
+    lines += ["", "flags:", *(f"  {flag:<12}{text}" for flag, text in flags.items())]
+    return "\n".join([*lines, "", *textwrap.wrap(RULES, width)])

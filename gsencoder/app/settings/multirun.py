@@ -1,0 +1,105 @@
+"""Many runs from one command line (`-m`): Hydra's multirun, its sweepers and launchers.
+
+Values follow Hydra's grammar here (`voxel=0.01,0.02`, `teacher=labels,palette`), but for text, which stays text
+unless it has the form `query=choice(mug,banana)`. Run k writes to OUT/k; Hydra leaves its `multirun.yaml` in OUT.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from gsencoder.app.runs.printable import one_line
+from gsencoder.app.settings.compose import (
+    SWEPT_TEXT,
+    Choices,
+    choices_of,
+    hydra_error,
+    open_hydra,
+    overrides,
+    plain_settings,
+    read_words,
+    seal,
+    unseal,
+)
+from gsencoder.app.settings.config import CommonConfig, typed
+from gsencoder.app.settings.options import join_list
+from gsencoder.core.errors import InputError
+
+# A launcher that runs jobs in other processes imports this module there, and only then resolves the settings.
+OmegaConf.register_new_resolver("text", unseal, replace=True)
+
+
+def _job(composed: Any, *, cls: type[CommonConfig], run: Callable[[Any], int], swept: Sequence[str]) -> int:
+    """One run, with a folder of its own; the exit code, so that a failed run does not stop the others."""
+    from hydra.core.hydra_config import HydraConfig
+
+    job = HydraConfig.get()
+    try:
+        config = typed(cls, plain_settings(composed))
+    except InputError as error:
+        print(one_line(f"error: run {job.job.num}: {error}"), file=sys.stderr)
+        return 2
+    assert config.out is not None
+    if not config.quiet:
+        told = [text for text in job.overrides.task if text.partition("=")[0] in swept]
+        print(one_line(f"run {job.job.num}: {' '.join(told)}"), file=sys.stderr)
+    return run(replace(config, out=config.out / str(job.job.num)))
+
+
+def run_many(
+    command: str,
+    cls: type[CommonConfig],
+    words: Sequence[str],
+    run: Callable[[Any], int],
+    conf: Path | None = None,
+) -> int:
+    """Runs `run(settings)` for every combination of the values given; the largest exit code.
+
+    Raises:
+        InputError: the words are no settings of this command, or there is no folder to write the runs to.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    choices = choices_of(command, cls, conf)
+    paths, given = read_words(words, choices, sweep=True)
+    if paths:
+        given["paths"] = join_list(paths)
+    _check_out(command, given, choices)
+    own = {
+        "hydra.mode": "MULTIRUN",
+        "hydra.output_subdir": "null",
+        "hydra.sweep.dir": seal(given["out"]),
+        "hydra.sweep.subdir": ".",
+        "hydra/job_logging": "none",
+        "hydra/hydra_logging": "none",
+    }
+    asked = overrides(given, choices, sweep=True)
+    written = [f"{key}={value}" for key, value in own.items() if key not in given] + asked
+    parsed = OverridesParser.create().parse_overrides(asked)
+    swept = tuple(override.get_key_element() for override in parsed if override.is_sweep_override())
+    job = partial(_job, cls=cls, run=run, swept=swept)
+    with open_hydra(conf) as hydra:
+        try:
+            batches = hydra.multirun(command, job, written, with_log_configuration=False)
+        except HydraException as error:
+            raise InputError(hydra_error(error, given, choices)) from error
+    codes = [int(result.return_value) for batch in batches for result in batch]
+    failed = sum(code != 0 for code in codes)
+    if failed:
+        print(f"error: {failed} of {len(codes)} runs failed", file=sys.stderr)
+    return max(codes, default=0)
+
+
+def _check_out(command: str, given: dict[str, str], choices: Choices) -> None:
+    if choices.options["out"].metavar == "FILE":
+        raise InputError(f"-m: {command} writes a file, and several runs need a folder")
+    if not given.get("out"):
+        raise InputError("-m: out= is missing: the folder in which run k writes to OUT/k")
+    if SWEPT_TEXT.fullmatch(given["out"]):
+        raise InputError("out: cannot be swept; run k writes to OUT/k")

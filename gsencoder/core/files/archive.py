@@ -1,0 +1,259 @@
+"""One safetensors file with a JSON header: written whole or not at all, and on load checked against what it must hold.
+
+A file comes from anywhere: an array of another size would otherwise be broadcast, or end the run far from its cause.
+A disk or a transfer may change it: files of version 2 carry checksums (`checksums.py`) of header and arrays, and each
+array is held against its own when it is read. Version 1 had none, and is read with a warning.
+"""
+
+import hashlib
+import json
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.files.atomic import is_full_disk
+from gsencoder.core.files.checksums import block_checksums, bytes_of, file_digest, wrong_blocks
+
+VERSION = 2
+WITHOUT_CHECKSUMS = 1
+"""The version whose files have none, but for packages, which had one over the whole file."""
+OWN_KEYS = ("version", "checksums", "digest")
+"""Keys of the header that are not the caller's: the blocks' checksums by array, and the digest over everything else."""
+LARGEST_NUMBER = 2.0**63
+DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", "I64": "int64", "U8": "uint8"}
+"""safetensors' names of the number types that are written here."""
+DAMAGED = "the file is damaged"
+
+
+def first_difference(found: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = "") -> str:
+    """The first setting in which two runs differ, in words."""
+    for key in sorted({*found, *wanted}):
+        old, new = found.get(key), wanted.get(key)
+        if isinstance(old, dict) and isinstance(new, dict) and old != new:
+            return first_difference(old, new, f"{prefix}{key}.")
+        if old != new:
+            return f"{prefix}{key}={old}, and this run asks {prefix}{key}={new}"
+    return "other settings"
+
+
+class Archive:
+    """An open file; arrays and header values are checked as they are taken out.
+
+    Attributes:
+        path: of the file, for messages.
+        sizes: what the letters of shapes stand for, as the arrays taken so far have fixed it.
+    """
+
+    def __init__(self, path: Path, file: Any, header: dict[str, Any]) -> None:
+        """Args:
+        path: of the file.
+        file: it, opened by safetensors.
+        header: what it says of itself.
+
+        Raises:
+            InputError: another version, or a header that has been changed since it was written.
+        """
+        self.path, self.sizes = path, dict[str, int]()
+        self._file, self._header, self._names = file, header, frozenset(file.keys())
+        version = header.get("version")
+        self.checksums: Mapping[str, str] | None = None
+        if type(version) is int and version == WITHOUT_CHECKSUMS and not {"checksums", "digest"} & set(header):
+            if "sum" not in header:
+                warn_without_checksums(path)
+            return
+        if version != VERSION:
+            raise InputError(f"{path}: expected version {VERSION} of the format, got {str(version)[:20]}")
+        covered = {key: value for key, value in header.items() if key != "digest"}
+        checksums = header.get("checksums")
+        good = isinstance(checksums, dict) and checksums.keys() == self._names
+        if not good or header.get("digest") != file_digest(covered, {name: self._stored(name) for name in self._names}):
+            raise InputError(f"{path}: {DAMAGED}: its header does not have the checksum that was written with it")
+        self.checksums = checksums
+
+    def array(self, name: str, dtype: str, shape: tuple[int | str, ...]) -> np.ndarray:
+        """An array; a letter in its shape means the same size in all arrays of the file.
+
+        Raises:
+            InputError: missing, of another type or size, or not finite.
+        """
+        got_dtype, got = self._stored(name)
+        wanted = tuple(self.sizes.get(side, side) if isinstance(side, str) else side for side in shape)
+        same = len(got) == len(wanted) and all(isinstance(w, str) or w == g for w, g in zip(wanted, got, strict=True))
+        if got_dtype != dtype or not same:
+            raise InputError(
+                f"{self.path}: expected {name} {dtype}[{_listed(wanted)}], got {got_dtype}[{_listed(got)}]; "
+                "the file is damaged or from another program"
+            )
+        self.sizes |= {side: size for side, size in zip(wanted, got, strict=True) if isinstance(side, str)}
+        values = self._read(name)
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            bad = values.size - int(np.count_nonzero(np.isfinite(values)))
+            raise InputError(f"{self.path}: {bad} of {values.size} values of {name} are not finite")
+        return values
+
+    def shape(self, name: str, dtype: str, axes: int) -> tuple[int, ...]:
+        """The size of an array, without reading it.
+
+        Raises:
+            InputError: missing, of another type, or with another number of axes.
+        """
+        got_dtype, shape = self._stored(name)
+        if got_dtype != dtype or len(shape) != axes:
+            raise InputError(
+                f"{self.path}: expected {name} {dtype} with {axes} axes, got {got_dtype}[{_listed(shape)}]; "
+                "the file is damaged or from another program"
+            )
+        return shape
+
+    def _read(self, name: str) -> np.ndarray:
+        values: np.ndarray = self._file.get_tensor(name)
+        if self.checksums is not None and wrong_blocks(bytes_of(values), self.checksums[name]):
+            raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
+        return values
+
+    def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
+        """Type and size of an array as the file states them."""
+        if name not in self._names:
+            raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
+        stored = self._file.get_slice(name)
+        return DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
+
+    def value(self, key: str, *kinds: type | None) -> Any:
+        """A value of the header, of one of these types.
+
+        Raises:
+            InputError: missing or of another type.
+        """
+        value = self._header.get(key)
+        # JSON's true is a Python int, and no number here is meant to be one.
+        good = (value is None and None in kinds) or isinstance(value, tuple(kind for kind in kinds if kind is not None))
+        if key not in self._header or not good or (isinstance(value, bool) and bool not in kinds):
+            names = " or ".join("null" if kind is None else kind.__name__ for kind in kinds)
+            got = f"{str(value)[:60]!r}" if key in self._header else "nothing"
+            raise InputError(f"{self.path}: expected {key} ({names}) in the header, got {got}")
+        if isinstance(value, (int, float)) and not abs(value) < LARGEST_NUMBER:
+            raise InputError(f"{self.path}: expected a finite {key} in the header, got {str(value)[:20]}")
+        return value
+
+    def verify(self) -> None:
+        """Reads all arrays and holds them against their checksums; those of version 1 against the sum of the file.
+
+        Raises:
+            InputError: the file is damaged, or has no checksums.
+        """
+        if self.checksums is not None:
+            for name in sorted(self._names):
+                self._read(name)
+            return
+        arrays = {name: self._file.get_tensor(name) for name in self._names}
+        header = {key: value for key, value in self._header.items() if key not in ("version", "sum")}
+        if self.value("sum", str) != _sum_of_version_1(arrays, header):
+            raise InputError(f"{self.path}: {DAMAGED}: it does not have the checksum that was written with it")
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._header or key in self._names
+
+
+def _listed(shape: tuple[int | str, ...]) -> str:
+    return ", ".join(map(str, shape))
+
+
+def warn_without_checksums(path: Path) -> None:
+    """One warning a folder: a run may read hundreds of files of one kind from it."""
+    if path.parent not in _WARNED:
+        _WARNED.add(path.parent)
+        warnings.warn(
+            f"{path}: was written by an earlier version, without checksums, so damage to it or to files beside it "
+            "would not be noticed; make it anew to have them",
+            SceneWarning,
+            stacklevel=5,
+        )
+
+
+_WARNED: set[Path] = set()
+
+
+def _sum_of_version_1(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
+    """sha256 over the header and over names, types, shapes and bytes of all arrays."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = _contiguous(arrays[name])
+        digest.update(f"{name} {array.dtype.name}{array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+    """Writes arrays and header with their checksums; what had the name stays until the new file is whole.
+
+    Args:
+        path: the file.
+        arrays: by name, of the types in `DTYPES`.
+        header: values that JSON has, under other keys than `OWN_KEYS`.
+
+    Raises:
+        InputError: the disk is full, or the system refuses.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import save_file
+
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    pieces = {name: _contiguous(array) for name, array in arrays.items()}
+    assert not set(OWN_KEYS) & set(header)
+    assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that readers do not know"
+    checksums = {name: block_checksums(array) for name, array in pieces.items()}
+    # As it will be read: JSON makes lists of tuples and text of keys.
+    covered = json.loads(json.dumps({**header, "version": VERSION, "checksums": checksums}))
+    digest = file_digest(covered, {name: (array.dtype.name, array.shape) for name, array in pieces.items()})
+    metadata = {"gsencoder": json.dumps({**covered, "digest": digest})}
+    try:
+        save_file(pieces, temporary, metadata)
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        # safetensors writes files that nobody else may read.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        os.replace(temporary, path)
+    except (OSError, SafetensorError) as error:
+        if is_full_disk(error):
+            raise InputError(f"{path}: no space left on the device; make room and give the command again") from error
+        raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _contiguous(array: np.ndarray) -> np.ndarray:
+    """The array in one piece, of the same shape; numpy's own function makes a number a list of one."""
+    return np.ascontiguousarray(array).reshape(array.shape)
+
+
+@contextmanager
+def open_archive(path: Path) -> Iterator[Archive]:
+    """The file at `path`, open for the block. An `InputError` in the block that does not name the file is given its
+    name, so that what the types refuse is told with its place.
+
+    Raises:
+        InputError: missing, damaged, or of another version.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected one that gsencoder wrote")
+    try:
+        with about(path), safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
+            if not isinstance(header, dict):
+                raise InputError(f"{path}: expected version {VERSION} of the format, got none")
+            yield Archive(path, file, header)
+    except InputError:
+        raise
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        message = " ".join(str(error).split())[:160]
+        raise InputError(f"{path}: damaged or no safetensors file: {message}") from error

@@ -1,0 +1,30 @@
+"""Where models and tables are found: at the path that was given, or by bare name in the folder of models."""
+
+import os
+from pathlib import Path
+
+from gsencoder.core.errors import InputError
+
+MODELS_VARIABLE = "GSENCODER_MODELS"
+
+
+def find_file(name: str, option: str, *, folder: bool = False) -> Path:
+    """The file at `name`, else the file of that name in the folder that GSENCODER_MODELS names.
+
+    Args:
+        name: a path, or a bare file name.
+        option: what the user would set, for the error.
+        folder: whether a folder is sought, as models of several files have one.
+
+    Raises:
+        InputError: neither exists.
+    """
+    models = os.environ.get(MODELS_VARIABLE, "")
+    tried = [Path(name)]
+    if models and not tried[0].is_absolute():
+        tried.append(Path(models) / name)
+    for path in tried if name else ():
+        if path.is_dir() if folder else path.is_file():
+            return path
+    hint = "" if models else f", and {MODELS_VARIABLE} is not set (a folder to look for models in)"
+    raise InputError(f"{option}: no {'folder' if folder else 'file'} at {' or '.join(map(str, tried))}{hint}")

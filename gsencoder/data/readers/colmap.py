@@ -1,0 +1,174 @@
+"""COLMAP models, binary and text, with or without rigs and frames, read by pycolmap."""
+
+import itertools
+import math
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.colmap_binary import check_binary_model
+from gsencoder.data.readers.posed import FARTHEST, PosedImage, PosedImages, inside, rigid_pose, warn_left_out
+from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
+
+QUATERNION_TOLERANCE = 1e-3
+"""How far from 1 the length of a quaternion may be; the rest is taken for rounding in the file."""
+
+
+def is_colmap_model(folder: Path) -> bool:
+    """True where the files of a model lie in `folder` itself."""
+    return (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
+
+
+def read_colmap(model: Path, images: Path, root: Path, *, allow_outside: bool = False) -> PosedImages:
+    """Reads a model and finds its photographs.
+
+    Args:
+        model: folder of cameras, images and points3D (.bin before .txt where both are there), rigs and frames.
+        images: folder that the names of the model are relative to.
+        root: the scene folder, which names may not leave.
+        allow_outside: let them.
+
+    Returns:
+        The registered pictures sorted by name, in the model's own world, and its points with their colours. The unit
+        of length and up are unknown.
+
+    Raises:
+        InputError: damaged files, no registered picture whose photograph exists, an unusable camera or pose.
+    """
+    reconstruction = _load(model)
+    posed: list[PosedImage] = []
+    missing: list[str] = []
+    unregistered = 0
+    cameras: dict[int, CameraModel] = {}
+    for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
+        where = f"{model}: image {image.name[:120]!r}"
+        if not image.has_pose:
+            unregistered += 1
+            continue
+        path = inside(images, image.name, where, root=root, allow_outside=allow_outside)
+        if not path.is_file():
+            missing.append(image.name)
+            continue
+        if image.camera_id not in cameras:
+            if image.camera_id not in reconstruction.cameras:
+                raise InputError(f"{where}: its camera {image.camera_id} is not in the model")
+            found = reconstruction.cameras[image.camera_id]
+            camera = CameraModel(
+                model=found.model.name,
+                width=int(found.width),
+                height=int(found.height),
+                params=tuple(float(value) for value in found.params),
+            )
+            check_camera(camera, f"{model}: camera {image.camera_id}")
+            cameras[image.camera_id] = camera
+        cam_from_world = image.cam_from_world()
+        length = math.hypot(*map(float, cam_from_world.rotation.quat))
+        # pycolmap takes a quaternion of zeros for no rotation.
+        if not abs(length - 1) <= QUATERNION_TOLERANCE:
+            raise InputError(
+                f"{where}: its quaternion ({_pose_file(model)}) has length {length:.4g}, expected 1; export the model "
+                "again, or remove the image"
+            )
+        pose = np.eye(4)
+        pose[:3] = cam_from_world.matrix()
+        posed.append(
+            PosedImage(
+                name=image.name,
+                camera=cameras[image.camera_id],
+                cam_from_world=rigid_pose(pose, where),
+                image=path,
+            )
+        )
+    total = len(reconstruction.images)
+    if not posed:
+        first = f" (first: {missing[0][:200]!r})" if missing else ""
+        raise InputError(
+            f"{model}: no view: of {total} images {unregistered} have no pose "
+            f"and {len(missing)} are not in {images}{first}"
+        )
+    warn_left_out(missing, total, str(model), "images of the model", f"not in {images}, they are left out")
+    if unregistered:
+        warnings.warn(
+            f"{model}: {unregistered} of {total} images have no pose and are left out", SceneWarning, stacklevel=2
+        )
+    points, colors = _points(reconstruction, model)
+    return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors)
+
+
+def _pose_file(model: Path) -> str:
+    """The file that holds the poses: that of the frames where there is one (since COLMAP 3.12)."""
+    suffix = "bin" if (model / "cameras.bin").is_file() else "txt"
+    return f"frames.{suffix}" if (model / f"frames.{suffix}").is_file() else f"images.{suffix}"
+
+
+def _check_text_poses(file: Path) -> None:
+    """Names the image whose pose is not finite, where pycolmap names none. Each image has two lines."""
+    with file.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            words = line.split(maxsplit=9)
+            if not words or words[0].startswith("#"):
+                continue
+            next(lines, None)
+            try:
+                finite = bool(np.isfinite([float(word) for word in words[1:8]]).all())
+            except ValueError:
+                continue
+            if not finite:
+                name = words[9].strip() if len(words) > 9 else ""
+                raise InputError(f"{file}: image {name[:120]!r}: the pose has values that are not finite")
+
+
+def _load(model: Path) -> Any:
+    pycolmap = load_pycolmap()
+    binary = (model / "cameras.bin").is_file()
+    if binary:
+        check_binary_model(model)
+    else:
+        for name in ("cameras.txt", "images.txt", "points3D.txt"):
+            if not (model / name).is_file():
+                raise InputError(f"{model}: {name} is missing; a COLMAP model has cameras, images and points3D")
+        _check_text_poses(model / "images.txt")
+    reconstruction = pycolmap.Reconstruction()
+    try:
+        (reconstruction.read_binary if binary else reconstruction.read_text)(str(model))
+        # Names are decoded when they are asked for, so a name that is not UTF-8 shows only here.
+        [image.name for image in reconstruction.images.values()]
+    except Exception as error:
+        said = " ".join(str(error).split())[:200]
+        raise InputError(f"{model}: pycolmap cannot read this model ({type(error).__name__}: {said})") from error
+    if not binary:
+        _check_text_counts(model, reconstruction)
+    return reconstruction
+
+
+def _check_text_counts(model: Path, reconstruction: Any) -> None:
+    """Compares what was read with the counts in the files' comments: a text file cut short has no other sign."""
+    read = {"cameras": reconstruction.cameras, "images": reconstruction.images, "points3D": reconstruction.points3D}
+    for name, values in read.items():
+        with (model / f"{name}.txt").open(encoding="utf-8", errors="replace") as lines:
+            for line in itertools.takewhile(lambda line: line.startswith("#"), lines):
+                promised = re.match(r"# Number of \w+: (\d{1,15})\b", line)
+                if promised and int(promised[1]) != len(values):
+                    raise InputError(
+                        f"{model / name}.txt: promises {promised[1]} entries and holds {len(values)}; "
+                        "the file is cut short or was edited (correct or remove its comment)"
+                    )
+
+
+def _points(reconstruction: Any, model: Path) -> tuple[np.ndarray, np.ndarray]:
+    found = list(reconstruction.points3D.values())
+    points = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
+    colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)
+    with np.errstate(invalid="ignore"):
+        good = np.abs(points).max(axis=1, initial=0) <= FARTHEST
+    if not good.all():
+        warnings.warn(
+            f"{model}: {int((~good).sum())} of {len(good)} points are not finite and are left out",
+            SceneWarning,
+            stacklevel=3,
+        )
+    return points[good], colors[good]

@@ -1,0 +1,338 @@
+"""Pictures on disk as lazy sequences: photographs, sensor depth, masks and instance maps, decoded on access.
+
+Rules that hold for all of them:
+
+- The size in a file's header is checked before anything is decoded; more than `PIXEL_LIMIT` pixels are refused.
+- Only PNG, JPEG, WebP, TIFF, BMP and PPM are opened, and .npy for depth. A file that cannot be decoded to its
+  end is an InputError that names it.
+- The EXIF orientation is ignored, as COLMAP does: poses and intrinsics belong to the pixels as they are stored.
+- Grey becomes RGB by repetition, 16-bit grey keeps its upper 8 bits. An alpha channel composites the colour over
+  black, which is what a splat rendered without a background gives, and pixels of alpha below one half are masked.
+- Distorted pictures are resampled once (undistort.py): colour bilinearly, everything else by the nearest pixel.
+- A smaller scale averages colour over areas; depth and instances take the pixel at the new centre; a mask keeps a
+  pixel only if all that it covers is used.
+"""
+
+import operator
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, UInt8
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+PIXEL_LIMIT = 80_000_000
+"""Pictures of more pixels are refused before they are decoded (Pillow's own warning starts a little above this)."""
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
+Array = TypeVar("Array", bound=np.ndarray)
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width < 1 or height < 1 or width * height > PIXEL_LIMIT:
+        raise InputError(f"{path}: {width}×{height} pixels, expected 1 to {PIXEL_LIMIT:,}; make the picture smaller")
+
+
+def _open(path: Path) -> "Image":
+    """Reads a picture's header. Pillow raises nearly anything on hostile files, hence the wide net."""
+    from PIL import Image
+
+    try:
+        picture = Image.open(path, formats=FORMATS)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:
+        raise InputError(f"{path}: not a readable picture ({_brief(error)}); expected {', '.join(FORMATS)}") from error
+    try:
+        _check_size(path, *picture.size)
+    except InputError:
+        picture.close()
+        raise
+    return picture
+
+
+def _brief(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+
+
+def _decode(path: Path, picture: "Image") -> "Image":
+    try:
+        picture.load()
+    except Exception as error:
+        raise InputError(f"{path}: cannot be decoded ({_brief(error)}); the file is cut short or damaged") from error
+    return picture
+
+
+def check_picture(path: Path) -> None:
+    """Decodes a picture to its end.
+
+    Raises:
+        InputError: missing, of another format, too large, or damaged; the file is named.
+    """
+    with _open(path) as picture:
+        _decode(path, picture)
+
+
+def _load_npy(path: Path) -> np.ndarray:
+    """Maps a .npy file, so that its header is checked before its values are read."""
+    try:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:
+        raise InputError(f"{path}: not a readable .npy array ({_brief(error)})") from error
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+        raise InputError(f"{path}: expected a .npy array of numbers [H, W]")
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2:
+        raise InputError(f"{path}: expected an array [H, W], got {list(values.shape)}")
+    _check_size(path, values.shape[1], values.shape[0])
+    return values
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header alone.
+
+    Raises:
+        InputError: unreadable, or more than `PIXEL_LIMIT` pixels.
+    """
+    if path.suffix.lower() == ".npy":
+        height, width = _load_npy(path).shape
+        return width, height
+    with _open(path) as picture:
+        return picture.size
+
+
+def picture_info(path: Path) -> tuple[tuple[int, int], bool]:
+    """((width, height), whether there is transparency) from the header alone; errors as in `picture_size`."""
+    with _open(path) as picture:
+        try:
+            return picture.size, bool(picture.has_transparency_data)
+        except Exception as error:
+            raise InputError(f"{path}: not a readable picture ({_brief(error)})") from error
+
+
+def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
+    """Colour (composited over black) and alpha, None where the file has none.
+
+    Raises:
+        InputError: unreadable, damaged, too large, or of a kind that is not colour.
+    """
+    with _open(path) as opened:
+        picture = _decode(path, opened)
+        try:
+            if picture.mode.startswith("I"):
+                wide = np.asarray(picture).astype(np.int64)
+                if wide.min() < 0 or wide.max() > 65_535:
+                    raise InputError(f"{path}: grey values beyond 16 bits; expected an 8- or 16-bit photograph")
+                return np.repeat((wide >> 8).astype(np.uint8)[..., None], 3, axis=2), None
+            if picture.mode == "F":
+                raise InputError(f"{path}: a floating-point picture; expected an 8- or 16-bit photograph")
+            if not picture.has_transparency_data:
+                return np.array(picture.convert("RGB")), None
+            rgba = np.asarray(picture.convert("RGBA"))
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{path}: cannot be turned into RGB ({_brief(error)})") from error
+    alpha = rgba[..., 3]
+    colour = (rgba[..., :3].astype(np.uint16) * alpha[..., None] + 127) // 255
+    return colour.astype(np.uint8), alpha.copy()
+
+
+def read_integers(path: Path, what: str, *, wide: bool) -> np.ndarray:
+    """A single-channel integer PNG [H, W], int32; `wide` asks for more than 8 bits, as depth in millimetres has."""
+    with _open(path) as opened:
+        allowed = ("I;16", "I;16B", "I;16L", "I") + (() if wide else ("L", "P", "1"))
+        if opened.mode not in allowed:
+            kind = "16-bit" if wide else "8- or 16-bit"
+            raise InputError(f"{path}: {what} must be a {kind} picture with one channel, got mode {opened.mode}")
+        values = np.asarray(_decode(path, opened)).astype(np.int32)
+    if values.size and values.min() < 0:
+        raise InputError(f"{path}: {what} has negative values")
+    return values
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PixelGrid:
+    """How the pixels of a view's file become the pixels of the view.
+
+    Attributes:
+        source: the camera that the file's pixels belong to.
+        pinhole: the camera without distortion, at full size.
+        width: of the view, after scaling.
+        height: of the view, after scaling.
+    """
+
+    source: CameraModel
+    pinhole: Pinhole
+    width: int
+    height: int
+
+
+class _Files(Sequence[Array]):
+    """Files of V views, read on access. Slices are sequences of the same kind; nothing is kept in memory."""
+
+    def __init__(self, paths: Sequence[Path | None], grids: Sequence[PixelGrid], remaps: RemapCache) -> None:
+        self._paths, self._grids, self._remaps = tuple(paths), tuple(grids), remaps
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @overload
+    def __getitem__(self, index: int) -> Array: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Array]: ...
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return self._slice(index)
+        view = operator.index(index)
+        if not -len(self) <= view < len(self):
+            raise IndexError(f"view {view} of {len(self)}")
+        return self._load(view % len(self))
+
+    def _slice(self, rows: slice) -> "_Files[Array]":
+        return type(self)(self._paths[rows], self._grids[rows], self._remaps)
+
+    @abstractmethod
+    def _load(self, view: int) -> Array: ...
+
+    def _checked(self, view: int, shape: tuple[int, ...]) -> None:
+        source = self._grids[view].source
+        if shape != (source.height, source.width):
+            raise InputError(
+                f"{self._paths[view]}: {shape[1]}×{shape[0]} pixels, expected {source.width}×{source.height}; "
+                "the file changed since the scene was loaded"
+            )
+
+    def _nearest(self, view: int, values: np.ndarray) -> np.ndarray:
+        grid = self._grids[view]
+        self._checked(view, values.shape)
+        remap = self._remaps.get(grid.pinhole, grid.source)
+        if remap is not None:
+            values = remap.nearest(values)
+        if values.shape != (grid.height, grid.width):
+            rows = ((np.arange(grid.height) + 0.5) * (values.shape[0] / grid.height)).astype(np.int64)
+            columns = ((np.arange(grid.width) + 0.5) * (values.shape[1] / grid.width)).astype(np.int64)
+            values = values[rows][:, columns]
+        return values
+
+
+class ImageFiles(_Files[UInt8[np.ndarray, "H W 3"]]):
+    """Photographs as uint8 [H, W, 3] RGB, undistorted and scaled."""
+
+    def _load(self, view: int) -> UInt8[np.ndarray, "H W 3"]:
+        from PIL import Image
+
+        path, grid = self._paths[view], self._grids[view]
+        assert path is not None
+        colour = read_rgba(path)[0]
+        self._checked(view, colour.shape[:2])
+        remap = self._remaps.get(grid.pinhole, grid.source)
+        if remap is not None:
+            colour = remap.bilinear(colour)
+        if colour.shape[:2] != (grid.height, grid.width):
+            small = Image.fromarray(colour).resize((grid.width, grid.height), Image.Resampling.BOX)
+            colour = np.array(small)
+        return colour
+
+
+class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
+    """Sensor depth as float32 [H, W], z in world units, 0 = none; a view without a file is all zero.
+
+    PNG holds integers and .npy any number type; both are multiplied by the view's scale. In .npy, NaN and infinity
+    also mean none.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path | None],
+        grids: Sequence[PixelGrid],
+        remaps: RemapCache,
+        scales: Sequence[float],
+    ) -> None:
+        super().__init__(paths, grids, remaps)
+        self._scales = tuple(scales)
+
+    def _slice(self, rows: slice) -> "DepthFiles":
+        return DepthFiles(self._paths[rows], self._grids[rows], self._remaps, self._scales[rows])
+
+    def _load(self, view: int) -> Float32[np.ndarray, "H W"]:
+        path, grid = self._paths[view], self._grids[view]
+        if path is None:
+            return np.zeros((grid.height, grid.width), np.float32)
+        if path.suffix.lower() == ".npy":
+            mapped = _load_npy(path)
+            with np.errstate(over="ignore"):
+                values = np.where(np.isfinite(mapped), mapped, 0).astype(np.float64)
+            if values.size and values.min() < 0:
+                raise InputError(f"{path}: depth has negative values")
+        else:
+            values = read_integers(path, "depth", wide=True).astype(np.float64)
+        depth = self._nearest(view, values) * self._scales[view]
+        if depth.size and depth.max() > np.finfo(np.float32).max:
+            raise InputError(f"{path}: depth of {depth.max():g} world units; check the depth scale")
+        return depth.astype(np.float32)
+
+
+class InstanceFiles(_Files[Int32[np.ndarray, "H W"]]):
+    """Instance maps as int32 [H, W], 0 = none; a view without a file is all zero."""
+
+    def _load(self, view: int) -> Int32[np.ndarray, "H W"]:
+        path, grid = self._paths[view], self._grids[view]
+        if path is None:
+            return np.zeros((grid.height, grid.width), np.int32)
+        return self._nearest(view, read_integers(path, "an instance map", wide=False))
+
+
+class MaskFiles(_Files[Bool[np.ndarray, "H W"]]):
+    """Which pixels to use, bool [H, W]: the mask file is not 0, alpha is at least one half, and the pinhole pixel has
+    content in the distorted picture. Each of the three counts only where it exists."""
+
+    def __init__(
+        self,
+        paths: Sequence[Path | None],
+        grids: Sequence[PixelGrid],
+        remaps: RemapCache,
+        transparent: Sequence[Path | None],
+    ) -> None:
+        super().__init__(paths, grids, remaps)
+        self._transparent = tuple(transparent)
+
+    def _slice(self, rows: slice) -> "MaskFiles":
+        return MaskFiles(self._paths[rows], self._grids[rows], self._remaps, self._transparent[rows])
+
+    def _load(self, view: int) -> Bool[np.ndarray, "H W"]:
+        from PIL import Image
+
+        path, image, grid = self._paths[view], self._transparent[view], self._grids[view]
+        used = np.ones((grid.source.height, grid.source.width), bool)
+        if path is not None:
+            with _open(path) as opened:
+                picture = _decode(path, opened)
+                values = np.asarray(picture)
+            # A mask saved as RGB is white and black like any other; its alpha, if any, says nothing.
+            values = (
+                values[..., : len(picture.getbands()) - ("A" in picture.getbands())] if values.ndim == 3 else values
+            )
+            nonzero = np.asarray(values.any(axis=2) if values.ndim == 3 else values != 0)
+            self._checked(view, nonzero.shape)
+            used &= nonzero
+        if image is not None:
+            alpha = read_rgba(image)[1]
+            if alpha is not None:
+                self._checked(view, alpha.shape)
+                used &= alpha >= 128
+        remap = self._remaps.get(grid.pinhole, grid.source)
+        if remap is not None:
+            used = remap.nearest(used)
+        if used.shape != (grid.height, grid.width):
+            small = Image.fromarray(used.astype(np.uint8) * 255).resize((grid.width, grid.height), Image.Resampling.BOX)
+            used = np.asarray(small) == 255
+        return used

@@ -1,0 +1,181 @@
+"""What every reader of posed pictures hands over, and the checks that they share: paths, numbers, poses, the origin."""
+
+import math
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.undistort import CameraModel
+
+RIGID_TOLERANCE = 1e-3
+"""How far from 1 a singular value of a pose's rotation may be; the rest is taken for rounding in the file."""
+LONGEST_PATH = 4096
+"""Characters of a path: PATH_MAX of Linux, which other systems do not exceed."""
+FARTHEST = 1e12
+"""Coordinates beyond this are refused: float64 steps by a tenth of a millimetre there."""
+ORIGIN_STEP = 1000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedImage:
+    """One picture of a scene as its files describe it.
+
+    Attributes:
+        name: unique in the scene.
+        camera: intrinsics with distortion.
+        cam_from_world: rigid, OpenCV axes, in the file's own world (no origin taken off).
+        image: the photograph, which exists.
+        depth: sensor depth, or None.
+        depth_camera: the camera of the depth picture; None where it is the photograph's.
+        depth_scale: world units for each step of the depth file.
+        mask: pixels to use, or None.
+        instance: instance map, or None.
+    """
+
+    name: str
+    camera: CameraModel
+    cam_from_world: Float64[np.ndarray, "4 4"]
+    image: Path
+    depth: Path | None = None
+    depth_camera: CameraModel | None = None
+    depth_scale: float = 1.0
+    mask: Path | None = None
+    instance: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedImages:
+    """A scene's pictures and what its files say about the world; coordinates are the file's own, in float64."""
+
+    source: str
+    images: tuple[PosedImage, ...]
+    metres_per_unit: float | None = None
+    up: Float64[np.ndarray, "3"] | None = None
+    points: Float64[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    colors: UInt8[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+
+
+def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"]:
+    """The mean of `points`, each coordinate rounded to a multiple of 1000 units; zero for none.
+
+    A scene near zero keeps its coordinates. One far away gets a round offset, which is taken off in float64 before
+    positions become float32: moved by any multiple of 1000 it has the same float32 coordinates.
+    """
+    if not len(points):
+        return np.zeros(3)
+    return np.round(points.mean(axis=0) / ORIGIN_STEP) * ORIGIN_STEP + 0.0
+
+
+def rigid_pose(matrix: Float64[np.ndarray, "4 4"], where: str) -> Float64[np.ndarray, "4 4"]:
+    """The pose with its rotation made exact (the nearest one, by SVD; the file holds a few digits only).
+
+    Raises:
+        InputError: not finite, singular, scaled, sheared, mirrored, or too far away; `where` begins the message.
+    """
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where}: the pose has values that are not finite")
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise InputError(f"{where}: the last row of the pose must be 0 0 0 1, got {matrix[3].tolist()}")
+    if np.abs(matrix[:3, 3]).max() > FARTHEST:
+        raise InputError(f"{where}: the camera is {np.abs(matrix[:3, 3]).max():g} units away; at most {FARTHEST:g}")
+    if np.abs(matrix[:3, :3]).max() > 1e6:
+        raise InputError(
+            f"{where}: the pose is not rigid (entries of {np.abs(matrix[:3, :3]).max():g} in its rotation)"
+        )
+    left, stretch, right = np.linalg.svd(matrix[:3, :3])
+    if np.abs(stretch - 1).max() > RIGID_TOLERANCE:
+        if stretch[2] <= 1e-9 * stretch[0] or stretch[0] < 1e-9:
+            raise InputError(f"{where}: the pose is singular (singular values {_list(stretch)}), expected a rotation")
+        if stretch[0] - stretch[2] <= RIGID_TOLERANCE * stretch[0]:
+            raise InputError(
+                f"{where}: the pose carries a uniform scale of {stretch.mean():.6g}; divide its rotation by it "
+                "(poses must be rigid, scene scale belongs in the translations)"
+            )
+        raise InputError(f"{where}: the pose is not rigid (singular values {_list(stretch)}, expected 1, 1, 1)")
+    rotation = left @ right
+    if np.linalg.det(rotation) < 0:
+        raise InputError(f"{where}: the pose mirrors the world (determinant -1), expected a rotation")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, matrix[:3, 3]
+    return pose
+
+
+def _list(values: np.ndarray) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)
+
+
+def inverse_rigid(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    """world_from_cam of a rigid cam_from_world, and the other way round."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def inside(folder: Path, relative: str, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
+    """`folder / relative`, which may not leave `root` through "..", an absolute path or a link unless allowed.
+
+    Args:
+        folder: what the path is relative to.
+        relative: as the scene's files give it.
+        where: begins the message.
+        root: the scene folder; None = `folder`.
+        allow_outside: let it leave.
+
+    Raises:
+        InputError: it leaves, or is no path at all.
+    """
+    root = folder if root is None else root
+    # A longer path is no file's, and to look for the links in it takes the square of its length.
+    if len(relative) > LONGEST_PATH:
+        raise InputError(
+            f"{where}: {relative[:80]!r}… is not a path ({len(relative):,} characters, at most {LONGEST_PATH:,})"
+        )
+    try:
+        path = folder / relative
+        leaves = not path.resolve().is_relative_to(root.resolve())
+        path.is_file()
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"{where}: {relative[:80]!r} is not a path ({type(error).__name__})") from error
+    if leaves and not allow_outside:
+        raise InputError(
+            f"{where}: {relative[:200]!r} leads out of the scene folder {root}; "
+            "copy the file into it, or set allow_outside=true if you trust the scene"
+        )
+    return path
+
+
+def number(values: Mapping[str, object], key: str, where: str) -> float | None:
+    """A finite number of a JSON object; None where the key is absent.
+
+    Raises:
+        InputError: anything else than a finite number; `where` begins the message.
+    """
+    value = values.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"{where}: {key} must be a number, got {str(value)[:40]!r}")
+    try:
+        finite = math.isfinite(value)
+    except OverflowError:
+        finite = False
+    if not finite:
+        raise InputError(f"{where}: {key} must be finite, got {str(value)[:40]}")
+    return float(value)
+
+
+def warn_left_out(missing: Iterable[str], total: int, source: str, what: str, result: str) -> None:
+    """One counted warning for files that are listed but missing; nothing where none is."""
+    names = list(missing)
+    if names:
+        warnings.warn(
+            f"{source}: {len(names)} of {total} {what} are missing (first: {names[0][:200]!r}); {result}",
+            SceneWarning,
+            stacklevel=3,
+        )

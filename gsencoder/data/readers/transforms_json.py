@@ -1,0 +1,240 @@
+"""transforms.json of nerfstudio, instant-ngp and Blender (NeRF synthetic).
+
+`transform_matrix` is world_from_camera with OpenGL axes (x right, y up, z backward); y and z are turned round on load.
+Values of a frame come before those of the file. Distortion (k1, k2, k3, k4, p1, p2) is OpenCV's, of the perspective
+or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `applied_transform`, `scale`, `offset` and
+`aabb_scale` are not used: the world is that of the matrices.
+
+Beside the keys of those programs these are read: `instance_file_path` (integers, 0 = none) for a frame, and
+`metres_per_unit` and `up` for the file.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.readers.images import picture_size
+from gsencoder.data.readers.posed import (
+    PosedImage,
+    PosedImages,
+    inside,
+    inverse_rigid,
+    number,
+    rigid_pose,
+    warn_left_out,
+)
+from gsencoder.data.readers.undistort import CameraModel, check_camera
+
+PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
+NERFSTUDIO_DEPTH_SCALE = 1e-3
+"""nerfstudio's own default for depth_unit_scale_factor: integer millimetres."""
+GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+TRANSFORMS = ("transforms.json", "transforms_train.json")
+"""The names that such files have."""
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        InputError: unreadable, not UTF-8, or not JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a readable JSON file ({' '.join(str(error).split())[:160]})") from error
+
+
+def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: float | None = None) -> PosedImages:
+    """Reads a transforms.json.
+
+    Args:
+        path: the JSON file; its folder is the scene folder, which paths in it may not leave.
+        allow_outside: let them.
+        depth_scale: world units for each step of a depth file; None = what the file says, else millimetres.
+
+    Returns:
+        Posed pictures in OpenCV axes. The unit is the metre and up is +z where the file says so, or where it has
+        depth with a `depth_unit_scale_factor`; otherwise both are unknown.
+
+    Raises:
+        InputError: no frame, a pose that is not rigid, intrinsics that are not finite, a repeated name, a path that
+            leaves the folder, an unknown camera model; the message names the frame.
+    """
+    data = read_json(path)
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
+        raise InputError(f"{path}: expected an object with a list of frames (nerfstudio, instant-ngp or Blender)")
+    frames, root, source = data["frames"], path.parent, path.name
+    images: list[PosedImage] = []
+    missing: dict[str, list[str]] = {"image": [], "depth": [], "mask": [], "instance": []}
+    names: set[str] = set()
+    metric_depth = False
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise InputError(f"{path}: frame {index} has no file_path")
+        name = frame["file_path"]
+        where = f"{path}: frame {index} ({name[:120]!r})"
+        if name in names:
+            raise InputError(f"{where}: this file_path is repeated; every frame needs its own")
+        names.add(name)
+        image = _find_image(root, name, where, allow_outside=allow_outside)
+        if image is None:
+            missing["image"].append(name)
+            continue
+        beside: dict[str, Path | None] = {}
+        for kind, keys in (
+            ("depth", ("depth_file_path", "depth_path")),
+            ("mask", ("mask_path",)),
+            ("instance", ("instance_file_path",)),
+        ):
+            listed = next((frame[key] for key in keys if frame.get(key) is not None), None)
+            beside[kind] = None
+            if listed is None:
+                continue
+            if not isinstance(listed, str):
+                raise InputError(f"{where}: {keys[0]} must be a path, got {str(listed)[:40]!r}")
+            found = inside(root, listed, where, allow_outside=allow_outside)
+            if found.is_file():
+                beside[kind] = found
+            else:
+                missing[kind].append(listed)
+        camera = _camera(data, frame, image, where)
+        stated = number(data | frame, "depth_unit_scale_factor", where)
+        if frame.get("depth_file_path") is None:
+            stated = number(data | frame, "integer_depth_scale", where) if frame.get("depth_path") else None
+        elif stated is not None:
+            metric_depth = True
+        scale = next(value for value in (depth_scale, stated, NERFSTUDIO_DEPTH_SCALE) if value is not None)
+        if not 0 < scale < math.inf:
+            raise InputError(f"{where}: the depth scale must be positive, got {scale}")
+        pose = rigid_pose(_matrix(frame.get("transform_matrix"), where), where)
+        images.append(
+            PosedImage(
+                name=name,
+                camera=camera,
+                cam_from_world=inverse_rigid(pose @ _OPENCV_FROM_OPENGL),
+                image=image,
+                depth=beside["depth"],
+                depth_scale=scale,
+                mask=beside["mask"],
+                instance=beside["instance"],
+            )
+        )
+    total = len(frames)
+    if not images:
+        raise InputError(f"{path}: none of the {total} listed images exists (first: {missing['image'][0][:200]!r})")
+    warn_left_out(missing["image"], total, source, "listed images", "their frames are left out")
+    warn_left_out(missing["depth"], total, source, "listed depth files", "those views have no depth")
+    warn_left_out(missing["mask"], total, source, "listed masks", "all pixels of those views are used")
+    warn_left_out(missing["instance"], total, source, "listed instance maps", "those views have no instances")
+    metres = number(data, "metres_per_unit", str(path))
+    if metres is not None and metres <= 0:
+        raise InputError(f"{path}: metres_per_unit must be positive, got {metres:g}")
+    return PosedImages(
+        source=str(path),
+        images=tuple(images),
+        metres_per_unit=metres if metres is not None else (1.0 if metric_depth else None),
+        up=_up(data.get("up"), path)
+        if data.get("up") is not None
+        else (np.array([0, 0, 1.0]) if metric_depth else None),
+    )
+
+
+def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
+    """The file of a frame; Blender leaves the suffix away."""
+    for suffix in ("", *GUESSED_SUFFIXES):
+        found = inside(root, name + suffix, where, allow_outside=allow_outside)
+        if found.is_file():
+            return found
+    return None
+
+
+def _matrix(value: object, where: str) -> Float64[np.ndarray, "4 4"]:
+    rows = value if isinstance(value, list) else []
+    good = len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)
+    if not good:
+        raise InputError(f"{where}: transform_matrix must have 4 rows (or the upper 3) of 4 numbers")
+    matrix = np.eye(4)
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            found = number({"transform_matrix": entry}, "transform_matrix", where)
+            if found is None:
+                raise InputError(f"{where}: transform_matrix has an empty entry in row {i}")
+            matrix[i, j] = found
+    return matrix
+
+
+def _up(value: object, path: Path) -> Float64[np.ndarray, "3"]:
+    if not isinstance(value, list) or len(value) != 3:
+        raise InputError(f"{path}: up must be three numbers")
+    parts = [number({"up": entry}, "up", str(path)) for entry in value]
+    up = np.array([np.nan if part is None else part for part in parts])
+    length = math.hypot(*up.tolist())
+    if not 1e-6 < length < 1e6:
+        raise InputError(f"{path}: up must be three finite numbers that are not all zero, got {value}")
+    return up / length
+
+
+def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> CameraModel:
+    """The intrinsics of a frame: its own values first, then the file's."""
+    both = data | {key: value for key, value in frame.items() if value is not None}
+    size = []
+    for key, actual in zip(("w", "h"), picture_size(image), strict=True):
+        stated = number(both, key, where)
+        if stated is not None and stated != actual:
+            raise InputError(
+                f"{where}: {key} is {stated:g} but the image {image} has {actual} pixels; give the images at the size "
+                "of the intrinsics (image_scale makes them smaller on load)"
+            )
+        size.append(actual)
+    w, h = size
+    fx = _focal(data, frame, "fl_x", "camera_angle_x", w, where)
+    fy = _focal(data, frame, "fl_y", "camera_angle_y", h, where)
+    if fx is None and fy is None:
+        raise InputError(f"{where}: no focal length; expected fl_x, or camera_angle_x in radians")
+    cx, cy = number(both, "cx", where), number(both, "cy", where)
+    k1, k2, k3, k4, p1, p2 = (number(both, key, where) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    assert fx is not None
+    assert fy is not None
+    base = (fx, fy, w / 2 if cx is None else cx, h / 2 if cy is None else cy)
+    model = both.get("camera_model", "")
+    if not isinstance(model, str):
+        raise InputError(f"{where}: camera_model must be a name, got {str(model)[:40]!r}")
+    if model == "OPENCV_FISHEYE" or (model in PERSPECTIVE and both.get("is_fisheye") is True):
+        if p1 or p2:
+            raise InputError(f"{where}: p1 and p2 do not belong to OPENCV_FISHEYE")
+        camera = CameraModel(model="OPENCV_FISHEYE", width=w, height=h, params=(*base, k1, k2, k3, k4))
+    elif model not in PERSPECTIVE:
+        raise InputError(f"{where}: camera model {model[:40]!r} is not supported; expected OPENCV or OPENCV_FISHEYE")
+    elif k4:
+        raise InputError(f"{where}: k4 of a perspective camera has no agreed meaning; expected k1, k2, k3, p1, p2")
+    elif k3:
+        camera = CameraModel(model="FULL_OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    else:
+        camera = CameraModel(model="OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2))
+    check_camera(camera, where)
+    return camera
+
+
+def _focal(data: dict[str, Any], frame: dict[str, Any], length: str, angle: str, side: int, where: str) -> float | None:
+    """A focal length in pixels from a length or, where there is none, a full field of view in radians."""
+    for values in (frame, data):
+        focal = number(values, length, where)
+        if focal is not None:
+            return focal
+        field = number(values, angle, where)
+        if field is not None:
+            if not 0 < field < math.pi:
+                raise InputError(f"{where}: {angle} must lie between 0 and pi radians, got {field:g}")
+            return side / (2 * math.tan(field / 2))
+    return None

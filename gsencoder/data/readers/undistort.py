@@ -1,0 +1,285 @@
+"""Lens distortion: which pinhole camera replaces a distorted one, and where each of its pixels lies in the file.
+
+The centre of every pinhole pixel is turned into a ray and projected through the distorted model by pycolmap, so the
+map is exact; nothing is fitted. A pixel is used only if that ray lies within 85° of the axis, lands inside the
+picture, and is what the model gives back when it is inverted there: a polynomial that folds over itself puts several
+rays on one pixel, and only the innermost is real.
+
+The pinhole keeps the picture's size and principal point. Both focal lengths are multiplied by one zoom, the smallest
+between 0.7 and 1.3 at which the whole pinhole picture is covered by the distorted one. Where no such zoom exists it is
+1, and the pixels without content are masked. The optical centre and the axes stay, so poses and depths do too.
+"""
+
+import math
+import signal
+import sys
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from gsencoder.core.errors import InputError
+
+MAX_HALF_FIELD = math.radians(85)
+"""Rays further from the optical axis than this (a field of view of 170°) are not used."""
+MIN_ZOOM, MAX_ZOOM = 0.7, 1.3
+MIN_USED = 0.5
+"""A camera of which fewer pixels than this share can be undistorted is refused."""
+MAX_SIDE = 65_535
+PIXEL_TOLERANCE = 0.01
+"""How far, in pixels, a ray may come back from its place when a model is inverted there."""
+
+_FOCALS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 1, "RADIAL": 1, "SIMPLE_FISHEYE": 1, "SIMPLE_RADIAL_FISHEYE": 1}
+_FOCALS |= {"RADIAL_FISHEYE": 1, "SIMPLE_DIVISION": 1}
+_FOCALS |= dict.fromkeys(
+    ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "FOV", "FISHEYE", "EUCM", "DIVISION"), 2
+)
+_FOCALS |= dict.fromkeys(("THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"), 2)
+_STRAIGHT_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraModel:
+    """A camera as a file describes it, distortion included.
+
+    Attributes:
+        model: one of COLMAP's camera model names.
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+        params: COLMAP's parameters of that model: focal lengths, principal point (pixel centres at .5), distortion.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True where there is no distortion to remove."""
+        distortion = self.params[_FOCALS.get(self.model, 2) + 2 :]
+        return self.model in ("PINHOLE", "SIMPLE_PINHOLE") or (self.model in _STRAIGHT_AT_ZERO and not any(distortion))
+
+    def pinhole_params(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy) of the model, distortion left out."""
+        if _FOCALS[self.model] == 1:
+            return (self.params[0], *self.params[:3])  # type: ignore[return-value]
+        return self.params[:4]  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pinhole:
+    """A camera without distortion, in pixels, pixel centres at .5."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def matrix(self, width: int, height: int) -> Float64[np.ndarray, "3 3"]:
+        """K for the same picture resized to width × height."""
+        sx, sy = width / self.width, height / self.height
+        return np.array([[self.fx * sx, 0, self.cx * sx], [0, self.fy * sy, self.cy * sy], [0, 0, 1]])
+
+
+def check_camera(camera: CameraModel, where: str) -> None:
+    """Raises InputError where the camera cannot be used; `where` begins the message."""
+    if camera.model not in _FOCALS:
+        raise InputError(
+            f"{where}: camera model {camera.model} cannot be undistorted to a pinhole within 170°; "
+            f"convert the images to one of {', '.join(sorted(_FOCALS))}"
+        )
+    if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
+        raise InputError(
+            f"{where}: picture size {camera.width}×{camera.height}, expected 1 to {MAX_SIDE} pixels a side"
+        )
+    if len(camera.params) < _FOCALS[camera.model] + 2 or not all(map(math.isfinite, camera.params)):
+        raise InputError(f"{where}: intrinsics of {camera.model} must be finite numbers, got {list(camera.params)}")
+    fx, fy, cx, cy = camera.pinhole_params()
+    side = max(camera.width, camera.height)
+    # A fisheye lens that sees half of the world has a focal length of a third of its picture.
+    if not (min(fx, fy) >= 1e-4 * side and max(fx, fy, abs(cx), abs(cy)) <= 1e4 * side):
+        raise InputError(
+            f"{where}: focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is not a camera's; "
+            f"expected pixels, focal lengths of at least {1e-4 * side:g} and none beyond {1e4 * side:g}"
+        )
+    if camera.is_pinhole:
+        half = max(abs(side_x) / fx for side_x in (cx, camera.width - cx))
+        half = max(half, max(abs(side_y) / fy for side_y in (cy, camera.height - cy)))
+        if half > math.tan(MAX_HALF_FIELD):
+            raise InputError(f"{where}: focal length {fx:g}, {fy:g} gives a field of view beyond 170°")
+    else:
+        _colmap_camera(camera, where)
+
+
+def load_pycolmap() -> Any:
+    """The pycolmap module, which must be imported through here and nowhere else.
+
+    Its wheel for Linux (4.2.1) exports zlib's functions and depends on the system's libz. If it is what loads libz,
+    libz calls into it, and the next zlib stream of anyone (a PNG written by Pillow, zlib.compress) aborts the process.
+    Loading libz first, through Python's own module, keeps the two apart. It also puts handlers of its own over those of
+    signals, which end the process with a page of addresses and none of the cleaning up; ours are put back.
+    """
+    import zlib  # noqa: F401
+
+    first = "pycolmap" not in sys.modules
+    import pycolmap
+
+    if first and threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP", "SIGINT"):
+            handler = signal.getsignal(getattr(signal, name)) if hasattr(signal, name) else None
+            if handler is not None:
+                signal.signal(getattr(signal, name), handler)
+    return pycolmap
+
+
+def _colmap_camera(camera: CameraModel, where: str) -> Any:
+    pycolmap = load_pycolmap()
+    # pycolmap reads past the end of a short parameter list unless it is checked first.
+    made = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
+    if not made.verify_params():
+        raise InputError(f"{where}: {len(camera.params)} parameters do not fit the camera model {camera.model}")
+    return made
+
+
+def _project(
+    camera: CameraModel, fx: float, fy: float, cx: float, cy: float, pixels: Float64[np.ndarray, "P 2"]
+) -> tuple[Float64[np.ndarray, "P 2"], Bool[np.ndarray, " P"]]:
+    """Where pixels of the pinhole (fx, fy, cx, cy) lie in the distorted picture, and which of them are usable."""
+    rays = np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))])
+    used = np.hypot(rays[:, 0], rays[:, 1]) <= math.tan(MAX_HALF_FIELD)
+    if camera.is_pinhole:
+        f_x, f_y, c_x, c_y = camera.pinhole_params()
+        where = rays[:, :2] * (f_x, f_y) + (c_x, c_y)
+    else:
+        made = _colmap_camera(camera, camera.model)
+        where = np.asarray(made.img_from_cam(rays), dtype=np.float64)
+        back = np.asarray(made.cam_from_img(np.nan_to_num(where)), dtype=np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            used &= (np.abs(back - rays[:, :2]) * (fx, fy)).max(axis=1) <= PIXEL_TOLERANCE
+    with np.errstate(invalid="ignore"):
+        used &= (where >= 0).all(axis=1) & (where <= (camera.width, camera.height)).all(axis=1)
+    return where, used
+
+
+def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
+    """The pinhole camera that stands for `camera` (see the head of this file).
+
+    Raises:
+        InputError: fewer than half of its pixels would have content; `where` begins the message.
+    """
+    check_camera(camera, where)
+    fx, fy, cx, cy = camera.pinhole_params()
+    w, h = camera.width, camera.height
+    zoom = 1.0
+    if not camera.is_pinhole:
+        across, down = np.arange(w) + 0.5, np.arange(h) + 0.5
+        border = [np.column_stack([across, np.full(w, y)]) for y in (0.5, h - 0.5)]
+        border += [np.column_stack([np.full(h, x), down]) for x in (0.5, w - 0.5)]
+        rim = np.concatenate(border)
+
+        def covered(zoom: float) -> bool:
+            return bool(_project(camera, fx * zoom, fy * zoom, cx, cy, rim)[1].all())
+
+        if covered(MIN_ZOOM):
+            zoom = MIN_ZOOM
+        elif covered(MAX_ZOOM):
+            low, high = MIN_ZOOM, MAX_ZOOM
+            for _ in range(14):
+                middle = (low + high) / 2
+                low, high = (low, middle) if covered(middle) else (middle, high)
+            zoom = high
+        coarse = np.stack(np.meshgrid(np.linspace(0.5, w - 0.5, 33), np.linspace(0.5, h - 0.5, 33)), -1).reshape(-1, 2)
+        used = _project(camera, fx * zoom, fy * zoom, cx, cy, coarse)[1].mean()
+        if used < MIN_USED:
+            raise InputError(
+                f"{where}: {camera.model} with {list(camera.params)} can be inverted on only {used:.0%} of its pixels "
+                "within 170°; check the calibration, or undistort the images yourself"
+            )
+    return Pinhole(fx=fx * zoom, fy=fy * zoom, cx=cx, cy=cy, width=w, height=h)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Remap:
+    """For each pixel of a pinhole picture its place in the file's picture; NaN where it has none.
+
+    Attributes:
+        x: columns in the file's picture, pixel centres at .5.
+        y: rows in the file's picture.
+    """
+
+    x: Float32[np.ndarray, "H W"]
+    y: Float32[np.ndarray, "H W"]
+
+    @property
+    def valid(self) -> Bool[np.ndarray, "H W"]:
+        return np.isfinite(self.x)
+
+    def bilinear(self, picture: np.ndarray) -> np.ndarray:
+        """uint8 [h, w, C] resampled to [H, W, C]; pixels without content are black. Edges are repeated half a pixel."""
+        h, w, channels = picture.shape
+        x = np.clip(np.nan_to_num(self.x) - np.float32(0.5), 0, w - 1)
+        y = np.clip(np.nan_to_num(self.y) - np.float32(0.5), 0, h - 1)
+        left, top = np.minimum(x.astype(np.int32), max(w - 2, 0)), np.minimum(y.astype(np.int32), max(h - 2, 0))
+        fx, fy = x - left, y - top
+        at, right, below = top * w + left, int(w > 1), w if h > 1 else 0
+        mixed = np.empty((*x.shape, channels), np.uint8)
+        # One channel at a time is nearly twice as fast as gathering triples.
+        for channel in range(channels):
+            flat = picture[..., channel].astype(np.float32).reshape(-1)
+            upper, lower = flat[at], flat[at + below]
+            upper += (flat[at + right] - upper) * fx
+            lower += (flat[at + below + right] - lower) * fx
+            upper += (lower - upper) * fy
+            mixed[..., channel] = upper + np.float32(0.5)
+        mixed[~self.valid] = 0
+        return mixed
+
+    def nearest(self, picture: np.ndarray) -> np.ndarray:
+        """[h, w] of any type resampled to [H, W] without mixing values; pixels without content are zero."""
+        h, w = picture.shape
+        column = np.clip(np.nan_to_num(self.x), 0, w - 1).astype(np.int32)
+        row = np.clip(np.nan_to_num(self.y), 0, h - 1).astype(np.int32)
+        taken = picture.reshape(-1)[row * w + column]
+        taken[~self.valid] = 0
+        return taken
+
+
+def build_remap(target: Pinhole, source: CameraModel) -> Remap:
+    """The exact map from the pixels of `target` to those of `source`, both looking from the same place."""
+    x, y = np.meshgrid(np.arange(target.width) + 0.5, np.arange(target.height) + 0.5)
+    pixels = np.column_stack([x.reshape(-1), y.reshape(-1)])
+    where, used = _project(source, target.fx, target.fy, target.cx, target.cy, pixels)
+    where[~used] = np.nan
+    grid = where.astype(np.float32).reshape(target.height, target.width, 2)
+    return Remap(x=np.ascontiguousarray(grid[..., 0]), y=np.ascontiguousarray(grid[..., 1]))
+
+
+class RemapCache:
+    """The remaps of one scene, one a camera and not one a picture, kept up to `budget` bytes; the one unused
+    for longest is dropped first."""
+
+    def __init__(self, budget: int = 256 << 20) -> None:
+        self._budget = budget
+        self._kept: dict[tuple[Pinhole, CameraModel], Remap] = {}
+
+    def get(self, target: Pinhole, source: CameraModel) -> Remap | None:
+        """The remap, or None where the pictures are the same pixel for pixel."""
+        if (
+            source.is_pinhole
+            and (target.width, target.height) == (source.width, source.height)
+            and (target.fx, target.fy, target.cx, target.cy) == source.pinhole_params()
+        ):
+            return None
+        found = self._kept.pop((target, source), None)
+        if found is None:
+            found = build_remap(target, source)
+            size = found.x.nbytes + found.y.nbytes
+            while self._kept and sum(r.x.nbytes + r.y.nbytes for r in self._kept.values()) + size > self._budget:
+                del self._kept[next(iter(self._kept))]
+        self._kept[(target, source)] = found
+        return found

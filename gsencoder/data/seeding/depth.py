@@ -1,0 +1,205 @@
+"""RGB-D frames to oriented surface samples: back-projection, normals, rejection of pixels that float at edges.
+
+Everything local is done on inverse depth w = 1/z, because a plane n·x = −c seen through a pinhole is
+w = −n·r / c with the ray r = (u', v', 1): linear in the pixel. Its normal is then read off the gradient,
+n ∝ −(∂w/∂u', ∂w/∂v', w − u' ∂w/∂u' − v' ∂w/∂v'), and always faces the camera, because n·r ∝ −w < 0.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from gsencoder.core.errors import InputError, about
+from gsencoder.data.seeding.surface_grid import SurfaceGrid, SurfaceSamples
+from gsencoder.types import Cameras, Views
+
+LINEAR = 3.0
+"""A second difference of inverse depth within this many of its noise's standard deviations counts as zero."""
+RELATIVE_FLOOR = 1e-3
+"""… and so does one below this share of the view's mean inverse depth."""
+SMOOTHING_RADIUS = 2
+"""Half width in pixels of the window over which inverse depth is averaged."""
+BETWEEN = 0.3
+"""A pixel floats between two surfaces if the steps beyond its neighbours are below this share of those towards them."""
+OCCLUSION = 0.01
+"""A pixel lies behind its neighbour's outline if that is nearer by this share of its depth, 15 mm at 1.5 m."""
+
+SMALLEST_DEPTH, LARGEST_DEPTH = 1e-9, 1e12
+"""Depths outside are taken for a wrong scale, world units."""
+
+
+class SurfacePixels(NamedTuple):
+    """What one depth image says about the surfaces in it.
+
+    Attributes:
+        depth: z after smoothing, world units.
+        normals: unit, camera axes, towards the camera.
+        use: pixels that lie on a surface.
+    """
+
+    depth: Float32[np.ndarray, "H W"]
+    normals: Float32[np.ndarray, "H W 3"]
+    use: Bool[np.ndarray, "H W"]
+
+
+def surface_pixels(
+    depth: Float32[np.ndarray, "H W"], K: Float32[np.ndarray, "3 3"], *, min_cos: float = 0.1
+) -> SurfacePixels:
+    """Smooths a depth image within its own noise, finds normals, and drops pixels that lie on no surface.
+
+    Dropped are pixels without depth; pixels that lie between the two surfaces at a depth edge, since sensors mix both
+    there; pixels just behind an outline, whose colour is mixed with the nearer thing's; and surfaces seen at a slant
+    beyond arccos(min_cos). The nearer side of an edge is kept: thin things consist of such pixels.
+    """
+    valid = depth > 0
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=valid)
+    floor = RELATIVE_FLOOR * float(inverse.mean(where=valid)) if valid.any() else 0.0
+    step = np.float32(max(LINEAR * _second_difference_noise(inverse, valid), floor))
+    inverse = _smooth(inverse, valid, step)
+    along_u, float_u = _gradient(inverse, valid, step)
+    along_v, float_v = _gradient(inverse.T, valid.T, step)
+    along_u, along_v = along_u * K[0, 0], along_v.T * K[1, 1]
+    ray_u, ray_v = _rays(depth.shape, K)
+    normals = np.stack([-along_u, -along_v, ray_u * along_u + ray_v * along_v - inverse], axis=-1)
+    length = np.sqrt(np.einsum("ijk,ijk->ij", normals, normals))
+    normals /= np.maximum(length, np.float32(1e-30))[..., None]
+    ray_length = np.sqrt(ray_u * ray_u + ray_v * ray_v + 1)
+    use = valid & ~float_u & ~float_v.T & (inverse > np.float32(min_cos) * length * ray_length)
+    smooth = np.divide(1, inverse, out=np.zeros_like(depth), where=valid)
+    return SurfacePixels(smooth, normals, use)
+
+
+def depth_samples(
+    views: Views, *, voxel: float, min_cos: float = 0.1, max_depth: float | None = None
+) -> tuple[SurfaceSamples, list[str]]:
+    """Surface samples of all RGB-D frames on a grid of `voxel` world units, one view in memory at a time.
+
+    Returns the samples and the names of the views that gave none. Raises InputError where there is no depth or image,
+    or one has the wrong size or is not finite.
+    """
+    if not len(views):
+        raise InputError("seeds: the scene has no views; seeds from depth need posed RGB-D frames")
+    if views.depths is None:
+        raise InputError("seeds: the scene has no depth images; use source=points or source=mesh")
+    if views.images is None:
+        raise InputError("seeds: the scene has depth but no images, and seeds take their colour from the photographs")
+    grid = SurfaceGrid(voxel, np.median(views.cameras.centers, axis=0))
+    empty = []
+    for view, name in enumerate(views.names):
+        depth, image = read_rgbd(views, view)
+        if views.masks is not None:
+            depth = np.where(views.masks[view], depth, np.float32(0))
+        if max_depth is not None:
+            depth = np.where(depth <= max_depth, depth, np.float32(0))
+        pixels = surface_pixels(depth, views.cameras.Ks[view], min_cos=min_cos)
+        if not pixels.use.any():
+            empty.append(name)
+            continue
+        points, normals = _to_world(pixels, views.cameras, view)
+        with about(f"view {name!r}"):
+            grid.add(points, normals, image[pixels.use])
+    return grid.samples(), empty
+
+
+def read_rgbd(views: Views, view: int) -> tuple[Float32[np.ndarray, "H W"], UInt8[np.ndarray, "H W 3"]]:
+    """Depth and image of one view. Raises InputError naming the view where they cannot be used."""
+    assert views.depths is not None
+    assert views.images is not None
+    depth, image = views.depths[view], views.images[view]
+    size = (int(views.cameras.heights[view]), int(views.cameras.widths[view]))
+    for kind, array in (("depth", depth), ("image", image)):
+        if array.shape[:2] != size:
+            got, wanted = "×".join(map(str, array.shape[1::-1])), f"{size[1]}×{size[0]}"
+            raise InputError(f"view {views.names[view]!r}: the {kind} is {got}, but its camera says {wanted}")
+    bad = np.count_nonzero(~np.isfinite(depth) | (depth < 0))
+    if bad:
+        raise InputError(
+            f"view {views.names[view]!r}: {bad} of {depth.size} depths are NaN, infinite or negative; "
+            "write 0 where there is no depth"
+        )
+    # Beyond this their inverses, and lengths in voxels, leave float32.
+    far = np.count_nonzero((depth > 0) & ~((depth >= SMALLEST_DEPTH) & (depth <= LARGEST_DEPTH)))
+    if far:
+        raise InputError(
+            f"view {views.names[view]!r}: {far} of {depth.size} depths lie outside {SMALLEST_DEPTH:g} to "
+            f"{LARGEST_DEPTH:g} world units; check the depth scale"
+        )
+    return depth, image
+
+
+def _second_difference_noise(inverse: np.ndarray, valid: np.ndarray) -> float:
+    """Standard deviation of the noise in second differences of inverse depth along the rows.
+
+    They vanish on planes but for noise, and the quartile ignores the edges. Rounding to millimetres is noise too, but
+    most of its second differences are 0, which is why the median would not do.
+    """
+    inside = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:]
+    second = np.abs(inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:])[inside]
+    return float(np.quantile(second, 0.75)) / 1.1503 if second.size else 0.0
+
+
+def _smooth(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> np.ndarray:
+    """Mean over a window, taken in pairs of opposite pixels whose line passes the centre within `step`.
+
+    Pairs keep a plane a plane however steep it is: what one side adds, the other takes off.
+    """
+    height, width = inverse.shape
+    total, weight = inverse.copy(), np.ones_like(inverse)
+    for dy in range(min(SMOOTHING_RADIUS, (height - 1) // 2) + 1):
+        reach = min(SMOOTHING_RADIUS, (width - 1) // 2)
+        for dx in range(-reach if dy else 1, reach + 1):
+            left, right = abs(dx), width - abs(dx)
+            here = (slice(dy, height - dy), slice(left, right))
+            ahead = (slice(2 * dy, height), slice(left + dx, right + dx))
+            behind = (slice(0, height - 2 * dy), slice(left - dx, right - dx))
+            pair = inverse[ahead] + inverse[behind]
+            fits = valid[ahead] & valid[behind] & (np.abs(pair - 2 * inverse[here]) < step)
+            total[here] += pair * fits
+            weight[here] += 2 * fits
+    return total / weight
+
+
+def _gradient(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient along the rows, [H, W], and the pixels that float between two surfaces or show beside a nearer one.
+
+    Central where the three pixels lie on a line within `step`; at an edge the smaller one-sided step, which stays on
+    the pixel's own surface; zero where the pixel is a peak between two edges.
+    """
+    known = valid[:, 1:] & valid[:, :-1]
+    steps = np.diff(inverse, axis=1) * known
+    none = np.zeros((len(inverse), 1), inverse.dtype)
+    before, after = np.hstack([none, steps]), np.hstack([steps, none])
+    never = none.astype(bool)
+    has_before, has_after = np.hstack([never, known]), np.hstack([known, never])
+    both = has_before & has_after
+    size_before, size_after = np.abs(before), np.abs(after)
+    smaller = np.minimum(size_before, size_after)
+    line = both & (np.abs(after - before) < step)
+    opposite = both & (before * after < 0) & (smaller > step)
+    one_sided = np.where(~has_after | (has_before & (size_before < size_after)), before, after)
+    gradient = np.where(line, (before + after) / 2, np.where(opposite, np.float32(0), one_sided))
+    # The surfaces that a floating pixel lies between go on beside it, less steep than the steps towards it.
+    flatter = (
+        np.maximum(np.hstack([none, size_before[:, :-1]]), np.hstack([size_after[:, 1:], none])) < BETWEEN * smaller
+    )
+    between = both & (before * after > 0) & (smaller > step) & flatter
+    # How much nearer the neighbour is, beyond what the pixel's own surface explains by its slope on the other side.
+    edge = np.maximum(step, np.float32(OCCLUSION) * inverse)
+    behind = both & ((np.maximum(after, -before) > edge + 3 * smaller) | ((after > edge) & (-before > edge)))
+    return gradient, between | behind
+
+
+def _rays(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x/z of each column [1, W] and y/z of each row [H, 1]."""
+    u = (np.arange(shape[1], dtype=np.float32) + np.float32(0.5) - K[0, 2]) / K[0, 0]
+    v = (np.arange(shape[0], dtype=np.float32) + np.float32(0.5) - K[1, 2]) / K[1, 1]
+    return u[None, :], v[:, None]
+
+
+def _to_world(pixels: SurfacePixels, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
+    """World positions and normals of the used pixels, float32 [n, 3] each."""
+    ray_u, ray_v = _rays(pixels.depth.shape, cameras.Ks[view])
+    local = np.stack([ray_u * pixels.depth, ray_v * pixels.depth, pixels.depth], axis=-1)[pixels.use]
+    rotation = cameras.cam_from_world[view, :3, :3]  # Row vectors times R are Rᵀ times column vectors.
+    return local @ rotation + cameras.centers[view].astype(np.float32), pixels.normals[pixels.use] @ rotation

@@ -1,0 +1,211 @@
+"""Initial Gaussians of a scene without optimisation (SplatDistill, section 3.1: surface samples on a 2 cm grid).
+
+One flat Gaussian stands on each piece of surface in each voxel, as wide as its neighbours are apart, in the colour
+that the photographs show. Such a splat renders well enough for features to be lifted onto it at once.
+"""
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.even_indices import evenly
+from gsencoder.data.readers.scene_splat import file_of_scene
+from gsencoder.data.seeding.depth import depth_samples, read_rgbd
+from gsencoder.data.seeding.flat import flat_gaussians
+from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
+from gsencoder.data.seeding.points import seed_from_points, typical_spacing
+from gsencoder.types import Gaussians, Scene, Views
+
+__all__ = ["SeedConfig", "seed", "seed_from_depth", "seed_from_mesh", "seed_from_points", "seed_from_tsdf"]
+
+LARGEST_SPACING = 4.0
+"""Upper limit of a Gaussian's spacing in voxels, for surfaces that the frames sample more coarsely than the grid."""
+TYPICAL_DEPTH_IN_VOXELS = 100
+"""Depth images without a unit: their median depth is taken to be this many voxels, as 2 m are of 2 cm."""
+EXTENT_IN_VOXELS = 300
+"""A mesh without a unit and without cameras: the diagonal of its box is taken to be this many voxels."""
+
+
+SAMPLED_VIEWS = 8
+"""So many depth images are read for that estimate."""
+
+SMALLEST_VOXEL, LARGEST_VOXEL = 1e-12, 1e12
+"""In units of the scene."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeedConfig:
+    """How Gaussians are made from what a scene holds."""
+
+    source: Literal["auto", "depth", "points", "mesh", "tsdf"] = field(
+        default="auto",
+        metadata={
+            "help": "depth = RGB-D frames; points = structure-from-motion points; mesh = a file; tsdf = RGB-D frames "
+            "fused to a mesh first; auto = depth if the views have it, else points"
+        },
+    )
+    voxel: float = field(default=0.02, metadata={"help": "edge of the grid in metres"})
+    voxel_units: float | None = field(
+        default=None, metadata={"help": "edge of the grid in the scene's own units, where its unit is unknown"}
+    )
+    mesh: str = field(
+        default="",
+        metadata={"help": "the file of source=mesh, in world coordinates: in each scene's folder, else from here"},
+    )
+    min_cos: float = field(
+        default=0.1, metadata={"help": "surfaces seen at a slant beyond arccos(min_cos) are not taken from depth"}
+    )
+    max_depth: float | None = field(
+        default=None, metadata={"help": "depths beyond, in metres (scene units where unknown), are not used"}
+    )
+
+    def __post_init__(self) -> None:
+        if self.source not in ("auto", "depth", "points", "mesh", "tsdf"):
+            raise InputError(f"source must be auto, depth, points, mesh or tsdf, got {self.source!r}")
+        for name in ("voxel", "voxel_units", "max_depth"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{name} must be a positive length, got {value}")
+        if not 0 <= self.min_cos < 1:
+            raise InputError(f"min_cos must lie in [0, 1), got {self.min_cos}")
+        if self.source == "mesh" and not self.mesh:
+            raise InputError("source=mesh needs the mesh's file (mesh=PATH)")
+
+
+def seed(scene: Scene, config: SeedConfig = SeedConfig()) -> Gaussians:
+    """Initial Gaussians of a scene, relative to its origin; the scene's own Gaussians are not looked at.
+
+    The voxel is `config.voxel` metres. Where the scene's unit is unknown it is, with a warning, for depth images one
+    hundredth of the median depth, for points their median nearest-neighbour distance, for a mesh one hundredth of the
+    median distance from the cameras to its middle, or one 300th of its diagonal.
+
+    Raises:
+        InputError: the scene does not hold what the source needs, or it cannot be used.
+    """
+    source, views = config.source, scene.views
+    if source == "auto":
+        source = "depth" if views is not None and views.depths is not None else "points"
+        if source == "points" and scene.sfm_points is None:
+            raise InputError(
+                f"seeds: scene {scene.name!r} has neither depth images nor structure-from-motion points; "
+                "give a mesh (source=mesh mesh=PATH) or a splat"
+            )
+    if source == "points":
+        points = scene.sfm_points
+        if points is None:
+            raise InputError(f"seeds: scene {scene.name!r} has no structure-from-motion points")
+        voxel = _voxel(scene, config, lambda: typical_spacing(points), "the points' median nearest-neighbour distance")
+        return seed_from_points(points, scene.sfm_colors, views=views, voxel=voxel)
+    if source == "mesh":
+        mesh = config.mesh if scene.folder is None else file_of_scene("seeds.mesh", config.mesh, scene.folder)
+        voxel = _voxel(
+            scene, config, lambda: _mesh_voxel(scene, mesh), "estimated from the mesh's size and the cameras"
+        )
+        return seed_from_mesh(mesh, voxel=voxel, origin=scene.origin)
+    if views is None:
+        raise InputError(f"seeds: scene {scene.name!r} has no views; source={source} needs posed RGB-D frames")
+    voxel = _voxel(scene, config, lambda: _depth_voxel(views), "one hundredth of the median depth")
+    unit = scene.metres_per_unit or 1.0
+    max_depth = None if config.max_depth is None else config.max_depth / unit
+    if source == "tsdf":
+        return seed_from_tsdf(views, voxel=voxel, max_depth=max_depth)
+    return seed_from_depth(views, voxel=voxel, min_cos=config.min_cos, max_depth=max_depth)
+
+
+def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_depth: float | None = None) -> Gaussians:
+    """Flat Gaussians on the surfaces that RGB-D frames show, one for each surface in each voxel.
+
+    Frames are read one at a time. Depth is smoothed within its own noise; pixels that float between two surfaces are
+    dropped; samples are averaged by voxel, facing and layer (see surface_grid.py), so that thin objects keep their
+    edges. The result does not depend on the order of the views beyond rounding.
+
+    Args:
+        views: posed depth and images; masked pixels are not used.
+        voxel: edge of the grid, world units.
+        min_cos: surfaces seen at a slant beyond arccos(min_cos) are not taken.
+        max_depth: depths beyond are not used, world units; None = all.
+
+    Raises:
+        InputError: no views, no depth or images, sizes that differ, values that are not finite, no depth anywhere.
+    """
+    if not 0 < voxel < math.inf:
+        raise InputError(f"seeds: voxel must be a positive length, got {voxel}")
+    samples, empty = depth_samples(views, voxel=voxel, min_cos=min_cos, max_depth=max_depth)
+    if not len(samples.points):
+        raise InputError(
+            f"seeds: none of the {len(views)} depth images shows a surface (0 means no depth); "
+            "check the depth files and their scale"
+        )
+    if empty:
+        warnings.warn(
+            f"seeds: {len(empty)} of {len(views)} views have no usable depth (first: {empty[0]!r})",
+            SceneWarning,
+            stacklevel=2,
+        )
+    return flat_gaussians(samples.points, samples.normals, samples.colors, largest=LARGEST_SPACING * voxel)
+
+
+def _voxel(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:
+    """The voxel in scene units.
+
+    Raises:
+        InputError: it is so small or large that float32 cannot count in it: a wrong unit.
+    """
+    voxel = _voxel_in_units(scene, config, estimate, how)
+    if not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
+        raise InputError(
+            f"seeds: a voxel of {voxel:g} units of scene {scene.name!r} is outside {SMALLEST_VOXEL:g} to "
+            f"{LARGEST_VOXEL:g}; check voxel, voxel_units and metres_per_unit"
+        )
+    return voxel
+
+
+def _voxel_in_units(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:
+    if config.voxel_units is not None:
+        return config.voxel_units
+    if scene.metres_per_unit is not None:
+        return config.voxel / scene.metres_per_unit
+    voxel = estimate()
+    warnings.warn(
+        f"seeds: the unit of scene {scene.name!r} is unknown, so the voxel is {voxel:.4g} of its units, {how}; "
+        "give metres_per_unit= or voxel_units= to choose",
+        SceneWarning,
+        stacklevel=4,
+    )
+    return voxel
+
+
+def _depth_voxel(views: Views) -> float:
+    if not len(views) or views.depths is None or views.images is None:
+        raise InputError("seeds: the scene has no posed views with depth and images; use source=points or source=mesh")
+    some = evenly(len(views), SAMPLED_VIEWS)
+    depths = [depth[depth > 0] for depth in (read_rgbd(views, int(view))[0] for view in some)]
+    values = np.concatenate(depths)
+    if not values.size:
+        raise InputError(
+            f"seeds: {len(some)} of {len(views)} depth images were looked at, and none has a depth above 0"
+        )
+    return float(np.median(values)) / TYPICAL_DEPTH_IN_VOXELS
+
+
+def _mesh_voxel(scene: Scene, path: str | Path) -> float:
+    lower, upper = mesh_bounds(path)
+    if scene.views is not None and len(scene.views):
+        middle = (lower + upper) / 2 - scene.origin
+        return float(np.median(np.linalg.norm(scene.views.cameras.centers - middle, axis=1))) / TYPICAL_DEPTH_IN_VOXELS
+    return float(np.linalg.norm(upper - lower)) / EXTENT_IN_VOXELS
+
+
+def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig()) -> Scene:
+    """The scene, with seeds where it has no splat.
+
+    Raises:
+        InputError: there is nothing to seed from.
+    """
+    return scene if scene.gaussians is not None else replace(scene, gaussians=seed(scene, config))

@@ -1,0 +1,248 @@
+"""PLY headers, and the INRIA layout of Gaussians in them (the files that most trainers write).
+
+Reference: Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, 2023 (the layout is its code's).
+"""
+
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.splat_formats.raw import SH_COEFFICIENTS, RawSplat
+
+MAX_HEADER = 1 << 18
+_BLOCK = 1 << 12  # Rows a block: small enough that its columns are picked from cache.
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_REQUIRED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+             "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlyElement:
+    """One element of a header; `dtype` is None where a list property leaves the row size open."""
+
+    name: str
+    count: int
+    dtype: np.dtype | None
+    first_bad: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlyHeader:
+    """What a .ply says about itself. `start` is the offset of the data in bytes."""
+
+    encoding: str
+    elements: tuple[PlyElement, ...]
+    start: int
+
+    def element(self, name: str) -> PlyElement | None:
+        """The element called `name`, or None."""
+        return next((element for element in self.elements if element.name == name), None)
+
+
+def read_header(path: Path, stream: BinaryIO) -> PlyHeader:
+    """Parses the header at the start of `stream`; every way to be wrong is an InputError that names the line."""
+    head = stream.read(MAX_HEADER)
+    end = re.search(rb"\nend_header[ \t]*\r?\n", head)
+    if end is None:
+        raise InputError(
+            f"{path}: no 'end_header' line in the first {len(head):,} bytes; the .ply is truncated or damaged"
+        )
+    lines = head[: end.start()].decode("ascii", errors="replace").splitlines()
+    encoding, order = "", "<"
+    elements: list[tuple[str, int, list[tuple[str, str]], str]] = []
+    for number, line in enumerate(lines[1:], start=2):
+        words = line.split()
+        match words:
+            case [] | ["comment", *_] | ["obj_info", *_]:
+                continue
+            case ["format", "ascii" | "binary_little_endian" | "binary_big_endian", _] if not encoding:
+                encoding = words[1]
+                order = ">" if encoding == "binary_big_endian" else "<"
+            case ["element", name, digits] if digits.isascii() and digits.isdigit() and len(digits) < 20:
+                elements.append((name, int(digits), [], ""))
+            case ["property", "list", _, _, name] if elements:
+                elements[-1] = (*elements[-1][:3], name)
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1][2].append((name, order + _TYPES[kind]))
+            case _:
+                raise InputError(f"{path}: line {number} of the .ply header cannot be read: {line[:80]!r}")
+    if not encoding:
+        raise InputError(f"{path}: the .ply header has no usable 'format' line")
+    names = [name for name, *_ in elements]
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: the .ply header repeats an element: {', '.join(names)[:120]}")
+    parsed = []
+    for name, count, fields, list_name in elements:
+        if len({field for field, _ in fields}) != len(fields):
+            raise InputError(f"{path}: the .ply header repeats a property of element {name!r}")
+        dtype = None if list_name else np.dtype(fields)
+        parsed.append(PlyElement(name=name, count=count, dtype=dtype, first_bad=list_name))
+    return PlyHeader(encoding=encoding, elements=tuple(parsed), start=end.end())
+
+
+def element_start(path: Path, header: PlyHeader, name: str, size: int) -> int:
+    """Offset in bytes of a binary element, checked against the size of the file before anything is allocated."""
+    offset = header.start
+    for element in header.elements:
+        if element.dtype is None:
+            raise InputError(
+                f"{path}: element {element.name!r} has the list property {element.first_bad!r} before or in {name!r}; "
+                "expected a splat with plain numbers (a mesh .ply is not a splat)"
+            )
+        end = offset + element.count * element.dtype.itemsize
+        if element.name == name:
+            if end > size:
+                raise InputError(
+                    f"{path}: the header claims {element.count:,} rows of {name!r}, {end:,} bytes in all, but has "
+                    f"{size:,} ({end - size:,} missing); it is truncated or its header is wrong"
+                )
+            return offset
+        offset = end
+    raise InputError(f"{path}: the .ply has no element {name!r}; expected a Gaussian splat")
+
+
+def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> RawSplat:
+    """Gaussians from the element `vertex`: any order of properties, any number type, others ignored."""
+    vertex = header.element("vertex")
+    if vertex is None or vertex.dtype is None:
+        raise InputError(f"{path}: the .ply has no element 'vertex' of plain numbers; expected a Gaussian splat")
+    names = vertex.dtype.names or ()
+    missing = [name for name in _REQUIRED if name not in names]
+    if missing == ["scale_2"]:
+        raise InputError(f"{path}: has scale_0 and scale_1 only, a 2D splat (surfels); expected three scales")
+    if missing:
+        raise InputError(
+            f"{path}: the .ply lacks {', '.join(missing)}; expected a Gaussian splat, not a point cloud or mesh"
+        )
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in (0, 9, 24, 45, 72) or any(f"f_rest_{i}" not in names for i in range(rest)):
+        raise InputError(
+            f"{path}: has {rest} f_rest properties; expected f_rest_0 … with 0, 9, 24 or 45 of them (SH 0 to 3)"
+        )
+    per_channel = rest // 3
+    kept = min(per_channel + 1, SH_COEFFICIENTS[-1])
+    if kept < per_channel + 1:
+        warnings.warn(f"{path}: SH degree 4 was cut to degree 3", SceneWarning, stacklevel=2)
+
+    count = vertex.count
+    if header.encoding == "ascii":
+        rows = _ascii_rows(path, stream, header, vertex, size)
+    else:
+        stream.seek(element_start(path, header, "vertex", size))
+        rows = None
+    means = np.empty((count, 3), np.float64)
+    quats, scales = np.empty((count, 4), np.float32), np.empty((count, 3), np.float32)
+    opacities, sh = np.empty(count, np.float32), np.empty((count, kept, 3), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start in range(0, count, _BLOCK):
+            stop = min(start + _BLOCK, count)
+            block = np.fromfile(stream, vertex.dtype, stop - start) if rows is None else rows[start:stop]
+            if len(block) < stop - start:
+                raise InputError(f"{path}: ended while it was read, at row {start + len(block):,} of {count:,}")
+            for axis, name in enumerate("xyz"):
+                means[start:stop, axis] = block[name]
+            for axis in range(4):
+                quats[start:stop, axis] = block[f"rot_{axis}"]
+            for axis in range(3):
+                scales[start:stop, axis] = block[f"scale_{axis}"]
+                sh[start:stop, 0, axis] = block[f"f_dc_{axis}"]
+                for k in range(1, kept):
+                    sh[start:stop, k, axis] = block[f"f_rest_{axis * per_channel + k - 1}"]
+            opacities[start:stop] = block["opacity"]
+    return RawSplat(
+        means=means,
+        quats=quats,
+        log_scales=scales,
+        logit_opacities=opacities,
+        sh=sh,
+        format=f"INRIA .ply, {header.encoding}",
+    )
+
+
+def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElement, size: int) -> np.ndarray:
+    assert vertex.dtype is not None
+    names = vertex.dtype.names or ()
+    skipped = 0
+    for element in header.elements:
+        if element is vertex:
+            break
+        skipped += element.count
+    # A row has at least one digit and one separator a value.
+    if skipped + vertex.count * len(names) * 2 > size - header.start + 1:
+        raise InputError(
+            f"{path}: the header claims {vertex.count:,} rows of {len(names)} numbers, more than {size:,} bytes hold; "
+            "it is truncated or its header is wrong"
+        )
+    stream.seek(header.start)
+    lines = islice(stream, skipped, skipped + vertex.count)
+    if vertex.count == 0:
+        return np.empty(0, vertex.dtype)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # "input contained no data" becomes the count's error below.
+            table = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2, encoding="latin-1")
+    except ValueError as error:
+        raise InputError(f"{path}: a row of the ascii .ply cannot be read: {str(error)[:120]}") from error
+    if table.shape != (vertex.count, len(names)):
+        got = f"{table.shape[0]:,} rows of {table.shape[1]} numbers"
+        raise InputError(
+            f"{path}: expected {vertex.count:,} rows of {len(names)} numbers, got {got}; the file is truncated"
+        )
+    # Columns get names again; numbers stay float64, so that text with many digits keeps them.
+    return table.view(np.dtype([(name, np.float64) for name in names])).reshape(-1)
+
+
+def write_inria(
+    stream: BinaryIO, raw: RawSplat, *, double_means: bool, further: Mapping[str, Float32[np.ndarray, " N"]]
+) -> None:
+    """Writes binary little-endian rows x y z nx ny nz f_dc f_rest opacity scale rot; normals are 0.
+
+    `double_means` writes x y z as doubles, for scenes far from zero; everything else is float. `further` properties
+    follow.
+    """
+    rest = raw.sh.shape[1] - 1
+    position = "f8" if double_means else "f4"
+    names = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * rest)),
+    ]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), *further]
+    dtype = np.dtype([(name, "<" + (position if name in "xyz" else "f4")) for name in names])
+    words = {"<f8": "double", "<f4": "float"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(raw)}"]
+    lines += [f"property {words[dtype[name].str]} {name}" for name in names]
+    stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
+    for start in range(0, len(raw), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        block = np.zeros(len(raw.means[part]), dtype)
+        for axis, name in enumerate("xyz"):
+            block[name] = raw.means[part, axis]
+        for axis in range(3):
+            block[f"f_dc_{axis}"] = raw.sh[part, 0, axis]
+            block[f"scale_{axis}"] = raw.log_scales[part, axis]
+            for k in range(rest):
+                block[f"f_rest_{axis * rest + k}"] = raw.sh[part, k + 1, axis]
+        for axis in range(4):
+            block[f"rot_{axis}"] = raw.quats[part, axis]
+        block["opacity"] = raw.logit_opacities[part]
+        for name, values in further.items():
+            block[name] = values[part]
+        stream.write(block.tobytes())

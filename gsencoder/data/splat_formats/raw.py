@@ -1,0 +1,137 @@
+"""Splat values as files hold them: logarithms, logits, quaternions of any length, and every defect still in place.
+
+Nothing outside the splat files, `inspect` and `repair` sees these; all others get `Gaussians`.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Integer
+
+from gsencoder.core.errors import InputError
+
+LOGIT_LIMIT = 20.0
+"""Opacities 0 and 1 are written as this logit: 2e-9 away from the true value, and finite."""
+
+MAX_EXPANSION = 200
+"""A packed file may unpack to this many times its size …"""
+
+ALWAYS_ALLOWED = 16 << 20
+"""… or to this many bytes, whichever is more."""
+
+SH_COEFFICIENTS = (1, 4, 9, 16)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RawSplat:
+    """One splat as its file stores it; nothing is checked but the structure.
+
+    Attributes:
+        means: centres in the file's own coordinates.
+        quats: wxyz, of any length (INRIA files are not normalised).
+        log_scales: natural logarithms of the standard deviations; −inf where the file says 0 or less.
+        logit_opacities: logits; formats that store 0 … 255 give ±20 at the two ends.
+        sh: colour coefficients, degree-major, K = 1, 4, 9 or 16.
+        format: the file format in words.
+    """
+
+    means: Float64[np.ndarray, "N 3"]
+    quats: Float32[np.ndarray, "N 4"]
+    log_scales: Float32[np.ndarray, "N 3"]
+    logit_opacities: Float32[np.ndarray, " N"]
+    sh: Float32[np.ndarray, "N K 3"]
+    format: str
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    def select(self, rows: Bool[np.ndarray, " N"] | Integer[np.ndarray, " n"]) -> "RawSplat":
+        """The Gaussians of `rows` (indices or a mask), in that order."""
+        return replace(
+            self,
+            means=self.means[rows],
+            quats=self.quats[rows],
+            log_scales=self.log_scales[rows],
+            logit_opacities=self.logit_opacities[rows],
+            sh=self.sh[rows],
+        )
+
+
+def logits_from_opacities(opacities: Float[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]:
+    """ln(p / (1 − p)), held to ±`LOGIT_LIMIT` so that 0 and 1 stay finite."""
+    p = opacities.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logits = np.log(p) - np.log1p(-p)
+    return np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT).astype(np.float32)
+
+
+def opacities_from_logits(logits: Float32[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]:
+    """1 / (1 + e^−x), computed in float64."""
+    with np.errstate(over="ignore"):
+        return (1 / (1 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
+
+
+def logs_from_scales(scales: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    """Natural logarithms; −inf for zero and negative scales, NaN for NaN."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(np.maximum(scales.astype(np.float64), 0)).astype(np.float32)
+
+
+def quats_from_smallest_three(
+    largest: Integer[np.ndarray, " N"], others: Float[np.ndarray, "N 3"]
+) -> Float32[np.ndarray, "N 4"]:
+    """Unit quaternions from the index of their largest component and the other three in order.
+
+    The left-out component is √(1 − Σ others²), taken positive; the order of components is the caller's.
+    """
+    values = others.astype(np.float64)
+    missing = np.sqrt(np.maximum(0, 1 - np.square(values).sum(axis=1)))
+    quats = np.empty((len(values), 4), np.float32)
+    for column in range(4):
+        before = values[:, column - 1] if column > 0 else values[:, 0]
+        after = values[:, column] if column < 3 else values[:, 2]
+        quats[:, column] = np.where(largest == column, missing, np.where(largest < column, before, after))
+    return quats
+
+
+def unusable_rows(raw: RawSplat) -> dict[str, Bool[np.ndarray, " N"]]:
+    """Rows that cannot become Gaussians, by the name of the fix that mends them. A row is listed once.
+
+    nonfinite: NaN or Inf in means, quats or sh, NaN in log_scales or logit_opacities.
+    quats: norm below 1e-12, so there is no rotation.
+    scales: e^log_scale is 0, subnormal or infinite in float32.
+    opacities: infinite logits.
+    """
+    flat = raw.sh.reshape(len(raw), raw.sh.shape[1] * 3)
+    with np.errstate(over="ignore", invalid="ignore"):
+        # A row's sum is finite unless an entry is not; float64 cannot overflow on sums of float32.
+        total = raw.quats.sum(axis=1, dtype=np.float64) + flat.sum(axis=1, dtype=np.float64)
+        nonfinite = ~np.isfinite(total) | ~np.isfinite(raw.means.astype(np.float32)).all(axis=1)
+        nonfinite |= np.isnan(raw.log_scales).any(axis=1) | np.isnan(raw.logit_opacities)
+        norms = np.square(raw.quats.astype(np.float64)).sum(axis=1)
+        scales = np.exp(raw.log_scales)
+        tiny = np.finfo(np.float32).tiny
+        bad_scales = ~((scales >= tiny) & np.isfinite(scales)).all(axis=1)
+    found = {"nonfinite": nonfinite, "quats": norms < 1e-24, "scales": bad_scales}
+    found["opacities"] = np.isinf(raw.logit_opacities)
+    seen = nonfinite
+    for name in ("quats", "scales", "opacities"):
+        found[name] = found[name] & ~seen
+        seen = seen | found[name]
+    return found
+
+
+def check_expansion(path: Path, wanted: int, size: int) -> None:
+    """Refuses a file that claims to unpack to far more than any real one does."""
+    allowed = max(MAX_EXPANSION * size, ALWAYS_ALLOWED)
+    if wanted > allowed:
+        raise InputError(
+            f"{path}: claims to unpack to {wanted:,} bytes from {size:,}, more than {MAX_EXPANSION} times its size; "
+            "the file is damaged or made to exhaust memory"
+        )

@@ -1,0 +1,72 @@
+"""How far two fields of features on the same Gaussians are apart."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.even_indices import evenly
+from gsencoder.types import GaussianFeatures
+
+SAMPLE = 20_000
+CHUNK = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldError:
+    """One field held against a more accurate one; each seen Gaussian counts the same, however much it was seen.
+
+    Attributes:
+        centred: 1 − mean cosine after each field's own mean is taken off, over Gaussians that both saw.
+        raw: the same without taking the mean off.
+        covered: share of the reference's seen Gaussians that the other saw too.
+    """
+
+    centred: float
+    raw: float
+    covered: float
+
+    @property
+    def total(self) -> float:
+        """1 − mean centred cosine over all that the reference saw; a Gaussian that only it saw counts as 0."""
+        return 1 - self.covered * (1 - self.centred)
+
+
+def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, sample: int = SAMPLE) -> FieldError:
+    """Compares two fields in the full space.
+
+    Args:
+        features: what is judged.
+        reference: what is taken for right.
+        sample: at most so many Gaussians, evenly spaced over those that the reference saw; 0 = all.
+
+    Raises:
+        InputError: fields of different splats or spaces, or a reference that saw nothing.
+    """
+    if len(features) != len(reference) or features.space != reference.space:
+        raise InputError(
+            f"field_error: expected {len(reference)} Gaussians in ({reference.space.describe()}), "
+            f"got {len(features)} in ({features.space.describe()})"
+        )
+    rows = np.flatnonzero(reference.seen)
+    if not len(rows):
+        raise InputError("field_error: the reference saw no Gaussian")
+    if sample:
+        rows = rows[evenly(len(rows), sample)]
+    both = rows[features.seen[rows]]
+    centred = raw = 0.0
+    for start in range(0, len(both), CHUNK):
+        part = both[start : start + CHUNK]
+        a, b = features.decode(part).astype(np.float64), reference.decode(part).astype(np.float64)
+        raw += float(row_cosines(a, b).sum())
+        centred += float(row_cosines(a - features.mean, b - reference.mean).sum())
+    if not len(both):
+        return FieldError(centred=1.0, raw=1.0, covered=0.0)
+    return FieldError(centred=1 - centred / len(both), raw=1 - raw / len(both), covered=len(both) / len(rows))
+
+
+def row_cosines(a: Float64[np.ndarray, "n D"], b: Float64[np.ndarray, "n D"]) -> Float64[np.ndarray, " n"]:
+    """Cosine of each row with the other's; the eps inside the root makes a zero vector's cosine 0."""
+    norms = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1) + 1e-60)
+    return np.asarray((a * b).sum(axis=1) / norms)

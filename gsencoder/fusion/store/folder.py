@@ -1,0 +1,123 @@
+"""Features on disk: a folder that holds the Gaussians, the cameras and their features.
+
+Arrays are safetensors files, memory-mapped on load; features are float16 for seen rows only. The folder is all that
+localisation needs: no photographs, no teacher.
+"""
+
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import Archive, open_archive, write_archive
+from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
+from gsencoder.data.splats import fingerprint
+from gsencoder.fusion.store.package import PACKAGE_FILE, load_package
+from gsencoder.types import GaussianFeatures, Gaussians, Scene
+
+SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
+BLOCK = 16_384
+"""Rows that are turned into half precision at a time."""
+WORDS_FILE = "words.safetensors"
+"""The text table whose words lead into the features, beside them where there is one."""
+
+
+def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settings: dict[str, Any]) -> None:
+    """Writes scene and features into an existing, empty folder (which the caller makes appear whole or not at all).
+
+    float16 holds values up to 65,504, so each channel is stored divided by its largest magnitude.
+
+    Raises:
+        InputError: features of another splat, or not finite.
+    """
+    gaussians = scene.gaussians
+    if gaussians is None or len(gaussians) != len(features):
+        raise InputError(f"save_features: {len(features)} features need as many Gaussians in scene {scene.name}")
+    around, header = scene_parts(scene)
+    own = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+    write_archive(folder / SCENE_FILE, own | around, header)
+    rows = np.flatnonzero(features.weights > 0)
+    # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
+    blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
+    largest, bad = np.zeros(features.features.shape[1], np.float32), 0
+    for block in blocks:
+        kept = features.features[block]
+        bad += int((~np.isfinite(kept).all(axis=1)).sum())
+        largest = np.maximum(largest, np.abs(kept).max(axis=0))
+    if bad:
+        raise InputError(f"save_features: {bad} of {len(rows)} rows are not finite")
+    channel_scale = np.where(largest > 0, largest, 1).astype(np.float32)
+    halves = np.empty((len(rows), len(largest)), np.float16)
+    for number, block in enumerate(blocks):
+        halves[number * BLOCK : number * BLOCK + len(block)] = features.features[block] / channel_scale
+    arrays, header = space_parts(features.space, features.mean, features.basis)
+    arrays |= {
+        "rows": rows.astype(np.int32),
+        "features": halves,
+        "channel_scale": channel_scale,
+        "weights": features.weights[rows],
+    }
+    header |= {"settings": settings, "fingerprint": fingerprint(gaussians)}
+    write_archive(folder / FEATURES_FILE, arrays, header)
+
+
+def load_features(folder: Path) -> Scene:
+    """The scene and its features from a folder that `save_features` or `packages.save_package` wrote.
+
+    Raises:
+        InputError: not such a folder, damaged, of another version, or features of another splat.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of features made by `gsencoder fuse`, `encode` or `pack`")
+    if (folder / PACKAGE_FILE).is_file():
+        if (folder / SCENE_FILE).is_file():
+            raise InputError(f"{folder}: holds {SCENE_FILE} and {PACKAGE_FILE}, two kinds of features; keep one")
+        return load_package(folder)
+    with _open(folder, SCENE_FILE) as file:
+        gaussians = Gaussians(
+            means=file.array("means", "float32", ("N", 3)),
+            quats=file.array("quats", "float32", ("N", 4)),
+            scales=file.array("scales", "float32", ("N", 3)),
+            opacities=file.array("opacities", "float32", ("N",)),
+            sh=file.array("sh", "float32", ("N", "K", 3)),
+        )
+        scene = read_scene(file, gaussians)
+    features = _load_rows(folder, gaussians)
+    return replace(scene, features={features.space.name: features})
+
+
+def load_settings(folder: Path) -> dict[str, Any]:
+    """The settings that made the features of a folder.
+
+    Raises:
+        InputError: not such a folder, or damaged.
+    """
+    with _open(folder, FEATURES_FILE) as file:
+        found: dict[str, Any] = file.value("settings", dict)
+        return found
+
+
+def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
+    if not (folder / name).is_file():
+        raise InputError(f"{folder}: {name} is missing; this is no folder of gsencoder features")
+    return open_archive(folder / name)
+
+
+def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:
+    with _open(folder, FEATURES_FILE) as file:
+        check_splat(file, gaussians, "fuse or encode this splat again")
+        rows, n = file.array("rows", "int32", ("n",)), len(gaussians)
+        if len(rows) and (rows[0] < 0 or rows[-1] >= n or (np.diff(rows) <= 0).any()):
+            raise InputError(f"expected row numbers that rise from 0 to at most {n - 1}")
+        scale = file.array("channel_scale", "float32", ("R",))
+        seen = file.array("weights", "float32", ("n",))
+        if (scale <= 0).any() or (seen <= 0).any():
+            raise InputError("expected channel_scale and weights above 0")
+        values, weights = np.zeros((n, len(scale)), np.float32), np.zeros(n, np.float32)
+        values[rows] = file.array("features", "float16", ("n", "R")).astype(np.float32) * scale
+        weights[rows] = seen
+        space, mean, basis = read_space(file)
+        return GaussianFeatures(features=values, weights=weights, mean=mean, space=space, basis=basis)

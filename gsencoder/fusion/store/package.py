@@ -1,0 +1,180 @@
+"""Scene packages: a splat that any viewer opens, and the features of its Gaussians beside it.
+
+Three forms are for other programs: an .npz, a safetensors file, or properties of the .ply itself. The compact one is
+for gsencoder: codes of a few bytes (`compact`), memory-mapped, checked by a sum, bound to its splat by a fingerprint.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.mapped_arrays import MappedArrays
+from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
+from gsencoder.data.splats import fingerprint, load_splat, save_splat
+from gsencoder.fusion.store.quantize import CompactFeatures, compact
+from gsencoder.types import GaussianFeatures, Scene
+
+Form = Literal["compact", "npz", "safetensors", "ply"]
+SPLAT_FILE, PACKAGE_FILE = "splat.ply", "features.gsf"
+NPZ_FILE, SAFETENSORS_FILE, BASIS_FILE = "features.npz", "features.safetensors", "basis.npz"
+FORMAT = 1
+
+
+def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, error: float) -> CompactFeatures:
+    """Writes splat and compact features into an existing folder, which the caller makes appear whole or not at all.
+
+    Args:
+        folder: where.
+        scene: of the features.
+        features: fused or encoded.
+        error: budget of 1 − mean centred cosine.
+
+    Raises:
+        InputError: no Gaussians, or a budget that cannot be met.
+    """
+    made = compact(features, error=error)
+    written = _save_splat(folder, scene)
+    arrays, header = scene_parts(scene)
+    parts, named = space_parts(features.space, features.mean, made.basis)
+    seen = np.zeros(len(made), bool)
+    seen[made.rows] = True
+    coded = {
+        "bits": made.bits,
+        "levels": made.levels,
+        "codes": made.codes,
+        "weight_codes": made.weight_codes,
+        "seen": np.packbits(seen),
+        **parts,
+    }
+    header |= named | {
+        "form": FORMAT,
+        "fingerprint": written,
+        "total": len(made),
+        "lightest": made.lightest,
+        "heaviest": made.heaviest,
+        "error": made.error,
+        "lowest": made.lowest,
+    }
+    write_archive(folder / PACKAGE_FILE, arrays | coded, header)
+    return made
+
+
+def open_package(file: Path) -> CompactFeatures:
+    """The features of a package, its codes memory-mapped.
+
+    Raises:
+        InputError: missing, damaged, or of another version.
+    """
+    with open_archive(file) as archive:
+        form = archive.value("form", int)
+        if form != FORMAT:
+            raise InputError(f"expected form {FORMAT} of a package, got {form}; pack the features again")
+        archive.verify()
+        _, _, basis = read_space(archive)
+        if basis is None:
+            raise InputError("expected components of a basis; the file is damaged or from another program")
+        mapped = MappedArrays(file, {"codes": ("uint8", 2), "weight_codes": ("uint8", 1)})
+        seen, total = archive.array("seen", "uint8", ("S",)), archive.value("total", int)
+        if not 0 <= total <= 8 * len(seen) < total + 8:
+            raise InputError(f"expected marks of {total} Gaussians, got {8 * len(seen)}")
+        return CompactFeatures(
+            codes=mapped.whole("codes"),
+            bits=archive.array("bits", "uint8", ("R",)),
+            levels=archive.array("levels", "float32", ("L",)),
+            weight_codes=mapped.whole("weight_codes"),
+            lightest=archive.value("lightest", float, int),
+            heaviest=archive.value("heaviest", float, int),
+            rows=np.flatnonzero(np.unpackbits(seen, count=total)),
+            total=total,
+            basis=basis,
+            error=archive.value("error", float, int),
+            lowest=archive.value("lowest", float, int),
+        )
+
+
+def load_package(folder: Path) -> Scene:
+    """The scene and its features from a folder of `save_package`.
+
+    Raises:
+        InputError: damaged, of another version, or features of another splat.
+    """
+    file = folder / PACKAGE_FILE
+    packed = open_package(file)
+    with open_archive(file) as archive:
+        gaussians = load_splat(folder / SPLAT_FILE, origin=archive.array("origin", "float64", (3,)))
+        check_splat(archive, gaussians, "pack this splat's own features")
+        if len(gaussians) != len(packed):
+            raise InputError(f"expected features of {len(gaussians):,} Gaussians, got {len(packed):,}")
+        scene = read_scene(archive, gaussians)
+    features = packed.features()
+    return replace(scene, features={features.space.name: features})
+
+
+def save_arrays(
+    folder: Path, scene: Scene, features: GaussianFeatures, form: Literal["npz", "safetensors"], *, decoded: bool
+) -> None:
+    """Writes the splat, and plain arrays that other programs read: features [N, R] float32, or [N, D] float16 where
+    decoded; weights [N]; mean [D]; components [R, D] (a vector is mean + features @ components); about, as JSON.
+
+    Raises:
+        InputError: no Gaussians, or vectors that float16 does not hold.
+    """
+    arrays = _plain(features, decoded="float16" if decoded else "")
+    about = _about(features, _save_splat(folder, scene), decoded=decoded)
+    if form == "npz":
+        with atomic_file(folder / NPZ_FILE) as stream:
+            np.savez(stream, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+    else:
+        write_archive(folder / SAFETENSORS_FILE, arrays, about)
+
+
+def save_ply(folder: Path, scene: Scene, features: GaussianFeatures, *, decoded: bool) -> None:
+    """Writes the splat with properties feature_0, feature_1, … and feature_weight, float32, and what they mean beside
+    it: `basis.npz`, as `save_arrays` has it.
+
+    Raises:
+        InputError: no Gaussians.
+    """
+    arrays = _plain(features, decoded="float32" if decoded else "")
+    columns = np.ascontiguousarray(arrays.pop("features").T)
+    further = {f"feature_{number}": column for number, column in enumerate(columns)}
+    written = _save_splat(folder, scene, {**further, "feature_weight": arrays.pop("weights")})
+    about = _about(features, written, decoded=decoded)
+    with atomic_file(folder / BASIS_FILE) as stream:
+        np.savez(stream, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+
+
+def _save_splat(folder: Path, scene: Scene, further: Mapping[str, np.ndarray] | None = None) -> str:
+    """Writes the splat; its fingerprint, as it will be read."""
+    if scene.gaussians is None:
+        raise InputError(f"{scene.name}: has no Gaussians")
+    save_splat(folder / SPLAT_FILE, scene.gaussians, origin=scene.origin, further=further)
+    return fingerprint(load_splat(folder / SPLAT_FILE, origin=scene.origin))
+
+
+def _plain(features: GaussianFeatures, *, decoded: str) -> dict[str, np.ndarray]:
+    """The arrays; `decoded` is the type of whole vectors, or empty for coordinates."""
+    arrays = {"weights": features.weights, "mean": features.mean}
+    if not decoded:
+        components = {} if features.basis is None else {"components": features.basis.components}
+        return {"features": features.features, **arrays, **components}
+    vectors = np.zeros((len(features), features.space.channels), decoded)
+    seen = np.flatnonzero(features.seen)
+    for rows in np.array_split(seen, max(1, len(seen) // 65536)):
+        with np.errstate(over="ignore"):
+            vectors[rows] = features.decode(rows)
+        if not np.isfinite(vectors[rows]).all():
+            raise InputError(f"decoded=true: the vectors do not fit into {decoded}; take decoded=false, or form=ply")
+    return {"features": vectors, **arrays}
+
+
+def _about(features: GaussianFeatures, belongs: str, *, decoded: bool) -> dict[str, Any]:
+    kind = "vectors" if decoded or features.basis is None else "coordinates: vector = mean + features @ components"
+    return {"space": asdict(features.space), "features": kind, "fingerprint": belongs}

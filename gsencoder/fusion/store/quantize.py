@@ -1,0 +1,326 @@
+"""Features in a few bytes a Gaussian: as many as an error budget asks for.
+
+Coordinates are turned so that the first hold most, each is replaced by the nearest of 2ᵇ levels (Lloyd 1982, Max 1960),
+and bits go one at a time to the coordinate whose error they lower most. A name or a patch lives near few directions, so
+that most coordinates need one or two bits, or none.
+
+Kinds of features count alike, however many Gaussians they have: what is asked for is a mug more often than a ceiling,
+and a mean over Gaussians is all ceiling.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.even_indices import evenly
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
+
+MOST_BITS = 8
+"""Of a coordinate."""
+SAMPLE = 10_000
+"""Gaussians that levels are fitted to."""
+ALIKE = 0.9
+"""Rows whose centred cosine is above are of one kind."""
+RETRIES = 3
+"""Times that a sample is completed by rows that it missed."""
+ROUNDS = 10
+"""Of moving levels to the mean of what is nearest to them."""
+BINS = 1024
+BLOCK = 16_384
+"""Rows that are turned into bits, or back, at a time."""
+LOST = 0.8
+"""A row whose cosine falls below is of a kind that the sample missed; generous budgets take a lower bound."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CompactFeatures:
+    """Features as codes.
+
+    Attributes:
+        codes: of the seen rows, each row's bits one coordinate after the other, the first in the highest bit.
+        bits: of each coordinate.
+        levels: what the codes of each coordinate stand for, 2ᵇ values each.
+        weight_codes: of the seen rows; 0 = `lightest`, 255 = `heaviest`, and each step between is the same factor.
+        lightest: the smallest weight of a seen row.
+        heaviest: the largest weight.
+        rows: which Gaussians were seen, ascending.
+        total: Gaussians.
+        basis: what the coordinates stand for.
+        error: 1 − mean centred cosine to what was compacted: over the seen rows, or over their kinds (a sample in which
+            each row counts by how few are like it), whichever is larger. Features at the space's mean have no cosine.
+        lowest: the centred cosine that one row in a thousand is below.
+    """
+
+    codes: UInt8[np.ndarray, "n row_bytes"]
+    bits: UInt8[np.ndarray, " R"]
+    levels: Float32[np.ndarray, " L"]
+    weight_codes: UInt8[np.ndarray, " n"]
+    lightest: float
+    heaviest: float
+    rows: Int64[np.ndarray, " n"]
+    total: int
+    basis: FeatureBasis
+    error: float
+    lowest: float
+
+    def __post_init__(self) -> None:
+        counts = self.bits.astype(np.int64)
+        fits = self.codes.shape[1] == -(-int(counts.sum()) // 8) and len(self.levels) == int((1 << counts).sum())
+        some = len(counts) == self.basis.rank > 0 and 1 <= counts.min() <= counts.max() <= MOST_BITS
+        if not fits or not some:
+            raise InputError(
+                f"CompactFeatures: {self.codes.shape[1]} bytes a row and {len(self.levels)} levels do not go with bits "
+                f"{counts.tolist()[:20]} of {self.basis.rank} coordinates"
+            )
+        if not len(self.codes) == len(self.weight_codes) == len(self.rows) > 0:
+            raise InputError(
+                f"CompactFeatures: {len(self.rows)} seen rows, {len(self.codes)} codes and {len(self.weight_codes)} "
+                "weights; expected as many of each"
+            )
+        if self.rows[0] < 0 or self.rows[-1] >= self.total or (np.diff(self.rows) <= 0).any():
+            raise InputError(f"CompactFeatures: expected rows that rise from 0 to at most {self.total - 1}")
+        tiny, largest = np.finfo(np.float32).tiny, np.finfo(np.float32).max
+        if not tiny <= self.lightest <= self.heaviest <= largest or not 0 <= self.error <= 2:
+            raise InputError(
+                f"CompactFeatures: expected weights in float32's range and an error from 0, got {self.lightest} to "
+                f"{self.heaviest} and {self.error}"
+            )
+
+    def __len__(self) -> int:
+        return self.total
+
+    def coordinates(self, places: np.ndarray | slice = slice(None)) -> Float32[np.ndarray, "k R"]:
+        """Coordinates in the basis of seen rows, by their place among these."""
+        codes = self.codes[places]
+        bits = self.bits.astype(np.int64)
+        begins = np.concatenate(([0], np.cumsum(bits)))
+        offsets = np.concatenate(([0], np.cumsum(1 << bits)))
+        found = np.empty((len(codes), len(bits)), np.float32)
+        for start in range(0, len(codes), BLOCK):
+            ones = np.unpackbits(codes[start : start + BLOCK], axis=1)
+            for number, width in enumerate(bits):
+                part = ones[:, begins[number] : begins[number + 1]]
+                code = part @ (1 << np.arange(width - 1, -1, -1))
+                found[start : start + BLOCK, number] = self.levels[offsets[number] + code]
+        return found
+
+    def features(self) -> GaussianFeatures:
+        """All of them, as other stages take them."""
+        values = np.zeros((self.total, self.basis.rank), np.float32)
+        weights = np.zeros(self.total, np.float32)
+        values[self.rows] = self.coordinates()
+        share = self.weight_codes / 255
+        weights[self.rows] = np.exp((1 - share) * np.log(self.lightest) + share * np.log(self.heaviest))
+        return GaussianFeatures(
+            features=values, weights=weights, mean=self.basis.mean, space=self.space, basis=self.basis
+        )
+
+    @property
+    def space(self) -> FeatureSpace:
+        """What decoded features are."""
+        return self.basis.space
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row's codes."""
+        return int(self.codes.shape[1])
+
+
+def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatures:
+    """The fewest bytes a row whose features come within a budget.
+
+    Args:
+        features: fused or encoded.
+        error: budget of `CompactFeatures.error`.
+
+    Raises:
+        InputError: a budget out of range, or below what 8 bits a coordinate reach; nothing seen.
+    """
+    if not 0 < error < 1:
+        raise InputError(f"error: expected a budget between 0 and 1, got {error}")
+    rows = np.flatnonzero(features.seen)
+    if not len(rows):
+        raise InputError("compact: no Gaussian has features")
+    sample = rows[evenly(len(rows), SAMPLE)]
+    bound = min(LOST, 1 - 10 * error)
+    for _ in range(RETRIES):
+        found, cosines = _within(features, rows, sample, error)
+        lost = np.setdiff1d(rows[cosines < bound], sample)
+        if not len(lost):
+            break
+        sample = np.union1d(sample, lost[evenly(len(lost), SAMPLE // 4)])
+    return found
+
+
+def _within(
+    features: GaussianFeatures, rows: Int64[np.ndarray, " n"], sample: Int64[np.ndarray, " k"], error: float
+) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
+    """The fewest bytes a row that a sample asks for, and what they leave of the cosine of each row."""
+    centred = _centred(features, sample)
+    norms = np.sqrt((centred * centred).sum(axis=1))
+    centred, norms = centred[norms > 0], norms[norms > 0]
+    if not len(norms):
+        raise InputError("compact: all features are the space's mean, which no direction tells from one another")
+    rarity = _rarity(centred, norms)
+    # A cosine weighs an error by what it is an error of.
+    heft = rarity / np.maximum(norms, 1e-6 * float(norms.max())) ** 2
+    _, vectors = np.linalg.eigh((centred * heft[:, None]).T @ centred)
+    turned = vectors[:, ::-1]
+    choice = _Choice(centred @ turned, heft, rarity)
+    while True:
+        choice.add_bits(8)
+        if max(choice.errors()) > error and choice.can_grow:
+            continue
+        found, cosines = _encode(features, rows, turned, choice)
+        if found.error <= error:
+            return found, cosines
+        if not choice.can_grow:
+            raise InputError(
+                f"error={error}: {MOST_BITS} bits a coordinate reach {found.error:.2g}; give a larger budget, or "
+                "another form"
+            )
+
+
+def _centred(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray, "n R"]:
+    values = features.features[rows].astype(np.float64)
+    return values if features.basis is not None else values - features.mean
+
+
+def _rarity(centred: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """1 over the number of rows that point the same way, which adds up to one for each kind of feature."""
+    units = (centred / norms[:, None]).astype(np.float32)
+    alike = [(units[start : start + 1024] @ units.T > ALIKE).sum(axis=1) for start in range(0, len(units), 1024)]
+    return 1 / np.maximum(np.concatenate(alike), 1)
+
+
+class _Choice:
+    """How many bits each coordinate has, and its levels, on a sample."""
+
+    def __init__(
+        self,
+        sample: Float64[np.ndarray, "n R"],
+        heft: Float64[np.ndarray, " n"],
+        rarity: Float64[np.ndarray, " n"],
+    ) -> None:
+        self._sample, self._heft, self._rarity = sample, heft, rarity
+        count = sample.shape[1]
+        self.bits = np.zeros(count, np.int64)
+        self.levels = [np.zeros(1)] * count
+        self._rounded = np.zeros_like(sample)
+        self._now = heft @ sample**2
+        self._next = [self._fit(number, 1) for number in range(count)]
+
+    @property
+    def energy_kept(self) -> float:
+        """Share of the energy that lies in coordinates with bits."""
+        energy = (self._sample**2).sum(axis=0)
+        return float(energy[self.bits > 0].sum() / max(float(energy.sum()), 1e-300))
+
+    @property
+    def can_grow(self) -> bool:
+        """Whether some coordinate may have more bits."""
+        return bool((self.bits < MOST_BITS).any())
+
+    def errors(self) -> tuple[float, float]:
+        """The mean of 1 − cosine over rows, and over kinds."""
+        each = 1 - _cosines(self._sample, self._rounded, (self._sample**2).sum(axis=1))
+        return float(each.mean()), float(self._rarity @ each / self._rarity.sum())
+
+    def add_bits(self, count: int) -> None:
+        """Gives some more bits, each where it lowers the error most."""
+        for _ in range(count):
+            gains = [
+                self._now[number] - self._next[number][0] if self.bits[number] < MOST_BITS else -1.0
+                for number in range(len(self.bits))
+            ]
+            best = int(np.argmax(gains))
+            if self.bits[best] == MOST_BITS:
+                break
+            self._now[best], self.levels[best] = self._next[best]
+            self.bits[best] += 1
+            self._rounded[:, best] = self.levels[best][_nearest(self.levels[best], self._sample[:, best])]
+            if self.bits[best] < MOST_BITS:
+                self._next[best] = self._fit(best, int(self.bits[best]) + 1)
+
+    def _fit(self, number: int, bits: int) -> tuple[float, Float64[np.ndarray, " L"]]:
+        """The weighted error that is left, and the levels: each the mean of what is nearest to it."""
+        values = self._sample[:, number]
+        best: tuple[float, np.ndarray] = (np.inf, np.zeros(1))
+        count = 1 << bits
+        # What levels end as depends on where they begin. Many that share a smooth density lie as dense as its cube root
+        # (Panter and Dite 1951); a few kinds of features are no density, and are found from an even spread.
+        mass, edges = np.histogram(values, BINS, weights=self._heft)
+        filled = np.concatenate(([0], np.cumsum(np.cbrt(mass))))
+        dense = np.interp((np.arange(count) + 0.5) / count * filled[-1], filled, edges)
+        spread = np.linspace(values.min(), values.max(), 2 * count + 1)[1::2]
+        for levels in (dense, spread):
+            for _ in range(ROUNDS):
+                near = _nearest(levels, values)
+                weight = np.bincount(near, self._heft, count)
+                total = np.bincount(near, self._heft * values, count)
+                levels = np.sort(np.where(weight > 0, total / np.where(weight > 0, weight, 1), levels))
+            left = float(self._heft @ (levels[_nearest(levels, values)] - values) ** 2)
+            if left < best[0]:
+                best = (left, levels)
+        return best
+
+
+def _nearest(levels: np.ndarray, values: np.ndarray) -> Int64[np.ndarray, " n"]:
+    """Which of the ascending levels each value is nearest to."""
+    return np.searchsorted((levels[1:] + levels[:-1]) / 2, values)
+
+
+def _encode(
+    features: GaussianFeatures, rows: Int64[np.ndarray, " n"], turned: Float64[np.ndarray, "R R"], choice: _Choice
+) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
+    used = np.flatnonzero(choice.bits)
+    bits, levels = choice.bits[used], [choice.levels[number].astype(np.float32) for number in used]
+    codes = np.empty((len(rows), -(-int(bits.sum()) // 8)), np.uint8)
+    cosines = np.ones(len(rows))
+    for start in range(0, len(rows), BLOCK):
+        centred = _centred(features, rows[start : start + BLOCK])
+        values = centred @ turned[:, used]
+        ones, rounded = [], np.empty_like(values)
+        for number, (each, width) in enumerate(zip(levels, bits, strict=True)):
+            code = _nearest(each, values[:, number])
+            rounded[:, number] = each[code]
+            ones.append(code[:, None] >> np.arange(width - 1, -1, -1) & 1)
+        codes[start : start + BLOCK] = np.packbits(np.concatenate(ones, axis=1).astype(np.uint8), axis=1)
+        squares = (centred**2).sum(axis=1)
+        cosines[start : start + BLOCK] = np.where(squares > 0, _cosines(values, rounded, squares), np.nan)
+    axes = turned[:, used].T
+    basis = features.basis
+    components = axes if basis is None else axes @ basis.components
+    weights = features.weights[rows].astype(np.float64)
+    tiny = float(np.finfo(np.float32).tiny)
+    lightest, heaviest = max(float(weights.min()), tiny), max(float(weights.max()), tiny)
+    shares = np.log(np.maximum(weights, lightest) / lightest) / max(np.log(heaviest / lightest), 1e-12)
+    made = CompactFeatures(
+        codes=codes,
+        bits=bits.astype(np.uint8),
+        levels=np.concatenate(levels),
+        weight_codes=np.rint(255 * shares).astype(np.uint8),
+        lightest=lightest,
+        heaviest=heaviest,
+        rows=rows,
+        total=len(features),
+        basis=FeatureBasis(
+            mean=features.mean,
+            components=np.ascontiguousarray(components, np.float32),
+            energy_kept=choice.energy_kept * (1.0 if basis is None else basis.energy_kept),
+            space=features.space,
+        ),
+        error=max(1 - float(np.nanmean(cosines)), choice.errors()[1], 0.0),
+        lowest=float(np.nanquantile(cosines, 0.001)),
+    )
+    return made, cosines
+
+
+def _cosines(
+    values: Float64[np.ndarray, "n R"], rounded: Float64[np.ndarray, "n R"], squares: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """Of rows and what they were rounded to; `squares` are the rows' own, with coordinates that were left out."""
+    norms = np.sqrt(squares) * np.sqrt((rounded**2).sum(axis=1))
+    return np.asarray((values * rounded).sum(axis=1) / np.where(norms > 0, norms, 1))

@@ -1,0 +1,235 @@
+"""A question about a scene, from words to what a VLM is sent: what to look for, which views, which prompt."""
+
+import warnings
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, get_args
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.infer.ask.prompts import Task, messages, number_in, prompt_text
+from gsencoder.infer.ask.question_words import words_in
+from gsencoder.infer.ask.server import VlmConfig
+from gsencoder.infer.draw.pictures import Picture
+from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.pictures import picture_kinds, view_pictures
+from gsencoder.infer.views.selection import ViewsConfig, ViewSet
+from gsencoder.infer.views.targets import Target, best_boxes, target_of, targets_of
+from gsencoder.text.table import TextTable
+from gsencoder.types import Box, Scene
+
+KEPT_PICTURES = 8
+"""Sets of pictures that are kept for the next question; each is some megabytes."""
+SAME = 0.5
+"""What shares more of its Gaussians with what was found before, as intersection over union, is the same thing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """What is asked.
+
+    Attributes:
+        text: the question; may be empty for a caption.
+        task: see `prompts`.
+        query: words to look for; empty = the words of the table that the text holds.
+        aabb: a box in world coordinates to look at in place of words: lower corner, upper corner.
+    """
+
+    text: str = ""
+    task: Task = "answer"
+    query: tuple[str, ...] = ()
+    aabb: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.task not in get_args(Task):
+            raise InputError(f"task: expected one of {', '.join(get_args(Task))}, got {str(self.task)[:40]!r}")
+        if self.aabb and (len(self.aabb) != 6 or not all(np.isfinite(self.aabb))):
+            raise InputError(f"aabb: expected six numbers, lower corner and upper corner, got {list(self.aabb)}")
+        if self.aabb and not all(low < high for low, high in zip(self.aabb[:3], self.aabb[3:], strict=True)):
+            raise InputError(f"aabb: the lower corner is not below the upper one: {list(self.aabb)}")
+        if self.aabb and self.query:
+            raise InputError("aabb and query: give one of them")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskConfig:
+    """How a question becomes a prompt."""
+
+    boxes: int = field(default=3, metadata={"help": "boxes of each word that are looked at, best first"})
+    marks: bool | None = field(
+        default=None,
+        metadata={"help": "numbered marks on what was found; left out: for ground and caption"},
+    )
+
+    def __post_init__(self) -> None:
+        if self.boxes < 1:
+            raise InputError(f"boxes: expected 1 or more, got {self.boxes}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prompt:
+    """What a VLM is shown and told.
+
+    Attributes:
+        text: the words.
+        pictures: as they are sent.
+        views: where they were taken, and why.
+        targets: what they are of, in the order of their marks.
+        boxes: the boxes of the targets, where words found them.
+        words: that were looked for.
+        marks: the numbers that the pictures carry.
+    """
+
+    text: str
+    pictures: list[Picture]
+    views: ViewSet
+    targets: tuple[Target, ...]
+    boxes: tuple[Box, ...]
+    words: tuple[str, ...]
+    marks: frozenset[int]
+
+
+class Asker:
+    """Turns questions about one scene into prompts; what was found and chosen is kept for the next question."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        table: TextTable | None,
+        *,
+        space: str | None = None,
+        config: AskConfig = AskConfig(),
+        localization: LocalizeConfig = LocalizeConfig(),
+        views: ViewsConfig = ViewsConfig(),
+        side: int = 768,
+    ) -> None:
+        """Args:
+        scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
+        table: words that lead into the features; None where there are none.
+        space: which features are asked.
+        config: see there.
+        localization: how words become boxes.
+        views: how views are chosen.
+        side: longer pictures are made smaller, pixels.
+        """
+        self._scene, self._table, self._space, self._side = scene, table, space, side
+        self._config, self._localization, self._views = config, localization, views
+        self._kept: dict[Hashable, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
+        self._drawn: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
+
+    def prompt(self, question: Question) -> Prompt:
+        """What to send for a question.
+
+        Where no words are given and the question holds none that the table knows, evenly spread frames are shown.
+
+        Warns:
+            SceneWarning: nothing was looked for, or nothing of it was found.
+
+        Raises:
+            InputError: words that the table does not know, a box without Gaussians, a task that needs what is missing.
+        """
+        words = question.query
+        if not words and not question.aabb and self._table is not None:
+            words = words_in(question.text, self._table)
+        key = (words, question.aabb, question.task == "caption")
+        if key not in self._kept:
+            self._kept[key] = self._look(words, question)
+        targets, boxes, views = self._kept[key]
+        if not targets and self._views.method == "greedy":
+            told = self._nothing(words)
+            if question.task != "answer":
+                raise InputError(f"task={question.task}: {told}; give query= or aabb=")
+            warnings.warn(f"{told}: evenly spread views are shown", SceneWarning, stacklevel=2)
+        marked = self._config.marks
+        if marked is None:
+            marked = question.task in ("ground", "caption")
+        pictures, marks = self._pictures_of((*key, marked), views, targets if marked else ())
+        # A thing in a box that was given has no name.
+        names = [box.query for box in boxes] or ["" for _ in targets]
+        kinds = picture_kinds(self._scene, views)
+        text = prompt_text(question.task, question.text, names, marks=marks, kinds=kinds)
+        return Prompt(text=text, pictures=pictures, views=views, targets=targets, boxes=boxes, words=words, marks=marks)
+
+    def _pictures_of(
+        self, key: Hashable, views: ViewSet, marked: Sequence[Target]
+    ) -> tuple[list[Picture], frozenset[int]]:
+        """Pictures of what was asked about last are kept: many questions are about the same thing."""
+        found = self._drawn.pop(key, None) or view_pictures(self._scene, views, marked)
+        self._drawn[key] = found
+        if len(self._drawn) > KEPT_PICTURES:
+            del self._drawn[next(iter(self._drawn))]
+        return found
+
+    def _nothing(self, words: Sequence[str]) -> str:
+        return f"nothing was found of {', '.join(words)}" if words else "the question names nothing to look for"
+
+    def _look(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]:
+        targets, boxes = self._targets(words, question)
+        config = self._views
+        if not targets:
+            config = replace(config, method="uniform", source="both")
+        views = choose_views(self._scene, targets, config)
+        # Marks are drawn on pictures of the size that is sent, or their numbers would shrink.
+        small = views.cameras.resized(self._side, enlarge=False)
+        return targets, boxes, replace(views, cameras=small)
+
+    def _targets(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...]]:
+        gaussians = self._scene.gaussians
+        if gaussians is None:
+            raise InputError(f"ask: scene {self._scene.name} has no Gaussians")
+        if question.aabb:
+            low, high = _corners(question.aabb, self._scene.origin)
+            rows = np.flatnonzero(((gaussians.means >= low) & (gaussians.means <= high)).all(axis=1))
+            if not len(rows):
+                raise InputError(f"aabb: no Gaussian of scene {self._scene.name} is in the box {list(question.aabb)}")
+            return (target_of("thing in the box", gaussians, rows),), ()
+        if not words:
+            return (), ()
+        if self._table is None:
+            raise InputError(f"query: no words lead into the features of {self._scene.name}; give words= or aabb=")
+        found = localize(self._scene, words, self._table, self._localization, space=self._space)
+        # A caption is of one thing.
+        boxes = self._config.boxes if question.task != "caption" else 1
+        targets, kept = _distinct(targets_of(gaussians, found, boxes), best_boxes(found, boxes))
+        return (targets[:1], kept[:1]) if question.task == "caption" else (targets, kept)
+
+
+def _distinct(targets: Sequence[Target], boxes: Sequence[Box]) -> tuple[tuple[Target, ...], tuple[Box, ...]]:
+    """What several words found is one thing: that of the first word."""
+    kept: list[int] = []
+    for index, box in enumerate(boxes):
+        same = (np.intersect1d(box.rows, boxes[other].rows, assume_unique=True).size for other in kept)
+        sizes = (len(box.rows) + len(boxes[other].rows) for other in kept)
+        if all(shared <= SAME * (size - shared) for shared, size in zip(same, sizes, strict=True)):
+            kept.append(index)
+    return tuple(targets[index] for index in kept), tuple(boxes[index] for index in kept)
+
+
+def _corners(
+    aabb: Sequence[float], origin: Float64[np.ndarray, "3"]
+) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+    return np.array(aabb[:3]) - origin, np.array(aabb[3:]) - origin
+
+
+def prompt_messages(prompt: Prompt, config: VlmConfig) -> list[dict[str, Any]]:
+    """The prompt as the chat protocol carries it."""
+    return messages(prompt.text, prompt.pictures, side=config.image_side, kind=config.image_format)
+
+
+def meant(prompt: Prompt, text: str) -> int | None:
+    """Which target an answer to task=ground means, from 1; 0 for none of them, None where it names no mark.
+
+    Warns:
+        SceneWarning: the answer names no mark, several, or one that no picture carries.
+    """
+    number = number_in(text, len(prompt.targets))
+    if number is None or (number and number not in prompt.marks):
+        told = " ".join(text.split())[:80]
+        warnings.warn(
+            f"the answer does not name one of the {len(prompt.marks)} marks: {told!r}", SceneWarning, stacklevel=2
+        )
+        return None
+    return number

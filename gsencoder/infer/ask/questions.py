@@ -1,0 +1,128 @@
+"""Files of questions and of answers: JSON lines, one each."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from gsencoder.core.errors import InputError, about
+from gsencoder.infer.ask.ask import Question
+from gsencoder.infer.ask.prompts import Task, check_question
+
+LARGEST_FILE = 1 << 26
+"""Bytes of a file of questions."""
+FIELDS = ("id", "question", "task", "query", "aabb")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """One line of a file of questions.
+
+    Attributes:
+        id: of the question; the number of its line where it has none.
+        question: what is asked.
+    """
+
+    id: str
+    question: Question
+
+    def digest(self, settings: Mapping[str, Any]) -> str:
+        """Of the question and all that its answer depends on."""
+        asked = [self.question.text, self.question.task, list(self.question.query), list(self.question.aabb)]
+        return sha256(json.dumps([asked, settings], sort_keys=True).encode()).hexdigest()[:16]
+
+
+def read_questions(path: Path, task: Task = "answer") -> tuple[Asked, ...]:
+    """Reads lines such as {"id": "7", "question": "What is on the table?", "query": "table"}; id, task, query and aabb
+    may be left out, empty lines are skipped.
+
+    Args:
+        path: of the file.
+        task: of lines that name none.
+
+    Raises:
+        InputError: no such file, a line that is no such object, an id that comes twice, or no questions.
+    """
+    if not path.is_file():
+        raise InputError(f"questions: {path} is no file; expected JSON lines")
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(f"questions: {path} holds more than {LARGEST_FILE:,} bytes")
+        lines = path.read_bytes().decode("utf-8-sig").split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"questions: {path} cannot be read as text: {error}") from error
+    found: dict[str, Asked] = {}
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            with about(f"{path}: line {number}"):
+                asked = _asked(line, str(number), task)
+                if asked.id in found:
+                    raise InputError(f"id {asked.id[:40]!r} comes twice")
+                found[asked.id] = asked
+    if not found:
+        raise InputError(f"questions: {path} holds none")
+    return tuple(found.values())
+
+
+def _asked(line: str, number: str, task: Task) -> Asked:
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is no JSON: {error}") from error
+    if not isinstance(row, dict):
+        raise InputError(f"expected an object, got {type(row).__name__}")
+    unknown = sorted(set(row) - set(FIELDS))
+    if unknown:
+        raise InputError(f"{unknown[0]}: no such field; there are {', '.join(FIELDS)}")
+    name, text, query = row.get("id", number), row.get("question", ""), row.get("query", [])
+    if not isinstance(name, (str, int)) or isinstance(name, bool):
+        raise InputError(f"id: expected text or a number, got {str(name)[:40]!r}")
+    if not isinstance(text, str):
+        raise InputError(f"question: expected text, got {str(text)[:40]!r}")
+    words = [query] if isinstance(query, str) else query
+    if not isinstance(words, list) or not all(isinstance(word, str) and word.strip() for word in words):
+        raise InputError(f"query: expected a word or a list of words, got {str(query)[:40]!r}")
+    corners = row.get("aabb", [])
+    numbers = isinstance(corners, list) and all(
+        isinstance(value, (int, float)) and not isinstance(value, bool) for value in corners
+    )
+    if not numbers:
+        raise InputError(f"aabb: expected six numbers, got {str(corners)[:40]!r}")
+    check_question(row.get("task", task), text)
+    try:
+        aabb = tuple(float(value) for value in corners)
+    except OverflowError as error:
+        raise InputError(f"aabb: expected six numbers, got {str(corners)[:40]!r}") from error
+    return Asked(
+        id=str(name),
+        question=Question(
+            text=text,
+            task=row.get("task", task),
+            query=tuple(word.strip() for word in words),
+            aabb=aabb,
+        ),
+    )
+
+
+def read_answers(path: Path) -> dict[str, dict[str, Any]]:
+    """The finished lines of a file of answers, by id; a last line that was cut off is none.
+
+    Raises:
+        InputError: it cannot be read, or holds something else.
+    """
+    if not path.exists():
+        return {}
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    found = {}
+    for number, line in enumerate(lines[:-1], start=1):
+        try:
+            row = json.loads(line)
+            found[str(row["id"])] = row
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise InputError(f"{path}: line {number} is no answer; give resume=false to ask anew") from error
+    return found

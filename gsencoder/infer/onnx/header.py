@@ -1,0 +1,214 @@
+"""What an exported encoder says of itself: entries of text beside the graph, which any program can read.
+
+`gsencoder` is JSON: the format's version, the grid, the curves, the feature space, and for each array its type and
+shape. `gsencoder.NAME` is the array NAME: little-endian, deflated, in base64. `gsencoder.sum` is the sha256 of the
+whole file, with zeros in the sum's own place.
+"""
+
+import base64
+import binascii
+import hashlib
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, get_args
+
+import numpy as np
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.int8 import round_columns
+from gsencoder.core.runtime.device_names import Stored
+from gsencoder.models.grid.serialize import ALIGN, Order
+from gsencoder.models.output_space import OutputSpace, write_outputs
+from gsencoder.text.table import TextTable, unrounded
+from gsencoder.types import FeatureBasis, FeatureSpace
+
+KEY = "gsencoder"
+VERSION = 2
+SUM, NO_SUM = f"{KEY}.sum", "0" * 64
+FIELDS = ("means", "quats", "scales", "opacities", "sh_dc")
+"""Inputs of the graph that every cloud has."""
+SETTINGS = ("voxel", "corner", "starts")
+"""Inputs that have values of their own: the grid in metres, and those of a cloud that is no part of another."""
+OUTPUT = "features"
+ARRAYS = ("mean", "components", "words", "words_mean", "words_scale")
+MOST_DEFLATED = 20
+"""Bytes that a character of text may stand for, where an array is large."""
+WORD_STEPS = 63
+"""Largest integer of a word's embedding in an int8 file: seven bits leave centred cosines of 0.9995 or more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OnnxHeader:
+    """What a runtime must know of an exported encoder.
+
+    Attributes:
+        voxel: edge of the finest grid, metres.
+        levels: of the network.
+        orders: the curves that attention follows.
+        patch: most tokens in a patch.
+        outputs: what the features mean; the graph has restored them already.
+        words: what turns words into their space, where there is such a table.
+        precision: what the graph computes in.
+        made_by: settings and results of training and export, as JSON values.
+    """
+
+    voxel: float
+    levels: int
+    orders: tuple[Order, ...]
+    patch: int
+    outputs: OutputSpace
+    words: TextTable | None = None
+    precision: Stored = "float32"
+    made_by: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        known = set(get_args(Order))
+        numbers = type(self.levels) is int and type(self.patch) is int
+        if not 0 < self.voxel < math.inf or not numbers or not 1 <= self.levels <= ALIGN.bit_length() or self.patch < 1:
+            raise InputError(
+                f"expected a positive voxel, 1 to {ALIGN.bit_length()} levels and patches of 1 or more, got "
+                f"{self.voxel}, {self.levels}, {self.patch}"
+            )
+        if self.precision not in get_args(Stored):
+            raise InputError(
+                f"expected a precision among {', '.join(get_args(Stored))}, got {str(self.precision)[:40]}"
+            )
+        if not self.orders or not set(self.orders) <= known:
+            raise InputError(f"expected orders among {', '.join(sorted(known))}, got {str(self.orders)[:80]}")
+
+
+def to_metadata(header: OnnxHeader) -> dict[str, str]:
+    """The entries of text that hold a header."""
+    words = header.words
+    arrays, values = write_outputs(header.outputs)
+    values |= {
+        "version": VERSION,
+        "voxel": header.voxel,
+        "levels": header.levels,
+        "orders": list(header.orders),
+        "patch": header.patch,
+        "precision": header.precision,
+        "made_by": dict(header.made_by),
+    }
+    if words is not None:
+        arrays["words_mean"] = words.mean
+        if header.precision.startswith("int8"):
+            arrays["words"], arrays["words_scale"] = round_columns(words.embeddings, WORD_STEPS)
+        else:
+            arrays["words"] = words.embeddings.astype(np.float16)
+        values["words"] = {"names": list(words.names), "space": asdict(words.space)}
+    values["arrays"] = {name: {"dtype": value.dtype.name, "shape": value.shape} for name, value in arrays.items()}
+    entries = {KEY: json.dumps(values, ensure_ascii=False)}
+    for name, value in arrays.items():
+        little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
+        entries[f"{KEY}.{name}"] = base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
+    return entries
+
+
+def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
+    """The header that entries of text hold.
+
+    Raises:
+        InputError: there is none, it is of another version, or damaged.
+    """
+    if KEY not in entries:
+        raise InputError("is no encoder that `gsencoder export` wrote")
+    try:
+        values = json.loads(entries[KEY])
+        version = values["version"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"the entry {KEY!r} is damaged ({type(error).__name__})") from error
+    if version != VERSION:
+        raise InputError(
+            f"is of format version {str(version)[:20]}, and this gsencoder reads {VERSION}; export it again"
+        )
+    try:
+        arrays = {name: _array(entries, name, **values["arrays"][name]) for name in ARRAYS if name in values["arrays"]}
+        space = FeatureSpace(**values["space"])
+        basis = None
+        if "components" in arrays:
+            basis = FeatureBasis(
+                mean=arrays["mean"],
+                components=arrays["components"],
+                energy_kept=values["energy_kept"],
+                space=space,
+            )
+        words = None
+        if "words" in values:
+            words = TextTable(
+                names=tuple(values["words"]["names"]),
+                embeddings=unrounded(arrays["words"].astype(np.float32) * arrays.get("words_scale", np.float32(1))),
+                space=FeatureSpace(**values["words"]["space"]),
+                mean=arrays["words_mean"],
+            )
+        return OnnxHeader(
+            voxel=float(values["voxel"]),
+            levels=values["levels"],
+            orders=tuple(values["orders"]),
+            patch=values["patch"],
+            outputs=OutputSpace(space=space, mean=arrays["mean"], scale=float(values["scale"]), basis=basis),
+            words=words,
+            precision=values["precision"],
+            made_by=values["made_by"],
+        )
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, binascii.Error, zlib.error) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"its entries are damaged ({type(error).__name__}: {str(error)[:80]})") from error
+
+
+def with_sum(model: bytes) -> bytes:
+    """A serialised model whose entry `SUM` is filled in."""
+    place = _sum_place(model)
+    if place is None:
+        raise ValueError(f"the model has no entry {SUM}")
+    return model[:place] + _digest(model, place) + model[place + len(NO_SUM) :]
+
+
+def check_sum(model: bytes) -> bool:
+    """Whether a file has a sum.
+
+    Raises:
+        InputError: it has another than its contents.
+    """
+    place = _sum_place(model)
+    if place is not None and model[place : place + len(NO_SUM)] != _digest(model, place):
+        raise InputError(
+            "its contents do not have the sum that was written with them: it is damaged, or was changed by a program "
+            f"that left the entry {SUM} in it"
+        )
+    return place is not None
+
+
+def _sum_place(model: bytes) -> int | None:
+    """Where the digits of the sum begin: an entry is its key, then the mark of a second field and the length of it."""
+    key = SUM.encode() + bytes((0x12, len(NO_SUM)))
+    found = model.rfind(key)
+    return found + len(key) if found >= 0 and found + len(key) + len(NO_SUM) <= len(model) else None
+
+
+def _digest(model: bytes, place: int) -> bytes:
+    digest = hashlib.sha256(model[:place])
+    digest.update(NO_SUM.encode())
+    digest.update(model[place + len(NO_SUM) :])
+    return digest.hexdigest().encode()
+
+
+def _array(entries: Mapping[str, str], name: str, *, dtype: str, shape: list[int]) -> np.ndarray:
+    if dtype not in ("float32", "float16", "int8"):
+        raise InputError(f"expected {name} of float32, float16 or int8, got {dtype[:20]!r}")
+    text = entries[f"{KEY}.{name}"]
+    wanted = math.prod(shape) * np.dtype(dtype).itemsize
+    if not 0 <= wanted <= max(1 << 24, MOST_DEFLATED * len(text)):
+        raise InputError(f"{name} claims {str(wanted)[:20]} bytes in {len(text)} of text")
+    unpacking = zlib.decompressobj()
+    raw = unpacking.decompress(base64.b64decode(text, validate=True), wanted + 1)
+    if len(raw) != wanted or not unpacking.eof:
+        raise InputError(f"expected {wanted} bytes of {name}, got {'more' if len(raw) > wanted else len(raw)}")
+    values = np.frombuffer(raw, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)
+    if not np.isfinite(values).all():
+        raise InputError(f"{name} holds values that are not finite")
+    return values

@@ -1,0 +1,190 @@
+"""The exported encoder under onnxruntime: features of a splat, and words for them, without torch."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.files.model_files import find_file
+from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
+from gsencoder.infer.onnx.header import FIELDS, OUTPUT, SETTINGS, SUM, OnnxHeader, check_sum, from_metadata
+from gsencoder.models.grid.curves import Curves, curves_of
+from gsencoder.models.grid.serialize import NEVER, check_extent
+from gsencoder.text.table import TextTable
+from gsencoder.types import GaussianFeatures, Gaussians, check_unit
+
+SUFFIX = ".onnx"
+CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+
+
+class OnnxEncoder:
+    """A file of `gsencoder export`, ready to run.
+
+    Attributes:
+        name: of the file, for messages.
+        header: what it says of itself.
+    """
+
+    def __init__(self, file: str | Path | bytes, *, device: Device = "auto", threads: int = 0) -> None:
+        """Reads and checks the file.
+
+        Args:
+            file: a path, a name in the folder GSENCODER_MODELS, or what the file holds.
+            device: where it is to run; auto = a GPU where this onnxruntime has one.
+            threads: of the CPU; 0 = onnxruntime's own choice.
+
+        Raises:
+            InputError: no such file, not one that `gsencoder export` wrote, damaged, of another version, or no such
+                device.
+        """
+        self.name = "the model" if isinstance(file, bytes) else str(find_file(str(file), "weights"))
+        try:
+            model = file if isinstance(file, bytes) else Path(self.name).read_bytes()
+        except OSError as error:
+            raise InputError(f"{self.name}: cannot be read: {error.strerror or error}") from error
+        with about(self.name):
+            summed = check_sum(model)
+        self._session = open_session(model, self.name, device, threads)
+        try:
+            self.header: OnnxHeader = from_metadata(self._session.get_modelmeta().custom_metadata_map)
+            wanted = {f"{name}: {self._type(name)}" for name in (*FIELDS, *SETTINGS)}
+            found = {f"{each.name}: {each.type}" for each in self._session.get_inputs()}
+            found |= {f"{each.name}: {each.type}" for each in self._session.get_overridable_initializers()}
+            if found != wanted or OUTPUT not in [each.name for each in self._session.get_outputs()]:
+                raise InputError(f"expected inputs {', '.join(sorted(wanted))}, got {', '.join(sorted(found))}")
+        except InputError as error:
+            raise InputError(f"{self.name}: {error}") from error
+        if not summed:
+            warnings.warn(
+                f"{self.name}: has no entry {SUM}: another program changed it, and damage would not be noticed",
+                SceneWarning,
+                stacklevel=2,
+            )
+
+    @staticmethod
+    def _type(name: str) -> str:
+        return {"voxel": "tensor(double)", "starts": "tensor(int64)"}.get(name, "tensor(float)")
+
+    @property
+    def voxel(self) -> float:
+        """Edge of the finest grid in metres."""
+        return self.header.voxel
+
+    @property
+    def words(self) -> TextTable | None:
+        """What turns words into the features' space, where the file has it."""
+        return self.header.words
+
+    def encode(
+        self,
+        gaussians: Gaussians,
+        config: EncodeConfig = EncodeConfig(),
+        *,
+        metres_per_unit: float = 1.0,
+        track: Track = untracked,
+    ) -> GaussianFeatures:
+        """Features of every Gaussian, all with weight 1; see `infer.encode.encode`, which this equals within rounding.
+
+        Args:
+            gaussians: the splat.
+            config: of its parts; the precision is the file's.
+            metres_per_unit: of the splat's world; the encoder's grid is in metres.
+            track: wraps the loop over chunks to show progress.
+
+        Raises:
+            InputError: no Gaussians, or they spread over too many cells, or features that are not finite, or a unit
+                that is not positive.
+        """
+        check_unit(metres_per_unit, "metres_per_unit")
+        header = self.header
+        if config.precision not in ("auto", header.precision):
+            raise InputError(
+                f"precision: {self.name} computes in {header.precision}, not {config.precision}; "
+                "export another file for that"
+            )
+        voxel = header.voxel / metres_per_unit
+
+        def run(part: Gaussians, whole: Curves | None) -> Float32[np.ndarray, "n channels"]:
+            return self._run(part, whole, voxel)
+
+        features = encode_by_chunks(
+            gaussians,
+            run,
+            lambda: curves_of(gaussians.means, voxel, levels=header.levels, orders=header.orders, patch=header.patch),
+            config,
+            metres_per_unit=metres_per_unit,
+            channels=header.outputs.channels,
+            track=track,
+        )
+        return header.outputs.features(features)
+
+    def _run(self, part: Gaussians, whole: Curves | None, voxel: float) -> Float32[np.ndarray, "n channels"]:
+        feed = feed_of(part, whole, voxel)
+        try:
+            (found,) = self._session.run([OUTPUT], feed)
+        except Exception as error:  # onnxruntime raises its own classes, which share only this base
+            raise InputError(f"{self.name}: onnxruntime could not run it: {_first_line(error)}") from error
+        if found.shape != (len(part), self.header.outputs.channels):
+            raise InputError(f"{self.name}: expected {self.header.outputs.channels} channels, got {found.shape}")
+        return np.asarray(found, np.float32)
+
+
+def feed_of(part: Gaussians, whole: Curves | None, voxel: float) -> dict[str, np.ndarray]:
+    """What the graph takes of a part of a scene, in the grid of the whole; `whole` is None where it is all of it.
+
+    Raises:
+        InputError: the part spreads over too many cells.
+    """
+    scaled = np.floor(part.means.astype(np.float64) / voxel)
+    check_extent(float((scaled.max(axis=0) - scaled.min(axis=0)).max()) + 1, voxel)
+    feed = inputs_of(part) | {"voxel": np.array(voxel, np.float64)}
+    return feed if whole is None else feed | {"corner": whole.corner, "starts": rows_of(whole)}
+
+
+def inputs_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """What the graph takes of a cloud."""
+    values = (getattr(gaussians, name) for name in FIELDS[:-1])
+    return dict(zip(FIELDS, (*values, np.ascontiguousarray(gaussians.sh[:, 0])), strict=True))
+
+
+def rows_of(curves: Curves) -> Int64[np.ndarray, "rows P"]:
+    """The starts of all levels and orders in one array, as the graph takes them, filled up with `NEVER`."""
+    rows = [row for starts in curves.starts for row in starts]
+    table = np.full((len(rows), max(map(len, rows))), NEVER, np.int64)
+    for place, row in zip(table, rows, strict=True):
+        place[: len(row)] = row
+    return table
+
+
+def open_session(model: bytes, name: str, device: Device, threads: int = 0) -> Any:
+    """onnxruntime with a graph.
+
+    Raises:
+        InputError: no model that it reads, or no such device.
+    """
+    import onnxruntime
+
+    available = onnxruntime.get_available_providers()
+    if device == "cuda" and CUDA not in available:
+        raise InputError(f"device: this onnxruntime has no GPU ({', '.join(available)}); give device=cpu")
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    # Planning which tensor takes over whose buffer is quadratic in the graph, half of the time that a session takes to
+    # open; without it buffers go back to the arena as soon as they can, which is a fifth less memory as well.
+    options.enable_mem_reuse = False
+    if threads:
+        options.intra_op_num_threads = threads
+    providers = [CPU] if device == "cpu" or CUDA not in available else [CUDA, CPU]
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=providers)
+    except Exception as error:  # as above
+        raise InputError(f"{name}: is no model that onnxruntime reads, or damaged: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:160]

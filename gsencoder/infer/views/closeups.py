@@ -1,0 +1,70 @@
+"""Close-ups: windows of the scene's own photographs around a target.
+
+A photograph has far more pixels than a model is shown of it. A window of it shows a small thing as large as a camera
+near it would, and sharper than any render.
+"""
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from gsencoder.core.even_indices import evenly
+from gsencoder.infer.views.free_space import in_picture
+from gsencoder.infer.views.scores import AROUND
+from gsencoder.infer.views.targets import Target
+from gsencoder.types import Cameras, Gaussians
+
+SAMPLE = 1000
+"""Gaussians of a target that tell where it is in a frame."""
+LEAST_INSIDE = 0.5
+"""This share of them is in the frame at least."""
+LEAST_WIDTH = 160
+"""Windows are at least so wide, pixels of the photograph: smaller ones would be enlarged to a blur."""
+MOST_SHARE = 0.75
+"""Windows of more than this share of a frame's width or height are left out: the frame itself shows as much."""
+
+
+def closeups(
+    frames: Cameras, gaussians: Gaussians, target: Target, *, width: int, height: int
+) -> tuple[Cameras, Int64[np.ndarray, " n"]]:
+    """The frames' cameras with windows around a target, where these are clearly smaller than the frame.
+
+    Args:
+        frames: in the sizes of their photographs.
+        gaussians: the splat.
+        target: what is looked at; half of its size is left on every side.
+        width: of the pictures to be shown, pixels.
+        height: of the pictures to be shown, pixels; windows have the same shape.
+
+    Returns:
+        n cameras at places of frames, and which frames these are, ascending.
+    """
+    points = gaussians.means[target.rows[evenly(len(target.rows), SAMPLE)]].astype(np.float64)
+    rows: list[int] = []
+    Ks: list[Float64[np.ndarray, "3 3"]] = []
+    for view in range(len(frames)):
+        x, y, _, shown = in_picture(frames, view, points)
+        if shown.mean() < LEAST_INSIDE:
+            continue
+        places = np.stack((x[shown], y[shown]))
+        low, high = places.min(axis=1), places.max(axis=1)
+        wide, tall = (high - low) * (1 + 2 * AROUND)
+        window = np.array([1, height / width]) * max(wide, tall * width / height, LEAST_WIDTH)
+        size = np.array([frames.widths[view], frames.heights[view]], np.float64)
+        if (window > MOST_SHARE * size).any():
+            continue
+        corner = np.clip((low + high) / 2 - window / 2, 0, size - window)
+        K = frames.Ks[view].astype(np.float64)
+        K[:2, 2] -= corner
+        K[:2] *= (np.array([width, height]) / window)[:, None]
+        rows.append(view)
+        Ks.append(K)
+    found = np.array(rows, np.int64)
+    return (
+        Cameras(
+            cam_from_world=frames.cam_from_world[found],
+            Ks=np.array(Ks, np.float32).reshape(-1, 3, 3),
+            widths=np.full(len(found), width, np.int32),
+            heights=np.full(len(found), height, np.int32),
+        ),
+        found,
+    )

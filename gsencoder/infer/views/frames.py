@@ -1,0 +1,106 @@
+"""Which of the scene's own cameras could show a target, by rays and before any render."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from gsencoder.core.even_indices import evenly
+from gsencoder.infer.views.free_space import FreeSpace, in_picture
+from gsencoder.infer.views.targets import Target
+from gsencoder.types import Cameras, Gaussians
+
+RAYS = 12
+"""Rays by which a frame is judged before any render."""
+AT_ONCE = 32
+"""Frames that are judged by rays together."""
+STOPPED = 0.02
+"""What a frame counts in which all rays are stopped: rays may err."""
+FURTHER, LEAST_SHOWN = 4, 0.25
+"""Half of the frames are spread over so many times as many, of those that show this share of what the best shows."""
+
+
+def frames_on(
+    cameras: Cameras, gaussians: Gaussians, targets: Sequence[Target], count: int, spaces: Sequence[FreeSpace]
+) -> Int64[np.ndarray, " n"]:
+    """The frames that show most of the targets as far as a few rays tell, ascending; at most so many.
+
+    Targets take turns. Each takes its best frames for half of the places, and for the others some from all along the
+    recording, so that the frames of a film are not all neighbours.
+
+    Args:
+        cameras: the scene's.
+        gaussians: the splat.
+        targets: one or more.
+        count: frames.
+        spaces: what rays meet, one for each target, which is itself left out.
+    """
+    ranked = [_ranked(cameras, gaussians, target, count, free) for target, free in zip(targets, spaces, strict=True)]
+    turns = np.stack(ranked, axis=1).reshape(-1)
+    first = np.sort(np.unique(turns, return_index=True)[1])[:count]
+    return np.sort(turns[first])
+
+
+def _ranked(
+    cameras: Cameras, gaussians: Gaussians, target: Target, count: int, free: FreeSpace
+) -> Int64[np.ndarray, " n"]:
+    """Frames in the order in which they are taken for a target, as many as are wanted."""
+    count = min(count, len(cameras))
+    half = (count + 1) // 2
+    filled = _filled(cameras, target)
+    rows = target.rows[evenly(len(target.rows), RAYS)]
+    points = gaussians.means[rows].astype(np.float64)
+    shown = np.full(len(cameras), -1.0)
+
+    def judge(views: Int64[np.ndarray, " n"]) -> None:
+        for start in range(0, len(views), AT_ONCE):
+            block = views[start : start + AT_ONCE]
+            shown[block] = filled[block] * (STOPPED + (1 - STOPPED) * _open(cameras, block, points, free))
+
+    order = np.argsort(-filled, kind="stable")
+    for start in range(0, len(order), AT_ONCE):
+        block = order[start : start + AT_ONCE]
+        # No frame shows more than it would if nothing stood between: the rest is not better than what there is.
+        if start >= half and filled[block[0]] <= np.sort(shown)[-half]:
+            break
+        judge(block)
+    best = np.argsort(-shown, kind="stable")
+    enough = LEAST_SHOWN * shown[best[0]]
+    others = np.setdiff1d(np.flatnonzero(filled >= enough), best[:half])
+    others = others[evenly(len(others), FURTHER * count)]
+    judge(others[shown[others] < 0])
+    others = others[shown[others] >= enough]
+    taken = np.concatenate([best[:half], others[evenly(len(others), count - half)]])
+    # Whatever is missing comes from those that show less, and at last from those that no ray was sent to.
+    rest = np.lexsort((-filled, -shown))
+    return np.concatenate([taken, rest[~np.isin(rest, taken)]])[:count]
+
+
+def _filled(cameras: Cameras, target: Target) -> Float64[np.ndarray, " V"]:
+    """The share of each picture that a target's ball fills."""
+    pose = cameras.cam_from_world.astype(np.float64)
+    at = pose[:, :3, :3] @ target.center + pose[:, :3, 3]
+    z = np.maximum(at[:, 2], 1e-9)
+    x, y = (at[:, axis] / z * cameras.Ks[:, axis, axis] + cameras.Ks[:, axis, 2] for axis in (0, 1))
+    radius = np.minimum(target.radius * cameras.Ks[:, 0, 0] / z, cameras.widths + cameras.heights)
+    filled = np.ones(len(cameras))
+    for place, size in ((x, cameras.widths), (y, cameras.heights)):
+        filled *= np.clip(np.minimum(place + radius, size) - np.maximum(place - radius, 0), 0, None) / size
+    return np.where(at[:, 2] > -target.radius, filled, 0)
+
+
+def _open(
+    cameras: Cameras, views: Int64[np.ndarray, " n"], points: Float64[np.ndarray, "p 3"], free: FreeSpace
+) -> Float64[np.ndarray, " n"]:
+    """The share of points that are in each picture with nothing between."""
+    inside = np.stack([in_picture(cameras, int(view), points)[3] for view in views])
+    towards = cameras.centers[views][:, None] - points
+    distance = np.linalg.norm(towards, axis=-1)
+    towards /= np.maximum(distance, 1e-12)[..., None]
+    # Rays begin beyond the cells of what the target lies on, and end before those in which the camera is.
+    begins = 2 * free.cell
+    starts = points + begins * towards
+    hits = free.first_hit(
+        starts.reshape(-1, 3), towards.reshape(-1, 3), np.maximum(distance - begins - free.cell, 0).reshape(-1)
+    )
+    return np.asarray((inside & np.isinf(hits).reshape(inside.shape)).mean(axis=1))

@@ -1,0 +1,163 @@
+"""Where a camera can stand: what is known to be empty, how far away surfaces are, what a ray meets."""
+
+from copy import copy
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64, Integer
+
+from gsencoder.core.even_indices import evenly
+from gsencoder.core.runtime.threads import parallel
+from gsencoder.data.seeding.spacing import NEIGHBOUR
+from gsencoder.geometry import covariances, transform
+from gsencoder.infer.views.split_gaussians import SIGMAS, patches
+from gsencoder.render import BlendConfig, blend
+from gsencoder.types import Cameras, Gaussians
+
+OPAQUE = 0.3
+"""Gaussians of less opacity are no obstacle."""
+WATCHED_SIDE = 96
+"""Longer side of the depth maps that tell what is empty, pixels."""
+NEAREST = 8
+"""So many patches are asked how far away their surface is."""
+CELL = 2.0
+"""Edge of the cells in which rays are followed, in spacings of the splat: surfaces have no holes in such cells."""
+SPACING_SAMPLE = 5000
+"""Gaussians that tell the spacing."""
+CELLS = 1 << 20
+MOST_STEPS = 512
+"""Rays are followed for so many cells."""
+
+
+class FreeSpace:
+    """The empty part of a scene, as its Gaussians and cameras that saw it tell.
+
+    Attributes:
+        cell: edge of the cells in which rays are followed, world units.
+        watchers: the cameras that tell what is empty; None where there are none.
+    """
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        """Args:
+        gaussians: the splat.
+        """
+        from scipy.spatial import cKDTree
+
+        solid = np.flatnonzero(gaussians.opacities >= OPAQUE)
+        if not len(solid):
+            solid = np.arange(len(gaussians))
+        self._gaussians, self._quats = gaussians, gaussians.quats[solid]
+        means = gaussians.means[solid].astype(np.float64)
+        asked = means[evenly(len(means), SPACING_SAMPLE)]
+        distances = cKDTree(means).query(asked, k=[min(NEIGHBOUR + 1, len(means))])[0]
+        # Of a single Gaussian, and of many in one place, the size is known.
+        self.cell = CELL * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))
+        self._patches = patches(gaussians.select(solid), self.cell)
+        self._tree = cKDTree(self._patches.centers)
+        # Floaters may be any distance away: what is beyond the middle's million cells on a side is met by no ray.
+        self._low = np.floor(np.median(means, axis=0) / self.cell) - CELLS // 2
+        self._met, self._cell_of = solid[self._patches.rows], self._codes(self._patches.centers)
+        self._occupied = np.unique(self._cell_of[self._cell_of >= 0])
+        self.watchers: Cameras | None = None
+        self._depths: list[Float32[np.ndarray, "h w"]] = []
+
+    def seen_by(self, cameras: Cameras, config: BlendConfig = BlendConfig()) -> "FreeSpace":
+        """The same space, of which cameras tell what they looked through.
+
+        Args:
+            cameras: in the same world; a depth map is rendered for each. None of them: nobody tells.
+            config: accuracy of the depth maps.
+        """
+        if not len(cameras):
+            return self
+        other = copy(self)
+        small = other.watchers = cameras.resized(WATCHED_SIDE)
+
+        def depth_map(view: int) -> Float32[np.ndarray, "h w"]:
+            b = blend(self._gaussians, small, view, config=config)
+            # Rays that end nowhere have looked through nothing that is known.
+            return torch.where(b.alpha >= 0.5, b.depth, 0.0).reshape(b.shape).float().numpy()
+
+        other._depths = parallel(depth_map, range(len(small)))
+        return other
+
+    def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+        """The cell of each point as a number; −1 far outside the splat."""
+        cells = np.floor(points / self.cell) - self._low
+        inside = ((cells >= 0) & (cells < CELLS)).all(axis=1)
+        x, y, z = np.where(inside[:, None], cells, 0).astype(np.int64).T
+        return np.where(inside, (x * CELLS + y) * CELLS + z, -1)
+
+    def without(self, rows: Integer[np.ndarray, " n"]) -> "FreeSpace":
+        """The same space, in which rays go through these Gaussians."""
+        other = copy(self)
+        codes = self._cell_of[~np.isin(self._met, rows)]
+        other._occupied = np.unique(codes[codes >= 0])
+        return other
+
+    def occupied(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether a Gaussian lies in the cell of each point."""
+        codes = self._codes(points)
+        if not len(self._occupied):
+            return np.zeros(len(points), bool)
+        places = np.searchsorted(self._occupied, codes).clip(max=len(self._occupied) - 1)
+        return np.asarray(self._occupied[places] == codes)
+
+    def first_hit(
+        self,
+        starts: Float64[np.ndarray, "n 3"],
+        directions: Float64[np.ndarray, "n 3"],
+        lengths: Float64[np.ndarray, " n"],
+    ) -> Float64[np.ndarray, " n"]:
+        """How far each ray goes before the first cell that holds a Gaussian; +inf where it meets none.
+
+        Args:
+            starts: of the rays.
+            directions: unit vectors.
+            lengths: rays are followed so far, world units, or for `MOST_STEPS` cells.
+        """
+        steps = int(np.clip(np.ceil(2 * lengths.max(initial=0) / self.cell), 1, 2 * MOST_STEPS))
+        along = self.cell / 2 * np.arange(steps + 1)
+        points = starts[:, None] + along[:, None] * directions[:, None]
+        hit = self.occupied(points.reshape(-1, 3)).reshape(len(starts), -1) & (along <= lengths[:, None])
+        return np.where(hit.any(axis=1), along[hit.argmax(axis=1)], np.inf)
+
+    def clearance(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """World units from each point to the nearest surface, less than zero inside a Gaussian.
+
+        A surface lies two standard deviations from the centre of a patch. The plane that touches it there, across
+        the line from the centre to the point, is no farther away than the surface; of the nearest patches.
+        """
+        parts = self._patches
+        count = min(NEAREST, len(parts.rows))
+        distances, near = self._tree.query(points, k=[*range(1, count + 1)])
+        offsets = points[:, None] - parts.centers[near]
+        directions = offsets / np.maximum(distances, 1e-12)[..., None]
+        quats, scales = self._quats[parts.rows[near]], parts.scales[near]
+        spread = covariances(torch.from_numpy(quats).double(), torch.from_numpy(scales).double())
+        reach = SIGMAS * np.sqrt(np.einsum("nki,nkij,nkj->nk", directions, spread.numpy(), directions))
+        return np.asarray((distances - reach).min(axis=1))
+
+    def seen_empty(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether some watcher looked through each point, at a surface at least a cell behind it."""
+        found = np.zeros(len(points), bool)
+        for view, depth in enumerate(self._depths):
+            assert self.watchers is not None
+            x, y, z, shown = in_picture(self.watchers, view, points)
+            column, row = (np.where(shown, part, 0).astype(np.int64) for part in (x, y))
+            found |= shown & (depth[row, column] >= z + self.cell)
+        return found
+
+
+def in_picture(
+    cameras: Cameras, view: int, points: Float64[np.ndarray, "n 3"]
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Where a camera sees points: x and y in pixels, depth z in world units, and whether they lie in its picture. Of
+    points that do not, x and y may be anything."""
+    pose, K = torch.from_numpy(cameras.cam_from_world[view]).double(), cameras.Ks[view].astype(np.float64)
+    at = transform(pose, torch.from_numpy(points)).numpy()
+    z = at[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        x, y = (at[:, axis] / z * K[axis, axis] + K[axis, 2] for axis in (0, 1))
+    shown = (z > 0) & (x >= 0) & (y >= 0) & (x < cameras.widths[view]) & (y < cameras.heights[view])
+    return x, y, z, shown

@@ -1,0 +1,172 @@
+"""What cameras really see of a target: small renders, occlusion included."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64
+
+from gsencoder.core.even_indices import evenly
+from gsencoder.core.runtime.threads import parallel
+from gsencoder.infer.views.free_space import in_picture
+from gsencoder.infer.views.targets import Target
+from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.types import Cameras, Gaussians
+
+JUDGED = BlendConfig(stop_transmittance=0.02, min_weight=1e-3)
+"""Rays of the small renders end where a fiftieth of them is left."""
+SURROUNDINGS = 2.0
+"""A target's context is in the ball so many times as large as its own."""
+SAMPLE = 2000
+"""Gaussians of a target, and of its context, on which coverage is counted."""
+FAINT = 0.05
+"""A pixel shows a target from so much weight on."""
+AROUND = 0.5
+"""The frame around a target is this share of its size on every side."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Looks:
+    """What each of V cameras sees of one target.
+
+    Attributes:
+        visible: blending weight of the target as a share of what it has when rendered alone, over the pixels where
+            it is at least half as opaque then as anywhere; 0 where it is outside.
+        share: of the picture that the target fills, by weight.
+        inside: share of the target's Gaussians whose means lie in the picture.
+        alpha: mean opacity of the render over the target and around it.
+        blur: standard deviation of the Gaussians that make up the target in the picture, on average, as a share of
+            the picture's longer side.
+        target: the weight of each Gaussian of the target (a sample) in small pixels.
+        context: the same of Gaussians around it.
+    """
+
+    visible: Float64[np.ndarray, " V"]
+    share: Float64[np.ndarray, " V"]
+    inside: Float64[np.ndarray, " V"]
+    alpha: Float64[np.ndarray, " V"]
+    blur: Float64[np.ndarray, " V"]
+    target: Float32[np.ndarray, "V n"]
+    context: Float32[np.ndarray, "V m"]
+
+
+def look(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    targets: Sequence[Target],
+    *,
+    side: int = 160,
+    config: BlendConfig = JUDGED,
+) -> tuple[Looks, ...]:
+    """Judges cameras by small renders, one for each, in which every Gaussian hides what is behind it.
+
+    Args:
+        gaussians: the splat.
+        cameras: in the same world.
+        targets: what is looked at.
+        side: longer side of the renders, pixels.
+        config: accuracy of the renders.
+    """
+    if not targets:
+        return ()
+    small = cameras.resized(side)
+    watched = [_Watched(gaussians, target) for target in targets]
+
+    def one(view: int) -> list[_Seen]:
+        b = blend(gaussians, small, view, config=config)
+        # Pixels that each Gaussian fills.
+        weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians))
+        return [each.seen(b, weights, small, view, config) for each in watched]
+
+    # Whole views share the threads out better than parts of small ones.
+    found = parallel(one, range(len(cameras)))
+    return tuple(_together([each[place] for each in found]) for place in range(len(targets)))
+
+
+def as_photographs(looks: Looks, taken: Bool[np.ndarray, " V"]) -> Looks:
+    """Looks where some cameras are shown as photographs: sharp and solid, however rough the splat is."""
+    return replace(looks, alpha=np.where(taken, 1.0, looks.alpha), blur=np.where(taken, 0.0, looks.blur))
+
+
+class _Seen(NamedTuple):
+    """What one camera sees of one target; see `Looks`."""
+
+    visible: float
+    share: float
+    inside: float
+    alpha: float
+    blur: float
+    target: Float32[np.ndarray, " n"]
+    context: Float32[np.ndarray, " m"]
+
+
+def _together(seen: Sequence[_Seen]) -> Looks:
+    """All cameras' sight of one target."""
+    values = {name: np.array([getattr(each, name) for each in seen], np.float64) for name in _Seen._fields[:5]}
+    target, context = (np.stack([getattr(each, name) for each in seen]) for name in ("target", "context"))
+    return Looks(**values, target=target, context=context)
+
+
+class _Watched:
+    """A target, and what is needed again for every camera that looks at it."""
+
+    def __init__(self, gaussians: Gaussians, target: Target) -> None:
+        self._rows = target.rows
+        self._alone = gaussians.select(target.rows)
+        member = np.zeros(len(gaussians), np.float32)
+        member[target.rows] = 1
+        self._member = torch.from_numpy(member)
+        near = np.linalg.norm(gaussians.means - target.center, axis=1) <= SURROUNDINGS * target.radius
+        around = np.flatnonzero(near & (member == 0))
+        self._samples = tuple(rows[evenly(len(rows), SAMPLE)] for rows in (target.rows, around))
+        # The size of a flat Gaussian is that of its disc.
+        self._sizes = np.sqrt(np.sort(self._alone.scales, axis=1)[:, 1:].prod(axis=1, dtype=np.float64))
+
+    def seen(
+        self, b: Blend, weights: Float64[np.ndarray, " N"], small: Cameras, view: int, config: BlendConfig
+    ) -> _Seen:
+        """What a camera sees of it."""
+        alone = blend(self._alone, small, view, config=config).alpha
+        shown = b.render(self._member)
+        # What is half transparent at a target's rim belongs to what is behind it, too.
+        solid = alone >= 0.5 * float(alone.max())
+        whole = float(alone[solid].sum())
+        mine = weights[self._rows]
+        depths = b.depths.numpy()[self._rows].astype(np.float64)
+        pixels = float(small.Ks[view, 0, 0]) * self._sizes / np.maximum(depths, config.near)
+        target, context = (weights[rows].astype(np.float32) for rows in self._samples)
+        return _Seen(
+            visible=min(float(shown[solid].sum()) / whole, 1.0) if whole > FAINT else 0.0,
+            share=float(shown.mean()),
+            inside=float(in_picture(small, view, self._alone.means.astype(np.float64))[3].mean()),
+            alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
+            blur=float(mine @ pixels / mine.sum()) / max(b.shape) if mine.sum() > 0 else 0.0,
+            target=target,
+            context=context,
+        )
+
+
+def _around(alone: torch.Tensor, alpha: torch.Tensor) -> float:
+    """Mean alpha in the rectangle around what shows the target, with a frame; 0 where nothing shows it."""
+    spans = []
+    for axis in (1, 0):
+        places = np.flatnonzero((alone > FAINT).any(dim=axis).numpy())
+        if not len(places):
+            return 0.0
+        margin = int(np.ceil(AROUND * (places[-1] - places[0] + 1)))
+        spans.append(slice(max(int(places[0]) - margin, 0), int(places[-1]) + 1 + margin))
+    return float(alpha[spans[0], spans[1]].mean())
+
+
+def coverage(seen: Float32[np.ndarray, "V n"]) -> Float64[np.ndarray, "V n"]:
+    """How well each camera sees each Gaussian: its weight as a share of the largest that any camera gives it."""
+    best = seen.max(axis=0, initial=0)
+    return np.asarray(seen / np.where(best > 0, best, 1), np.float64)
+
+
+def directions(cameras: Cameras, target: Target) -> Float64[np.ndarray, "V 3"]:
+    """Unit vectors from a target to each camera."""
+    offsets = cameras.centers - target.center
+    return np.asarray(offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12))

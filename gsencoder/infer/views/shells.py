@@ -1,0 +1,154 @@
+"""Cameras that could look at a target, on shells around it."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.core.even_indices import evenly
+from gsencoder.data.orbits import looking_cameras, spiral_directions
+from gsencoder.infer.views.free_space import MOST_STEPS, FreeSpace
+from gsencoder.infer.views.targets import Target
+from gsencoder.types import Cameras, Gaussians, Scene
+
+TRIED = 8
+"""So many times as many directions are tried as cameras are wanted …"""
+LEAST_TRIED = 64
+"""… but at least so many."""
+SHARES = (0.30, 0.18, 0.10)
+"""Shares of the picture that targets are to fill, direction by direction …"""
+ROOM = 1.5
+"""… but so many times the least share, and less than the largest by as much: outlines are counted in cells."""
+LARGEST_SHARE, THIN_SHARE = 0.5, 0.08
+"""A camera comes no nearer than the first; what is long and thin may leave the picture to fill the second."""
+FILLED = 0.9
+"""What fits into the picture keeps within so much of it."""
+CLEARANCE = 0.2
+"""Cameras keep off surfaces by this share of their distance to the target, or of its radius where that is less."""
+OUTLINE = 16
+"""Cells along a target's radius in which its outline is counted."""
+BESIDE = 1.5
+"""Rays that tell what is behind a target pass so many radii beside its centre."""
+SAMPLE = 1000
+"""Gaussians of a target that tell its outline."""
+
+
+def shell_cameras(
+    gaussians: Gaussians,
+    target: Target,
+    count: int,
+    free: FreeSpace,
+    *,
+    up: Float64[np.ndarray, "3"] | None = None,
+    width: int = 640,
+    height: int = 480,
+    fov_degrees: float = 60.0,
+    between: tuple[float, float] = (0.0, 1.0),
+) -> Cameras:
+    """Cameras around a target from which nothing stands between: SplatDistill sec. 3.4, "viewpoints around".
+
+    Directions lie on a spiral. Along each the distance is the one at which the target's outline fills a share of the
+    picture, its frame permitting, or nearer where a surface would stand between. Directions are left out from which
+    the camera would be too near to a surface, where no known camera has looked, or so near that little else is seen.
+    Of those that remain the ones are kept with most of the scene behind and around the target, evenly spread.
+
+    Args:
+        gaussians: the splat.
+        target: what is looked at.
+        count: at most so many.
+        free: where a camera can stand.
+        up: of the world, where known.
+        width: of the pictures, pixels.
+        height: of the pictures, pixels.
+        fov_degrees: horizontal field of view.
+        between: shares of the picture that the target is to fill at least, and at most.
+
+    Returns:
+        Cameras relative to the scene's origin; none where there is no room.
+    """
+    focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
+    outward, vertical = spiral_directions(max(TRIED * count, LEAST_TRIED), up)
+    wanted, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height, between)
+    # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
+    begins = reach + 2 * free.cell
+    starts = target.center + begins[:, None] * outward
+    open_until = begins + free.first_hit(starts, outward, np.maximum(wanted * (1 + CLEARANCE) - begins, 0))
+    distance = np.minimum(wanted, open_until / (1 + CLEARANCE))
+    centers = target.center + distance[:, None] * outward
+    good = (distance >= least) & (free.clearance(centers) >= CLEARANCE * np.minimum(distance, target.radius))
+    if free.watchers is not None:
+        good &= free.seen_empty(centers)
+    tried = np.flatnonzero(good)
+    if not len(tried):
+        return looking_cameras(centers[tried], -outward[tried], vertical, focal, width, height)
+    backed = _backed(target, centers[tried], vertical, free)
+    enough = np.sort(backed)[::-1][min(count, len(backed)) - 1]
+    kept = tried[backed >= enough]
+    kept = kept[evenly(len(kept), count)]
+    return looking_cameras(centers[kept], -outward[kept], vertical, focal, width, height)
+
+
+def _backed(
+    target: Target, centers: Float64[np.ndarray, "n 3"], vertical: Float64[np.ndarray, "3"], free: FreeSpace
+) -> Float64[np.ndarray, " n"]:
+    """Share of the rays through a target, and beside it, that end at something, for each camera. They begin before the
+    target, so that what it hangs on or lies on counts from either side."""
+    forward = target.center - centers
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, vertical)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    down = np.cross(forward, right)
+    hits = np.zeros(len(centers))
+    length = np.full(len(centers), MOST_STEPS * free.cell)
+    for across in (-1.0, 0.0, 1.0):
+        for along in (-1.0, 0.0, 1.0):
+            through = target.center + BESIDE * target.radius * (across * right + along * down)
+            ray = through - centers
+            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+            hits += np.isfinite(free.first_hit(through - BESIDE * target.radius * ray, ray, length))
+    return hits / 9
+
+
+def _distances(
+    gaussians: Gaussians,
+    target: Target,
+    outward: Float64[np.ndarray, "n 3"],
+    vertical: Float64[np.ndarray, "3"],
+    focal: float,
+    width: int,
+    height: int,
+    between: tuple[float, float],
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Along each direction how far a camera should be, how far at least, and how far the target itself reaches."""
+    rows = target.rows[evenly(len(target.rows), SAMPLE)]
+    offsets = gaussians.means[rows].astype(np.float64) - target.center
+    # A Gaussian fills a cell of its own size.
+    shares = np.clip(SHARES, between[0] * ROOM, between[1] / ROOM)
+    cell = max(target.radius / OUTLINE, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
+    wanted, least, reach = (np.empty(len(outward)) for _ in range(3))
+    for index, direction in enumerate(outward):
+        right = np.cross(direction, vertical)
+        right /= np.linalg.norm(right)
+        plane = np.stack((offsets @ right, offsets @ np.cross(direction, right)), axis=1)
+        area = len(np.unique(np.floor(plane / cell).astype(np.int64), axis=0)) * cell**2
+        reach[index] = max(float((offsets @ direction).max()), 0.0)
+        # Distance at which an area fills a share of the picture: area · focal² / distance² = share · pixels.
+        fills = [
+            focal * math.sqrt(area / (share * width * height))
+            for share in (shares[index % len(shares)], LARGEST_SHARE, THIN_SHARE)
+        ]
+        wide, high = np.abs(plane).max(axis=0)
+        framed = 2 * focal / FILLED * max(wide / width, high / height)
+        wanted[index] = reach[index] + max(fills[0], min(framed, fills[2]))
+        least[index] = reach[index] + fills[1]
+    return wanted, least, reach
+
+
+def up_of(scene: Scene) -> Float64[np.ndarray, "3"] | None:
+    """The scene's up, or what its cameras hold for it: the mean of their pictures' upward directions, where these
+    agree; None where nobody knows."""
+    if scene.up is not None or scene.views is None:
+        return scene.up
+    mean = -scene.views.cameras.cam_from_world[:, 1, :3].astype(np.float64).mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > 0.5 else None

@@ -1,0 +1,101 @@
+"""What views are worth, by themselves and together.
+
+The worth of a set is a sum with diminishing returns: of what each view shows by itself (`worth`), of how well the
+targets' Gaussians and their surroundings are covered, and of how spread the directions are. The greedy choice is then
+within 1 − 1/e of the best one (Nemhauser, Wolsey and Fisher 1978).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from gsencoder.infer.views.scores import Looks, coverage, directions
+from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.views.targets import Target
+from gsencoder.types import Cameras
+
+BLURRED = 0.04
+"""Gaussians of this standard deviation, as a share of the picture's longer side, halve what a view is worth."""
+LEAST_BEST = 0.1
+"""Views count as good in comparison with the best of them, if that is worth so much."""
+NOTHING = 0.004
+"""A view adds nothing if it adds less than this share of what the first one shows; small things are worth little in all
+of them …"""
+LEAST_GAIN = 1e-4
+"""… nor does one that adds less than a view that is worth so much by itself: not a pixel of the target."""
+
+
+def worth(looks: Looks, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
+    """What each view is worth for one target by itself, 0 to 1.
+
+    Half comes from filling at least `least_share` of the picture, in proportion below it, half from filling up to half
+    of `most_share`; a target that fills more than `most_share` counts less. All of it is scaled by how much of the
+    target is in the picture and not hidden, by the opacity around it, and by its sharpness: Gaussians of `BLURRED`
+    halve it.
+    """
+    share = looks.share
+    size = np.minimum(share / config.least_share, 1) * (0.5 + 0.5 * np.minimum(share / (config.most_share / 2), 1))
+    size *= np.clip((1 - share) / (1 - config.most_share), 0, 1)
+    sharp = 1 / (1 + (looks.blur / BLURRED) ** 2)
+    return np.asarray(size * sharp * looks.visible * (0.5 + 0.5 * looks.inside) * np.clip(looks.alpha / 0.9, 0, 1) ** 2)
+
+
+class Values:
+    """What sets of candidates are worth."""
+
+    def __init__(
+        self, cameras: Cameras, targets: Sequence[Target], looks: Sequence[Looks], config: ViewsConfig
+    ) -> None:
+        self.worths = [worth(each, config) for each in looks]
+        self._count = config.count
+        self._weights = (config.cover_weight, config.context_weight, config.spread_weight)
+        self._kept = []
+        for target, each, value in zip(targets, looks, self.worths, strict=True):
+            # How well a view sees something counts as far as it is a good view.
+            good = (value / max(float(value.max(initial=0)), LEAST_BEST))[:, None]
+            away = directions(cameras, target)
+            towards = np.clip(away @ away.T, 0, 1)
+            self._kept.append((coverage(each.target) * good, coverage(each.context) * good, towards * good))
+        self._raw = [coverage(each.target) for each in looks]
+
+    def covered(self, views: Int64[np.ndarray, " n"]) -> float | None:
+        """How well views show the targets' Gaussians together; see `Chosen`."""
+        if not self._raw:
+            return None
+        return float(np.mean([raw[views].max(axis=0).mean() for raw in self._raw]))
+
+    def of(self, views: Sequence[int] | Int64[np.ndarray, " n"]) -> float:
+        """What a set is worth: the sum that `greedy` makes large."""
+        chosen = list(views)
+        value = float(np.mean([worth[chosen].sum() for worth in self.worths]) / self._count)
+        for parts in self._kept:
+            for weight, part in zip(self._weights, parts, strict=True):
+                if part.shape[1]:
+                    value += weight / len(self._kept) * float(part[chosen].max(axis=0).mean())
+        return value
+
+    def greedy(self, count: int) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+        """Views in the order of their gains, and these; of equal ones the first. Those that add nothing are left out,
+        but for the first."""
+        modular = np.mean(self.worths, axis=0) / self._count
+        best = [[np.zeros(part.shape[1]) for part in parts] for parts in self._kept]
+        order: list[int] = []
+        gains: list[float] = []
+        for _ in range(min(count, len(modular))):
+            gain = modular.copy()
+            for parts, now in zip(self._kept, best, strict=True):
+                for weight, part, level in zip(self._weights, parts, now, strict=True):
+                    if weight and part.shape[1]:
+                        gain += weight / len(self._kept) * np.maximum(part - level, 0).mean(axis=1)
+            gain[order] = -np.inf
+            view = int(gain.argmax())
+            if order and gain[view] <= max(NOTHING * gains[0], LEAST_GAIN / self._count):
+                break
+            order.append(view)
+            gains.append(float(gain[view]))
+            best = [
+                [np.maximum(level, part[view]) for part, level in zip(parts, now, strict=True)]
+                for parts, now in zip(self._kept, best, strict=True)
+            ]
+        return np.array(order, np.int64), np.array(gains)

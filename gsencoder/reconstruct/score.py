@@ -1,0 +1,140 @@
+"""How well a splat shows photographs that it was not fitted to: the whole picture, and what could be known of it."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.photographs import Photographs
+from gsencoder.reconstruct.stereo import finds, look_up, world_points
+from gsencoder.render.image_metrics import inner, psnr, ssim
+
+FEWEST = 2
+"""Photographs that a splat can be fitted to."""
+SAME_DEPTH = 0.02
+"""Relative difference of measured depths up to which two photographs show the same surface."""
+
+
+class Score(NamedTuple):
+    """Means over views.
+
+    Attributes:
+        psnr: in dB, of the pixels that masks leave.
+        ssim: structural similarity of the same.
+        seen_psnr: in dB, of those of them that some fitted photograph shows too; None where no sensor tells.
+        seen_ssim: structural similarity of the same.
+        seen: share of the pixels that are such.
+    """
+
+    psnr: float
+    ssim: float
+    seen_psnr: float | None = None
+    seen_ssim: float | None = None
+    seen: float | None = None
+
+
+def split(count: int, every: int) -> tuple[list[int], list[int]]:
+    """Views to fit, and every so manyth that is kept to judge by.
+
+    Raises:
+        InputError: too few.
+    """
+    held_out = [view for view in range(count) if every and view % every == 0]
+    training = [view for view in range(count) if view not in held_out]
+    if len(training) < FEWEST:
+        raise InputError(f"reconstruct: expected at least {FEWEST} photographs to fit, got {len(training)} of {count}")
+    return training, held_out
+
+
+def unmasked(photographs: Photographs, views: Sequence[int], what: str, *, least: int = 0) -> list[int]:
+    """The views of which a mask leaves a window of pixels.
+
+    Args:
+        photographs: of all views.
+        views: some of them.
+        what: they are called in messages.
+        least: so many must be left.
+
+    Raises:
+        InputError: fewer are.
+
+    Warns:
+        SceneWarning: some are not left; they are named.
+    """
+    masks = {view: photographs.mask(view) for view in views}
+    blank = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
+    if not blank:
+        return list(views)
+    told = f"{len(blank)} of {len(views)} {what} are masked all over"
+    names = listed([photographs.names[view] for view in blank])
+    if len(views) - len(blank) < least:
+        raise InputError(f"reconstruct: {told}: {names}; look at their masks, or at their alpha channels")
+    warnings.warn(f"{told} and not used: {names}", SceneWarning, stacklevel=2)
+    return [view for view in views if view not in blank]
+
+
+def seen_pixels(
+    photographs: Photographs, views: Sequence[int], training: Sequence[int]
+) -> dict[int, Bool[Tensor, "H W"]]:
+    """For each view the pixels whose surface some other photograph shows; nothing else can be known about the rest.
+
+    Measured depth carries a pixel into the other photographs; it is seen where one measured the same depth there, and
+    not where one looks past it, before it, or where a depth is unknown.
+
+    Args:
+        photographs: of all views; views without measured depth are left out of the result.
+        views: to be judged.
+        training: the photographs that a splat is fitted to.
+    """
+    depths, points, shown = {}, {}, {}
+    for view in views:
+        shot = photographs.shot(view)
+        if shot.depth is not None:
+            depths[view] = shot.depth
+            points[view] = world_points(shot.depth, shot, _pose(photographs, view))[shot.depth > 0]
+            shown[view] = torch.zeros(len(points[view]), dtype=torch.bool)
+    # One fitted photograph after the other, so that not all of them are held at once.
+    for other in training if points else ():
+        shot = photographs.shot(other)
+        for view, places in points.items():
+            if shot.depth is not None:
+                z, measured = look_up(places, shot.depth, shot, _pose(photographs, other))
+                shown[view] |= finds(z, measured, SAME_DEPTH)
+    return {view: (depth > 0).masked_scatter(depth > 0, shown[view]) for view, depth in depths.items()}
+
+
+def _pose(photographs: Photographs, view: int) -> Float[Tensor, "4 4"]:
+    return torch.from_numpy(photographs.cameras.cam_from_world[view].copy())
+
+
+@torch.no_grad()
+def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Tensor, "H W"]] = {}) -> Score:
+    """How well an optimiser's splat shows some views.
+
+    Args:
+        optimizer: as it is now.
+        views: to look at.
+        seen: what `seen_pixels` found; a view of which nothing is seen, or its edges alone, in which no window of SSIM
+            has its middle, counts in the whole pictures alone.
+    """
+    whole, known, shares = [], [], []
+    for view in views:
+        shot = optimizer.photographs.shot(view)
+        picture = optimizer.picture(view, shot)
+        whole.append((psnr(picture, shot.image, shot.mask), float(ssim(picture, shot.image, shot.mask))))
+        if view in seen:
+            mask = seen[view] if shot.mask is None else seen[view] & shot.mask
+            shares.append(float(mask.float().mean()))
+            if inner(mask).any():
+                known.append((psnr(picture, shot.image, mask), float(ssim(picture, shot.image, mask))))
+    found = Score(*(float(mean) for mean in np.mean(whole, axis=0)))
+    if not known:
+        return found
+    seen_psnr, seen_ssim = (float(mean) for mean in np.mean(known, axis=0))
+    return found._replace(seen_psnr=seen_psnr, seen_ssim=seen_ssim, seen=float(np.mean(shares)))

@@ -1,0 +1,309 @@
+"""Blending weights on a CPU: numba kernels that project, bin and composite; the plain twin is reference.py."""
+
+import math
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64
+
+from gsencoder.core.runtime.threads import PIECES, even_cuts, kernel, parallel
+from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
+from gsencoder.render.rays import Lattice
+from gsencoder.types import Gaussians
+
+_ENTRIES = 48
+"""Room for so many entries a row is set aside; memory that is not touched costs nothing."""
+
+_SCRATCH_KEPT = 1 << 24
+"""Rooms of up to so many entries (200 MB) are kept for the next call."""
+
+
+@kernel
+@no_type_check
+def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d, near, alpha_min, out, index):
+    """geometry.project of rows [first, last) in one pass; valid rows are packed into out[first:first + count]."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    width, height = size
+    slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
+    row_x, row_y = np.empty(3), np.empty(3)
+    count = 0
+    for i in range(first, last):
+        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        z = pose[2, 0] * mx + pose[2, 1] * my + pose[2, 2] * mz + pose[2, 3]
+        opacity = np.float64(opacities[i])
+        if not z > near or not opacity > alpha_min:
+            continue
+        x = pose[0, 0] * mx + pose[0, 1] * my + pose[0, 2] * mz + pose[0, 3]
+        y = pose[1, 0] * mx + pose[1, 1] * my + pose[1, 2] * mz + pose[1, 3]
+        tx = min(max(x / z, -(cx / fx + slack_x)), (width - cx) / fx + slack_x)
+        ty = min(max(y / z, -(cy / fy + slack_y)), (height - cy) / fy + slack_y)
+        w, qx = np.float64(quats[i, 0]), np.float64(quats[i, 1])
+        qy, qz = np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        n = 1.0 / math.sqrt(w * w + qx * qx + qy * qy + qz * qz + 1e-24)
+        w, qx, qy, qz = w * n, qx * n, qy * n, qz * n
+        for k in range(3):
+            if k == 0:
+                c0, c1, c2 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + w * qz), 2 * (qx * qz - w * qy)
+            elif k == 1:
+                c0, c1, c2 = 2 * (qx * qy - w * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + w * qx)
+            else:
+                c0, c1, c2 = 2 * (qx * qz + w * qy), 2 * (qy * qz - w * qx), 1 - 2 * (qx * qx + qy * qy)
+            s = np.float64(scales[i, k])
+            h2 = s * (pose[2, 0] * c0 + pose[2, 1] * c1 + pose[2, 2] * c2)
+            row_x[k] = fx / z * (s * (pose[0, 0] * c0 + pose[0, 1] * c1 + pose[0, 2] * c2) - tx * h2)
+            row_y[k] = fy / z * (s * (pose[1, 0] * c0 + pose[1, 1] * c1 + pose[1, 2] * c2) - ty * h2)
+        xx = row_x[0] ** 2 + row_x[1] ** 2 + row_x[2] ** 2
+        yy = row_y[0] ** 2 + row_y[1] ** 2 + row_y[2] ** 2
+        xy = row_x[0] * row_y[0] + row_x[1] * row_y[1] + row_x[2] * row_y[2]
+        d0 = row_x[1] * row_y[2] - row_x[2] * row_y[1]
+        d1 = row_x[2] * row_y[0] - row_x[0] * row_y[2]
+        d2 = row_x[0] * row_y[1] - row_x[1] * row_y[0]
+        det = d0 * d0 + d1 * d1 + d2 * d2 + eps2d * (xx + yy) + eps2d * eps2d
+        r2 = 2 * math.log(opacity / alpha_min)
+        u, v = fx * x / z + cx, fy * y / z + cy
+        hu, hv = math.sqrt(r2 * (xx + eps2d)), math.sqrt(r2 * (yy + eps2d))
+        if not (u + hu > 0 and u - hu < width and v + hv > 0 and v - hv < height):
+            continue
+        at = first + count
+        out[0, at], out[1, at], out[2, at], out[3, at] = u, v, hu, hv
+        out[4, at], out[5, at], out[6, at] = (yy + eps2d) / det, -xy / det, (xx + eps2d) / det
+        out[7, at], out[8, at], out[9, at] = r2, opacity, z
+        index[at] = i
+        count += 1
+    return count
+
+
+def project(
+    gaussians: Gaussians, pose: np.ndarray, K: np.ndarray, width: int, height: int, *, eps2d: float, near: float
+) -> tuple[Float64[np.ndarray, "10 M"], Int32[np.ndarray, " M"]]:
+    """geometry.project for the M Gaussians that touch the image, in float64 without temporaries.
+
+    Returns:
+        Rows u, v, half width, half height, conic a, b, c, squared radius, opacity, z; and which Gaussians they are.
+    """
+    n = len(gaussians)
+    out, index = np.empty((10, n)), np.empty(n, np.int32)
+    cuts = np.linspace(0, n, PIECES + 1).astype(np.int64)
+    pose, K = pose.astype(np.float64), K.astype(np.float64)
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+
+    def work(piece: int) -> int:
+        bounds = (cuts[piece], cuts[piece + 1])
+        return _project(*bounds, *arrays, pose, K, (float(width), float(height)), eps2d, near, ALPHA_MIN, out, index)
+
+    counts = parallel(work, range(PIECES))
+    keep = [slice(start, start + count) for start, count in zip(cuts[:-1], counts, strict=True)]
+    return np.concatenate([out[:, part] for part in keep], axis=1), np.concatenate([index[part] for part in keep])
+
+
+@kernel
+@no_type_check
+def _bin_tiles(u, v, hu, hv, order, tile, tiles_x, tiles_y):
+    """Counting sort of (tile, Gaussian) pairs that keeps the depth order within a tile."""
+    n = len(order)
+    bounds = np.empty((n, 4), np.int32)
+    starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    last_u, last_v = tiles_x * tile - 1, tiles_y * tile - 1
+    for k in range(n):
+        g = order[k]
+        # Bounds are clipped as floats: a Gaussian far outside the image overflows an integer.
+        u0, u1 = max(np.ceil(u[g] - hu[g]), 0.0), min(np.floor(u[g] + hu[g]), float(last_u))
+        v0, v1 = max(np.ceil(v[g] - hv[g]), 0.0), min(np.floor(v[g] + hv[g]), float(last_v))
+        if u0 > u1 or v0 > v1:
+            bounds[k, 0], bounds[k, 1], bounds[k, 2], bounds[k, 3] = 0, -1, 0, -1
+            continue
+        bounds[k, 0], bounds[k, 1] = int(u0) // tile, int(u1) // tile
+        bounds[k, 2], bounds[k, 3] = int(v0) // tile, int(v1) // tile
+        for ty in range(bounds[k, 2], bounds[k, 3] + 1):
+            for tx in range(bounds[k, 0], bounds[k, 1] + 1):
+                starts[ty * tiles_x + tx + 1] += 1
+    for t in range(tiles_x * tiles_y):
+        starts[t + 1] += starts[t]
+    where = starts[:-1].copy()
+    members = np.empty(starts[-1], np.int32)
+    for k in range(n):
+        for ty in range(bounds[k, 2], bounds[k, 3] + 1):
+            for tx in range(bounds[k, 0], bounds[k, 1] + 1):
+                t = ty * tiles_x + tx
+                members[where[t]] = order[k]
+                where[t] += 1
+    return starts, members
+
+
+@kernel
+@no_type_check
+def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, rows, cols, weights):
+    """Front-to-back compositing of tiles [first, last): entries (row, Gaussian, weight), depth-ordered in a row.
+
+    Gaussians are the outer loop, so that one that several rays of a patch meet becomes a single entry at once. Along
+    a line of rays exp(−quadratic) is a product of two geometric sequences: g(u+1) = g(u)·r(u), r(u+1) = r(u)·q.
+    """
+    height, width, side, tile, tiles_x = shape
+    all_u, all_v, all_h = gaussians[0], gaussians[1], gaussians[3]
+    all_a, all_b, all_c, all_r2, all_opacity = gaussians[4], gaussians[5], gaussians[6], gaussians[7], gaussians[8]
+    cells = tile // side
+    cell_of = np.arange(tile) // side
+    count = 0
+    transmittance = np.empty((tile, tile), np.float64)
+    sums = np.zeros((cells, cells), np.float64)
+    share = 1.0 / (side * side)
+    for t in range(first, last):
+        tile_u, tile_v = (t % tiles_x) * tile, (t // tiles_x) * tile
+        end_u, end_v = min(tile, width * side - tile_u), min(tile, height * side - tile_v)
+        transmittance[:] = 1.0
+        open_rays = end_u * end_v
+        for m in range(starts[t], starts[t + 1]):
+            g = members[m]
+            # Entries of one Gaussian in one tile are at most its cells: room is checked here, not at each of them.
+            if count + cells * cells > len(rows):
+                more = np.empty(len(rows) + 1024, np.int32)
+                rows, cols = np.concatenate((rows, more)), np.concatenate((cols, more))
+                weights = np.concatenate((weights, np.empty(len(more), np.float32)))
+            a, b, c = all_a[g], all_b[g], all_c[g]
+            gu, gv, limit, opacity = all_u[g] - tile_u, all_v[g] - tile_v, all_r2[g], all_opacity[g]
+            f0, f1 = max(np.ceil(gv - all_h[g]), 0.0), min(np.floor(gv + all_h[g]), float(end_v - 1))
+            if f0 > f1:
+                continue
+            v0, v1 = int(f0), int(f1)
+            inv_a, q = 1.0 / a, math.exp(-a)
+            low_u, high_u = tile, -1
+            for j in range(v0, v1 + 1):
+                dv = j - gv
+                root = b * b * dv * dv - a * (c * dv * dv - limit)
+                if root < 0:
+                    continue
+                half, middle = math.sqrt(root) * inv_a, gu - b * dv * inv_a
+                f0, f1 = max(np.ceil(middle - half), 0.0), min(np.floor(middle + half), float(end_u - 1))
+                if f0 > f1:
+                    continue
+                u0, u1 = int(f0), int(f1)
+                du = u0 - gu
+                value = opacity * math.exp(-0.5 * (a * du * du + c * dv * dv) - b * du * dv)
+                ratio = math.exp(-a * (du + 0.5) - b * dv) if u1 > u0 else 0.0
+                low_u, high_u = min(low_u, u0), max(high_u, u1)
+                light = transmittance[j]
+                line = sums[cell_of[j]]
+                row = (tile_v + j) * width + tile_u
+                for i in range(u0, u1 + 1):
+                    alpha = min(value, ALPHA_MAX)
+                    value *= ratio
+                    ratio *= q
+                    before = light[i]
+                    # A negative transmittance marks a ray that has stopped.
+                    if alpha < ALPHA_MIN or before < 0:
+                        continue
+                    after = before * (1.0 - alpha)
+                    if after <= stop:
+                        light[i] = -1.0
+                        open_rays -= 1
+                        continue
+                    light[i] = after
+                    if side > 1:
+                        line[cell_of[i]] += alpha * before
+                    elif alpha * before >= keep:
+                        rows[count] = row + i
+                        cols[count] = g
+                        weights[count] = alpha * before
+                        count += 1
+            if side > 1 and high_u >= 0:
+                for cj in range(cell_of[v0], cell_of[v1] + 1):
+                    row = (tile_v // side + cj) * width + tile_u // side
+                    for ci in range(cell_of[low_u], cell_of[high_u] + 1):
+                        weight = sums[cj, ci] * share
+                        sums[cj, ci] = 0.0
+                        if weight > 0 and weight >= keep:
+                            rows[count] = row + ci
+                            cols[count] = g
+                            weights[count] = weight
+                            count += 1
+            if open_rays == 0:
+                break
+    return rows[:count], cols[:count], weights[:count]
+
+
+_free_scratch: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+
+def _take_scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Room for entries, used again from call to call: filling fresh pages costs more than the compositing.
+
+    Taking from the list and giving back are each one step, so that concurrent callers never share a room; what does
+    not fit grows inside the kernel.
+    """
+    try:
+        scratch = _free_scratch.pop()
+    except IndexError:
+        scratch = None
+    if scratch is None or len(scratch[0]) < entries:
+        return np.empty(entries, np.int32), np.empty(entries, np.int32), np.empty(entries, np.float32)
+    return scratch
+
+
+@kernel
+@no_type_check
+def _count(rows, crow):
+    for e in range(len(rows)):
+        crow[rows[e] + 1] += 1
+
+
+@kernel
+@no_type_check
+def _scatter(rows, cols, weights, index, where, out_cols, out_weights):
+    for e in range(len(rows)):
+        at = where[rows[e]]
+        where[rows[e]] = at + 1
+        out_cols[at] = index[cols[e]]
+        out_weights[at] = weights[e]
+
+
+def blend_weights(
+    lattice: Lattice,
+    projected: Float64[np.ndarray, "10 M"],
+    index: Int32[np.ndarray, " M"],
+    *,
+    stop: float,
+    keep: float,
+) -> tuple[Int64[np.ndarray, " P_plus_1"], Int32[np.ndarray, " nnz"], Float32[np.ndarray, " nnz"]]:
+    """CSR (crow, col, weight) of B.
+
+    Args:
+        lattice: where the rays are.
+        projected: Gaussians on the image plane, from `project`.
+        index: which columns of B they are.
+        stop: transmittance at which a ray ends.
+        keep: smallest weight stored.
+    """
+    # In lattice units the rays lie on whole numbers, whatever the grid.
+    gaussians = projected.copy()
+    gaussians[0] = (projected[0] - lattice.x0) / lattice.dx
+    gaussians[1] = (projected[1] - lattice.y0) / lattice.dy
+    gaussians[2] /= lattice.dx
+    gaussians[3] /= lattice.dy
+    gaussians[4] *= lattice.dx**2
+    gaussians[5] *= lattice.dx * lattice.dy
+    gaussians[6] *= lattice.dy**2
+    tile = lattice.tile
+    tiles_x, tiles_y = -(-lattice.width * lattice.side // tile), -(-lattice.height * lattice.side // tile)
+    order = np.argsort(gaussians[9], kind="stable").astype(np.int32)
+    starts, members = _bin_tiles(*gaussians[:4], order, tile, tiles_x, tiles_y)
+    shape = (lattice.height, lattice.width, lattice.side, tile, tiles_x)
+    cuts = even_cuts(starts)
+    room = np.concatenate(([0], np.cumsum(_ENTRIES * (tile // lattice.side) ** 2 * np.diff(cuts))))
+    scratch = _take_scratch(int(room[-1]))
+
+    def work(piece: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        space = (part[room[piece] : room[piece + 1]] for part in scratch)
+        bounds = (cuts[piece], cuts[piece + 1])
+        return _blend_tiles(*bounds, starts, members, gaussians, shape, stop, keep, *space)
+
+    pieces = parallel(work, range(PIECES))
+    crow = np.zeros(lattice.rows + 1, np.int64)
+    parallel(lambda piece: _count(pieces[piece][0], crow), range(PIECES))
+    np.cumsum(crow, out=crow)
+    where = crow[:-1].copy()
+    cols, weights = np.empty(crow[-1], np.int32), np.empty(crow[-1], np.float32)
+    # A row belongs to one tile, a tile to one piece: the pieces write to disjoint places.
+    parallel(lambda piece: _scatter(*pieces[piece], index, where, cols, weights), range(PIECES))
+    if len(scratch[0]) <= _SCRATCH_KEPT:
+        _free_scratch.append(scratch)
+    return crow, cols, weights

@@ -1,0 +1,267 @@
+"""A closed vocabulary as a table: names, their embeddings, and the files that hold them."""
+
+import difflib
+import json
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsencoder.core.errors import InputError, about
+from gsencoder.core.files.archive import open_archive, warn_without_checksums, write_archive
+from gsencoder.core.files.npz import read_npz
+from gsencoder.types import FeatureSpace
+
+UNIT_TOLERANCE = 1e-2
+"""How far from 1 the norm of a stored embedding may be: float16 rounding is about 1e-3."""
+FORMAT_1 = "gsencoder text table 1"
+LONGEST_SHOWN = 80
+"""Characters of a word that an error repeats."""
+LONGEST_NAME = 1000
+"""Characters of a name: longer than any word or caption, and short enough to compare with each other."""
+
+
+def normalise(word: str) -> str:
+    """A word as the table compares it: NFKC, lower case, one blank where there were blanks, `_` or `-`, no article."""
+    text = " ".join(re.split(r"[\s_\-]+", unicodedata.normalize("NFKC", word).casefold())).strip()
+    return re.sub(r"^(?:a|an|the) (?=.)", "", text)
+
+
+def _other_numbers(key: str) -> list[str]:
+    """Simple English singulars of a word, then its plurals; made-up forms do no harm, as no table has them."""
+    forms = []
+    for ending, singular in (("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")):
+        if key.endswith(ending) and len(key) > len(ending) + 1 and not key.endswith("ss"):
+            forms.append(key[: -len(ending)] + singular)
+    forms += [key + "s", key + "es"]
+    if key.endswith("y"):
+        forms.append(key[:-1] + "ies")
+    if key.endswith("fe"):
+        forms.append(key[:-2] + "ves")
+    if key.endswith("f"):
+        forms.append(key[:-1] + "ves")
+    return forms
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TextTable:
+    """A closed vocabulary: names and their embeddings.
+
+    Attributes:
+        names: the words, unique after `normalise`.
+        embeddings: one unit vector a name.
+        space: what the vectors are; `text_encoder` names the encoder that made them.
+        mean: the mean of the embeddings. Text and image features of a joint model have different means, so each side
+            is centred by its own.
+    """
+
+    names: tuple[str, ...]
+    embeddings: Float32[np.ndarray, "C D"]
+    space: FeatureSpace
+    mean: Float32[np.ndarray, " D"]
+    _row_of: dict[str, int] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        table = self.embeddings
+        long = next((row for row, name in enumerate(self.names) if len(name) > LONGEST_NAME), None)
+        if long is not None:
+            raise InputError(
+                f"TextTable: name {self.names[long][:LONGEST_SHOWN]!r}… in row {long} has {len(self.names[long]):,} "
+                f"characters, expected at most {LONGEST_NAME:,}"
+            )
+        if not self.names or table.ndim != 2 or len(table) != len(self.names):
+            raise InputError(f"TextTable: expected one embedding a name, got {len(self.names)} names and {table.shape}")
+        if table.shape[1] != self.space.channels or self.mean.shape != (self.space.channels,):
+            raise InputError(
+                f"TextTable: expected {self.space.channels} channels ({self.space.name}), got embeddings of "
+                f"{table.shape[1]} and a mean of {self.mean.shape}"
+            )
+        norms = np.sqrt((table.astype(np.float64) ** 2).sum(axis=1))
+        bad = np.flatnonzero(~(np.abs(norms - 1) <= UNIT_TOLERANCE))
+        if bad.size or not np.isfinite(self.mean).all():
+            first = "the mean is not finite"
+            if bad.size:
+                first = f"{self.names[bad[0]][:LONGEST_SHOWN]!r} has norm {norms[bad[0]]:.4g}"
+            raise InputError(f"TextTable: expected finite unit vectors, {first} ({bad.size} bad of {len(norms)} rows)")
+        for row, name in enumerate(self.names):
+            key = normalise(name)
+            if not key or key in self._row_of:
+                wrong = "repeated" if key else "empty"
+                raise InputError(f"TextTable: name {name[:LONGEST_SHOWN]!r} in row {row} is {wrong}")
+            self._row_of[key] = row
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def find(self, word: str) -> int | None:
+        """The row that a word means (itself, else its singular or plural), or None."""
+        key = normalise(word)
+        return next((self._row_of[form] for form in (key, *_other_numbers(key)) if form in self._row_of), None)
+
+    def near(self, word: str, count: int = 6) -> tuple[str, ...]:
+        """Names that a user may have meant: names that share a word with it first, then those spelt alike."""
+        row_of, key = self._row_of, normalise(word)
+        tokens = {form for token in key.split() for form in (token, *_other_numbers(token))}
+        sharing = [name for name in row_of if tokens & set(name.split())]
+        sharing.sort(key=lambda name: (-difflib.SequenceMatcher(None, key, name).ratio(), name))
+        alike = difflib.get_close_matches(key, list(row_of), n=count, cutoff=0.6)
+        found = dict.fromkeys([*alike[:1], *sharing, *alike])
+        return tuple(self.names[row_of[name]] for name in list(found)[:count])
+
+    def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
+        """The embeddings of words, forgiving case, blanks, `_`, `-`, a leading article and simple plurals.
+
+        Raises:
+            InputError: words that the table does not have; the message says which names are near.
+        """
+        rows = [self.find(word) for word in words]
+        unknown = [word for word, row in zip(words, rows, strict=True) if row is None]
+        if unknown:
+            parts = [f"{word[:LONGEST_SHOWN]!r}{_did_you_mean(self.near(word[:LONGEST_NAME]))}" for word in unknown[:3]]
+            more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
+            space = self.space.name[:LONGEST_SHOWN]
+            raise InputError(f"not among the {len(self)} words of {space}: {'; '.join(parts)}{more}")
+        return self.embeddings[np.array(rows, np.int64)]
+
+
+def _did_you_mean(names: Sequence[str]) -> str:
+    return f" (near: {', '.join(name[:LONGEST_SHOWN] for name in names)})" if names else " (no name is near)"
+
+
+def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) -> TextTable:
+    """A table from names and their unit vectors of any float type; `encoder` names what made them.
+
+    Rows are normalised in float32, which undoes the rounding of a float16 file.
+
+    Raises:
+        InputError: repeated or empty names, rows that are not finite unit vectors, sizes that differ.
+    """
+    table = np.ascontiguousarray(embeddings, dtype=np.float32)
+    if table.ndim != 2 or 0 in table.shape:
+        raise InputError(f"text table of {encoder}: expected embeddings [names, channels], got shape {table.shape}")
+    table = unrounded(table)
+    space = FeatureSpace(name=encoder, channels=table.shape[1], text_encoder=encoder)
+    mean = table.mean(axis=0, dtype=np.float64).astype(np.float32)
+    return TextTable(names=tuple(names), embeddings=table, space=space, mean=mean)
+
+
+def unrounded(table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C D"]:
+    """Unit vectors from rounded ones; rows far from unit length stay as they are, for TextTable to complain about."""
+    norms = np.linalg.norm(table, axis=1, keepdims=True)
+    rounded = np.abs(norms - 1) <= UNIT_TOLERANCE
+    return np.asarray(np.where(rounded, table / np.where(rounded, norms, 1), table))
+
+
+def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
+    """Reads an `.npz` with `names` and `embeddings`, or a `.safetensors` of `save_text_table`.
+
+    Args:
+        path: the file.
+        encoder: what made the embeddings. Left empty, it is what the file says in an entry `encoder`, else the file's
+            name without a trailing "_names".
+
+    Raises:
+        InputError: missing, damaged or hostile, or not such a table.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; expected a text table (.npz or .safetensors)")
+    with file.open("rb") as stream:
+        zipped = stream.read(2) == b"PK"
+    if zipped or file.suffix == ".npz":
+        return _read_npz(file, encoder)
+    return _read_version_1(file) if _is_version_1(file) else _read_archive(file)
+
+
+def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float32", "float16"] = "float32") -> None:
+    """Writes the table as an archive of embeddings and mean, with the names and the space in its header.
+
+    Args:
+        path: the file.
+        table: to store.
+        dtype: of the embeddings; float16 halves the file.
+
+    Raises:
+        InputError: the file cannot be written; what was there before stays.
+    """
+    space = {item.name: getattr(table.space, item.name) for item in fields(table.space)}
+    arrays = {"embeddings": table.embeddings.astype(dtype), "mean": table.mean}
+    write_archive(Path(path), arrays, {"names": list(table.names), "space": space, "dtype": dtype})
+
+
+def _read_archive(file: Path) -> TextTable:
+    with open_archive(file) as archive:
+        dtype = archive.value("dtype", str)
+        if dtype not in ("float32", "float16"):
+            raise InputError(f"{file}: expected embeddings of float32 or float16, got {dtype[:20]!r}")
+        arrays = {
+            "embeddings": archive.array("embeddings", dtype, ("C", "D")),
+            "mean": archive.array("mean", "float32", ("D",)),
+        }
+        return _table(file, archive.value("names", list), archive.value("space", dict), arrays)
+
+
+def _is_version_1(file: Path) -> bool:
+    """Whether a safetensors file is a text table as the first version wrote it: with a format of its own, and without
+    checksums."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(file, framework="np") as stored:
+            return (stored.metadata() or {}).get("format") == FORMAT_1
+    except (OSError, SafetensorError, ValueError) as error:
+        raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
+
+
+def _read_version_1(file: Path) -> TextTable:
+    from safetensors import SafetensorError, safe_open
+
+    warn_without_checksums(file)
+    try:
+        with safe_open(file, framework="np") as stored:
+            arrays = {name: stored.get_tensor(name) for name in ("embeddings", "mean")}
+            header = json.loads(stored.metadata()["table"])
+        names, space = header["names"], header["space"]
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
+    return _table(file, names, space, arrays)
+
+
+def _table(file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray]) -> TextTable:
+    """A table of what a file holds.
+
+    Raises:
+        InputError: other types, shapes or values than a table has.
+    """
+    shapes = arrays["embeddings"].ndim == 2 and arrays["mean"].ndim == 1
+    types = arrays["embeddings"].dtype in (np.float32, np.float16) and arrays["mean"].dtype == np.float32
+    texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    texts &= isinstance(space, dict) and set(space) <= {item.name for item in fields(FeatureSpace)}
+    texts = texts and all(isinstance(value, int if key == "channels" else str) for key, value in space.items())
+    if not texts or not {"name", "channels"} <= set(space) or not shapes or not types:
+        raise InputError(
+            f"{file}: expected embeddings [C, D] of float32 or float16, a float32 mean [D], names and a space of text"
+        )
+    if arrays["embeddings"].dtype == np.float16:
+        arrays["embeddings"] = unrounded(arrays["embeddings"].astype(np.float32))
+    with about(file):
+        return TextTable(names=tuple(names), space=FeatureSpace(**space), **arrays)
+
+
+def _read_npz(file: Path, encoder: str) -> TextTable:
+    wanted = {"names": ("U", 1), "embeddings": ("f", 2)}
+    arrays = read_npz(file, wanted, {"encoder": ("U", 0)}, longest_text=LONGEST_NAME)
+    made_by = encoder or str(arrays.get("encoder", "")) or file.stem.removesuffix("_names")
+    try:
+        return make_text_table([str(name) for name in arrays["names"]], arrays["embeddings"], made_by)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+
+
+def _one_line(error: BaseException) -> str:
+    return (" ".join(str(error).split()) or type(error).__name__)[:200]

@@ -1,0 +1,150 @@
+"""Random changes to a splat that leave what it shows the same: turned, mirrored, scaled, shaken, in other light."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+
+from gsencoder.core.errors import InputError
+from gsencoder.geometry import sh_basis
+from gsencoder.types import SH_C0, Gaussians
+
+_DIRECTIONS = 64
+"""Directions over which harmonics are turned: more than enough for the 16 coefficients of degree 3."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AugmentConfig:
+    """How much a training sample may differ from its scene; zeros leave it as it is."""
+
+    turn: float = field(default=180.0, metadata={"help": "largest rotation about the scene's up, degrees either way"})
+    tilt: float = field(default=3.0, metadata={"help": "standard deviation of the tilt of up, degrees"})
+    mirror: float = field(default=0.5, metadata={"help": "share of samples that are mirrored"})
+    scale: float = field(default=0.1, metadata={"help": "largest change of size, as a share"})
+    jitter: float = field(default=0.1, metadata={"help": "standard deviation of each centre's shift, in voxels"})
+    drop: float = field(default=0.2, metadata={"help": "largest share of Gaussians that are left out"})
+    light: float = field(default=0.2, metadata={"help": "largest change of brightness, as a share"})
+    tint: float = field(
+        default=0.08, metadata={"help": "largest change of each colour channel, and of black, as a share"}
+    )
+    noise: float = field(default=0.02, metadata={"help": "standard deviation of each Gaussian's colour, white being 1"})
+
+    def __post_init__(self) -> None:
+        for name in ("turn", "tilt", "jitter", "noise"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        for name in ("turn", "tilt"):
+            if getattr(self, name) > 360:
+                raise InputError(f"{name}: expected at most 360 degrees, got {getattr(self, name)}")
+        for name in ("mirror", "drop", "scale", "light", "tint"):
+            if not 0 <= getattr(self, name) <= (1 if name == "mirror" else 0.9):
+                most = 1 if name == "mirror" else 0.9
+                raise InputError(f"{name}: expected a share from 0 to {most}, got {getattr(self, name)}")
+
+
+def augment(
+    gaussians: Gaussians,
+    rng: np.random.Generator,
+    config: AugmentConfig,
+    *,
+    voxel: float,
+    up: Float64[np.ndarray, "3"] | None = None,
+) -> Gaussians:
+    """One random version, row by row the same Gaussians.
+
+    Args:
+        gaussians: world units.
+        rng: everything random comes from it.
+        config: how much may change; `drop` is not done here, since rows would go (see `data.batch`).
+        voxel: the unit of `jitter`, world units.
+        up: the axis of `turn`; the world's z where it is not known.
+    """
+    axis = np.array([0.0, 0.0, 1.0]) if up is None else up
+    rotation = _rotation(axis, math.radians(rng.uniform(-config.turn, config.turn)))
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across = _rotation(axis, rng.uniform(0, 2 * math.pi)) @ (across / np.linalg.norm(across))
+    rotation = _rotation(across, math.radians(rng.normal(0, config.tilt))) @ rotation
+    if rng.random() < config.mirror:
+        rotation = rotation @ (np.eye(3) - 2 * np.outer(across, across))
+    turned = turn(gaussians, rotation, float(rng.uniform(1 - config.scale, 1 + config.scale)))
+    shift = rng.uniform(0, voxel, 3) + rng.normal(0, config.jitter * voxel, turned.means.shape)
+    return replace(
+        turned,
+        means=(turned.means + shift).astype(np.float32),
+        sh=_relight(turned.sh, rng, config),
+    )
+
+
+def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float = 1.0) -> Gaussians:
+    """The splat after x → scale · to_from · x: means, quats, scales and harmonics together.
+
+    Args:
+        gaussians: world units.
+        to_from: a rotation, or a rotation with a mirror: any orthonormal matrix.
+        scale: > 0.
+
+    Raises:
+        InputError: not orthonormal, or a scale that is not positive.
+    """
+    if np.abs(to_from @ to_from.T - np.eye(3)).max() > 1e-6 or not 0 < scale < math.inf:
+        raise InputError("turn: expected an orthonormal matrix and a positive scale")
+    mirrored = np.linalg.det(to_from) < 0
+    # A Gaussian looks the same mirrored through its centre, so −M turns its axes as M does, and is a rotation.
+    quat = _quat(-to_from if mirrored else to_from)
+    return Gaussians(
+        means=(gaussians.means.astype(np.float64) @ (scale * to_from.T)).astype(np.float32),
+        quats=_multiply(quat, gaussians.quats),
+        scales=(gaussians.scales * np.float32(scale)).astype(np.float32),
+        opacities=gaussians.opacities,
+        sh=_turn_sh(gaussians.sh, to_from),
+    )
+
+
+def _turn_sh(sh: Float32[np.ndarray, "N K 3"], to_from: np.ndarray) -> Float32[np.ndarray, "N K 3"]:
+    """Coefficients of the turned function, f'(d) = f(to_fromᵀ d), from its values in many directions: exact, since a
+    turned harmonic is a sum of harmonics of its degree."""
+    degree = math.isqrt(sh.shape[1]) - 1
+    if degree == 0:
+        return sh
+    place = np.arange(_DIRECTIONS) + 0.5
+    z, around = 1 - 2 * place / _DIRECTIONS, place * math.pi * (1 + 5**0.5)
+    circle = np.sqrt(1 - z * z)
+    directions = np.stack((circle * np.cos(around), circle * np.sin(around), z), axis=1)
+    there = sh_basis(torch.from_numpy(directions), degree).numpy()
+    back = sh_basis(torch.from_numpy(directions @ to_from), degree).numpy()
+    matrix = np.linalg.lstsq(there, back, rcond=None)[0]
+    return np.einsum("kj,njc->nkc", matrix, sh).astype(np.float32)
+
+
+def _relight(
+    sh: Float32[np.ndarray, "N K 3"], rng: np.random.Generator, config: AugmentConfig
+) -> Float32[np.ndarray, "N K 3"]:
+    """Brighter or darker, tinted, with noise; colours are ½ + SH_C0·dc, and all degrees are scaled alike."""
+    gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
+    changed = sh * gain
+    black = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
+    changed[:, 0] += (black + rng.normal(0, config.noise, (len(sh), 3))) / SH_C0
+    return changed.astype(np.float32)
+
+
+def _rotation(axis: np.ndarray, angle: float) -> Float64[np.ndarray, "3 3"]:
+    """Rodrigues' formula for a unit axis."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def _quat(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "4"]:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]])
+
+
+def _multiply(left: Float64[np.ndarray, "4"], right: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
+    """Hamilton's product left · right, wxyz, normalised."""
+    w, x, y, z = left
+    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    product = right @ matrix.T
+    return (product / np.linalg.norm(product, axis=1, keepdims=True)).astype(np.float32)

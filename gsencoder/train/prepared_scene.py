@@ -1,0 +1,245 @@
+"""A scene made ready for training: one file with its Gaussians, their targets, and for every view the matrix B of the
+teacher's cells beside the teacher's vectors there.
+
+The file is memory-mapped: a sample reads the Gaussians and the views that it was given and nothing else, and the data
+workers of one machine share what was read. What is read is held against its checksums the first time.
+"""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
+
+from gsencoder.core.errors import InputError, about, advised
+from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.mapped_arrays import MappedArrays
+from gsencoder.data.archive_records import camera_arrays, read_cameras
+from gsencoder.models.output_space import OutputSpace
+from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene
+
+_ARRAYS = {
+    "means": ("float32", 2),
+    "quats": ("float32", 2),
+    "scales": ("float32", 2),
+    "opacities": ("float32", 1),
+    "sh_dc": ("float32", 2),
+    "targets": ("float16", 2),
+    "weights": ("float32", 1),
+    "rows": ("int64", 1),
+    "crow": ("int64", 1),
+    "col": ("int32", 1),
+    "weight": ("float16", 1),
+    "row_targets": ("float16", 2),
+    "row_valid": ("uint8", 1),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewRows:
+    """B of one view in rows of cells, and what the teacher saw there.
+
+    Attributes:
+        crow, col, weight: compressed rows, as in `render.Blend`.
+        targets: the teacher's vectors, standard units.
+        valid: cells in which the teacher has one.
+    """
+
+    crow: Int64[np.ndarray, " P_plus_1"]
+    col: Int32[np.ndarray, " nnz"]
+    weight: Float32[np.ndarray, " nnz"]
+    targets: Float32[np.ndarray, "P channels"]
+    valid: Bool[np.ndarray, " P"]
+
+
+class PreparedScene:
+    """One prepared file. It is opened when something is first asked for, so that scenes can be sent to workers."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.name = path, path.stem
+        self._closed: MappedArrays | None = None
+
+    def __reduce__(self) -> tuple[type["PreparedScene"], tuple[Path]]:
+        return PreparedScene, (self.path,)
+
+    @cached_property
+    def _arrays(self) -> MappedArrays:
+        with self._whole():
+            arrays = MappedArrays(self.path, _ARRAYS, self._closed)
+            _check_arrays(arrays, len(self._header[0]))
+        return arrays
+
+    @cached_property
+    def _header(self) -> tuple[Cameras, float | None, list[float] | None, tuple[str, ...]]:
+        with self._whole(), open_archive(self.path) as file:
+            names = tuple(str(name) for name in file.value("views", list))
+            cameras, unit, up = (
+                read_cameras(file),
+                file.value("metres_per_unit", float, int, None),
+                file.value("up", list, None),
+            )
+            if len(names) != len(cameras):
+                raise InputError(f"{len(names)} names of views, and {len(cameras)} cameras")
+            if unit is not None and not 0 < unit < math.inf:
+                raise InputError(f"metres_per_unit: expected a positive number, got {unit}")
+            if up is not None and (len(up) != 3 or not all(isinstance(value, (int, float)) for value in up)):
+                raise InputError(f"up: expected three numbers, got {str(up)[:60]}")
+        return cameras, unit, up, names
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        with about(self.path), advised("remove the file, and it is prepared again"):
+            yield
+
+    def close(self) -> None:
+        """Lets go of the file, which is opened again when something is asked for."""
+        arrays: MappedArrays | None = self.__dict__.pop("_arrays", None)
+        if arrays is not None:
+            arrays.close()
+            self._closed = arrays
+
+    def __len__(self) -> int:
+        return self._arrays.shape("means")[0]
+
+    @property
+    def cameras(self) -> Cameras:
+        return self._header[0]
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        return self._header[1]
+
+    @property
+    def up(self) -> Float64[np.ndarray, "3"] | None:
+        return None if self._header[2] is None else np.array(self._header[2], np.float64)
+
+    @property
+    def view_names(self) -> tuple[str, ...]:
+        return self._header[3]
+
+    @property
+    def channels(self) -> int:
+        """Columns of the targets."""
+        return self._arrays.shape("targets")[1]
+
+    @property
+    def means(self) -> Float32[np.ndarray, "N 3"]:
+        return self._arrays.whole("means")
+
+    @property
+    def weights(self) -> Float32[np.ndarray, " N"]:
+        """How much each Gaussian was seen; 0 = never, and it has no target."""
+        return self._arrays.whole("weights")
+
+    def gaussians(self, rows: np.ndarray) -> Gaussians:
+        """Some of the Gaussians, with degree-0 colours."""
+        with self._whole():
+            parts = {name: self._arrays.rows(name, rows) for name in ("means", "quats", "scales", "opacities", "sh_dc")}
+        sh = parts.pop("sh_dc")[:, None]
+        return Gaussians(**parts, sh=sh)
+
+    def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
+        """What the encoder should give for these Gaussians, standard units; zero where never seen."""
+        with self._whole():
+            return self._arrays.rows("targets", rows).astype(np.float32)
+
+    def view(self, view: int) -> ViewRows:
+        """One view's rows."""
+        first, last = (int(row) for row in self._arrays.whole("rows")[view : view + 2])
+        crow = np.array(self._arrays.whole("crow")[first : last + 1])
+        start, end = int(crow[0]), int(crow[-1])
+        with self._whole():
+            found = ViewRows(
+                crow=crow - start,
+                col=np.array(self._arrays.part("col", start, end)),
+                weight=self._arrays.part("weight", start, end).astype(np.float32),
+                targets=self._arrays.part("row_targets", first, last).astype(np.float32),
+                valid=self._arrays.part("row_valid", first, last).astype(bool),
+            )
+            inside = (found.col >= 0) & (found.col < len(self))
+            if not inside.all() or not (found.weight >= 0).all() or not np.isfinite(found.targets).all():
+                raise InputError(f"view {self.view_names[view]!r} has entries that no Blend has")
+        return found
+
+
+def _check_arrays(arrays: MappedArrays, views: int) -> None:
+    """Whether the arrays fit together, and what is looked at of every Gaussian is sound. Entries of B and targets are
+    looked at where they are used: here that would read the whole file."""
+    stored = {name: arrays.shape(name) for name in _ARRAYS}
+    sizes = {name: shape[0] for name, shape in stored.items()}
+    columns = {name: shape[1:] for name, shape in stored.items()}
+    n, rows, crow = sizes["means"], arrays.whole("rows"), arrays.whole("crow")
+    width = columns["targets"]
+    shapes = [("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ()), ("sh_dc", (3,)), ("weights", ())]
+    good = all(sizes[name] == n and columns[name] == wanted for name, wanted in [*shapes, ("targets", width)])
+    good &= columns["row_targets"] == width
+    good &= sizes["rows"] == views + 1 and bool((np.diff(rows) >= 0).all()) and rows[0] == 0
+    cells = int(rows[-1]) if sizes["rows"] else 0
+    good &= sizes["crow"] == cells + 1 and sizes["row_targets"] == sizes["row_valid"] == cells
+    good = bool(good) and crow[0] == 0 and bool((np.diff(crow) >= 0).all())
+    if not good or not crow[-1] == sizes["col"] == sizes["weight"]:
+        raise InputError("its arrays do not fit together")
+    if not np.isfinite(arrays.whole("means")).all() or not (arrays.whole("weights") >= 0).all():
+        raise InputError("it has positions that are not finite, or weights below 0")
+
+
+def write_prepared(
+    path: Path,
+    scene: Scene,
+    features: GaussianFeatures,
+    outputs: OutputSpace,
+    views: list[ViewRows],
+    *,
+    source: Path,
+) -> None:
+    """Writes a scene with its fused targets and the rows of all its views.
+
+    Args:
+        path: of the file.
+        scene: with Gaussians and cameras.
+        features: fused, in the basis of `outputs`.
+        outputs: the dataset's.
+        views: one for each camera.
+        source: where the scene was read from.
+
+    Raises:
+        InputError: features of another space, or the disk is full.
+    """
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    if features.space != outputs.space or features.features.shape[1] != outputs.channels:
+        raise InputError(
+            f"prepare: expected features of ({outputs.space.describe()}), got ({features.space.describe()})"
+        )
+    gaussians = scene.gaussians
+    sizes = [len(view.valid) for view in views]
+    entries = np.cumsum([0, *(len(view.col) for view in views)])
+    arrays = {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": gaussians.scales,
+        "opacities": gaussians.opacities,
+        "sh_dc": gaussians.sh[:, 0],
+        "targets": np.where(features.seen[:, None], outputs.standardize(features.features), 0).astype(np.float16),
+        "weights": features.weights,
+        "rows": np.cumsum([0, *sizes]).astype(np.int64),
+        "crow": np.concatenate(
+            [view.crow[:-1] + start for view, start in zip(views, entries[:-1], strict=True)] + [entries[-1:]]
+        ).astype(np.int64),
+        "col": np.concatenate([view.col for view in views]),
+        "weight": np.concatenate([view.weight for view in views]).astype(np.float16),
+        "row_targets": np.concatenate([view.targets for view in views]).astype(np.float16),
+        "row_valid": np.concatenate([view.valid for view in views]).astype(np.uint8),
+        **camera_arrays(scene.views.cameras),
+    }
+    header = {
+        "source": str(source.resolve()),
+        "views": list(scene.views.names),
+        "metres_per_unit": scene.metres_per_unit,
+        "up": None if scene.up is None else scene.up.tolist(),
+    }
+    write_archive(path, arrays, header)

@@ -1,0 +1,38 @@
+"""What tests of `reconstruct` look at."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from reconstructions import QUICK
+
+from gsencoder.app import cli
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rooms") / "room"
+    write_room(make_room(0, objects=4, views=6, width=120, height=90), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def built(room: Path) -> Path:
+    out = room.parent / "built"
+    assert cli.main(["reconstruct", str(room), f"out={out}", *QUICK]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def ten(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten photographs that belong together, and one that shows nothing."""
+    from PIL import Image
+
+    folder = tmp_path_factory.mktemp("ten") / "photographs"
+    folder.mkdir()
+    for path in sorted((shared / "scenes" / "plush" / "images").iterdir())[:10]:
+        shutil.copy(path, folder)
+    Image.new("RGB", (720, 540), (90, 90, 90)).save(folder / "grey.jpg")
+    return folder

@@ -1,0 +1,44 @@
+"""Where the words of `localize` come from."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from gsencoder.app.commands.localize import LocalizeCommandConfig
+from gsencoder.app.commands.query_words import LARGEST_QUERIES, asked_words
+from gsencoder.core.errors import InputError
+
+
+def words(**settings: object) -> list[str]:
+    config = LocalizeCommandConfig(**settings)  # type: ignore[arg-type]
+    return asked_words(config.query, config.queries)
+
+
+def test_words_of_query_and_file_are_asked_once_each_in_order(tmp_path: Path) -> None:
+    (tmp_path / "q.txt").write_bytes("\ufeffmug\r\n\n  red ball \nmug\n".encode())
+    assert words(query=(" ball", "mug"), queries=str(tmp_path / "q.txt")) == ["ball", "mug", "red ball"]
+
+
+@pytest.mark.parametrize("content", [b"", b"\n \n", b"\xef\xbb\xbf"])
+def test_no_word_at_all_is_an_error(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "q.txt").write_bytes(content)
+    with pytest.raises(InputError, match="query= is missing"):
+        words(queries=str(tmp_path / "q.txt"))
+
+
+def test_a_file_of_queries_must_be_a_text_file_of_sensible_size(tmp_path: Path) -> None:
+    (tmp_path / "q.txt").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match="cannot be read as text"):
+        words(queries=str(tmp_path / "q.txt"))
+    (tmp_path / "q.txt").write_bytes(b"x" * (LARGEST_QUERIES + 1))
+    with pytest.raises(InputError, match="holds more than 1,048,576 bytes"):
+        words(queries=str(tmp_path / "q.txt"))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_what_is_no_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, tmp_path / "nothing", Path("/dev/zero")):
+        with pytest.raises(InputError, match="is no file; expected a text file"):
+            words(queries=str(path))

@@ -1,0 +1,248 @@
+"""`reconstruct`, as a user runs it: RGB-D, points, a splat to refine, photographs alone, and what goes wrong."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from archives import flip_bit
+from reconstructions import QUICK, interrupt, never, refusal, summary_of
+
+from gsencoder.app import cli
+from gsencoder.app.commands import reconstruct
+from gsencoder.core.errors import InputError
+from gsencoder.data.splats import load_splat
+from gsencoder.reconstruct.score import split
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_room_becomes_a_splat_with_a_log_and_pictures(built: Path) -> None:
+    results = summary_of(built)["results"]
+    assert (results["source"], results["steps"], results["views"], results["held_out"]) == ("depth", 12, 4, 2)
+    splat = load_splat(built / results["splat"])
+    assert len(splat) == results["gaussians"] > 500
+    assert splat.sh_degree == 1
+    lines = (built / "log.csv").read_text().splitlines()
+    assert lines[0] == "step,seconds,gaussians,psnr,ssim,seen_psnr,seen_ssim,seen"
+    first, last = (dict(zip(lines[0].split(","), map(float, line.split(",")), strict=True)) for line in lines[1:])
+    assert (first["step"], last["step"]) == (0, 12)
+    assert last["psnr"] == results["psnr"] > first["psnr"]
+    assert last["seen_psnr"] == results["seen_psnr"] > first["seen_psnr"]
+    assert last["seen"] == first["seen"] == results["seen"] > 0.3
+    assert (built / "held_out.png").is_file()
+    assert not built.with_name("built.reconstruction").exists()
+
+
+def test_a_splat_is_refined(room: Path, built: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = [str(room), f"splat={built / 'splat.ply'}", f"out={out}", *QUICK]
+    assert cli.main(["reconstruct", *words]) == 0
+    results = summary_of(out)["results"]
+    assert results["source"] == "splat"
+    assert results["psnr"] > summary_of(built)["results"]["psnr"]
+
+
+def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(
+    room: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    advance = reconstruct.Optimizer.advance
+
+    def stop_at_five(self: reconstruct.Optimizer) -> dict[str, float]:
+        if self.step == 5:
+            raise KeyboardInterrupt
+        return advance(self)
+
+    words = ["reconstruct", str(room), f"out={out}", *QUICK]
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", stop_at_five)
+        assert cli.main(words) == 130
+    assert not out.exists()
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct, "start_of", never)
+        assert cli.main(words) == 0
+    results = summary_of(out)["results"]
+    assert {name: results[name] for name in ("seeds", "source")} == {
+        name: summary_of(built)["results"][name] for name in ("seeds", "source")
+    }
+    found, whole = load_splat(out / "splat.ply"), load_splat(built / "splat.ply")
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", stop_at_five)
+        assert cli.main([*words, "overwrite=true"]) == 130
+    assert (out / "splat.ply").is_file()
+
+
+def test_photographs_alone_are_placed_or_refused_in_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], room: Path
+) -> None:
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    assert "neither a scene nor a folder of scenes" in refusal(capsys, str(alone))
+    for number, path in enumerate(sorted((room / "images").iterdir())[:2]):
+        shutil.copy(path, alone / f"{number}{path.suffix}")
+    assert "expected at least 3 photographs" in refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
+    from PIL import Image
+
+    for number in range(4):
+        Image.new("RGB", (80, 60), (60 * number, 90, 20)).save(alone / f"{number}.png")
+    told = refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
+    assert "could be placed" in told or "cannot place these photographs" in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_photographs_alone_are_placed_once_and_become_a_splat(
+    tmp_path: Path, ten: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = shutil.copytree(ten, tmp_path / "photographs"), tmp_path / "out"
+    words = [str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25", "dense.spacing=3"]
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", interrupt)
+        assert cli.main(["reconstruct", *words]) == 130
+    work = out.with_name("out.reconstruction")
+    placed = (work / "placed.json").read_bytes()
+    monkeypatch.setattr("gsencoder.reconstruct.sfm.load_pycolmap", never)
+    # Places of another placement would put old Gaussians into a new world.
+    for damaged in (
+        b"",
+        b"[]",
+        b"{}",
+        b'{"asked": 1}',
+        placed[:-9],
+        placed.replace(b"found", b"lost"),
+        placed.replace(b"grey", b"gray"),
+        b"\xff\xfe",
+    ):
+        (work / "placed.json").write_bytes(damaged)
+        assert "where its photographs were placed (placed.json, sparse/0) is gone or damaged" in refusal(capsys, *words)
+    (work / "placed.json").write_bytes(placed)
+    for file in sorted((work / "sparse" / "0").iterdir()):
+        flip_bit(file, 4 * file.stat().st_size)
+        assert "(placed.json, sparse/0) is gone or damaged" in refusal(capsys, *words)
+        flip_bit(file, 4 * file.stat().st_size)
+    os.utime(folder / "grey.jpg", ns=(1, 1))
+    assert "belongs to other photographs" in refusal(capsys, *words)
+    shutil.copystat(ten / "grey.jpg", folder / "grey.jpg")
+    capsys.readouterr()
+    assert cli.main(["reconstruct", *words]) == 0
+    assert "could not be placed and are not used: grey.jpg" in capsys.readouterr().err
+    results = summary_of(out)["results"]
+    assert results["missing"] == ["grey.jpg"]
+    assert results["placed"] == 10
+    assert results["swept"] > results["filled"] / 10 > 0
+    assert len(load_splat(out / "splat.ply")) > 5000
+    assert "in another; give a scene with the poses" in refusal(
+        capsys, str(folder), f"out={tmp_path / 'refined'}", f"splat={out / 'splat.ply'}"
+    )
+
+
+def test_photographs_that_cannot_be_placed_are_told_before_any_is(
+    ten: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [str(tmp_path), f"out={tmp_path / 'out'}"]
+    monkeypatch.setattr("gsencoder.reconstruct.sfm._find_features", never)
+    for path in sorted(ten.iterdir())[:4]:
+        shutil.copy(path, tmp_path)
+    assert "sfm.camera: expected one of DIVISION" in refusal(capsys, *words, "sfm.camera=NOPE")
+    assert "sfm: size and features: expected" in refusal(capsys, *words, "sfm.size=99999999999")
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes((tmp_path / "20240212_003919.jpg").read_bytes()[:5000])
+    assert "bad.jpg: cannot be decoded" in refusal(capsys, *words)
+    bad.write_bytes(b"")
+    assert "bad.jpg: not a readable picture" in refusal(capsys, *words)
+    bad.unlink()
+    bad.symlink_to("nowhere.jpg")
+    assert "bad.jpg: no such file" in refusal(capsys, *words)
+    bad.unlink()
+    shutil.copy(tmp_path / "20240212_003919.jpg", os.fsencode(tmp_path) + b"/caf\xe9.jpg")
+    assert "has bytes that are no text" in refusal(capsys, *words)
+
+
+def test_films_beside_photographs_are_named(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in sorted((room / "images").iterdir())[:3]:
+        shutil.copy(path, tmp_path)
+    (tmp_path / "film.MP4").write_bytes(b"")
+    (tmp_path / ".hidden.jpg").write_bytes(b"")
+    assert cli.main(["reconstruct", str(tmp_path), f"out={tmp_path / 'out'}", "quiet=true"]) == 2
+    assert "1 files are in formats that cannot be placed and are not used: film.MP4" in capsys.readouterr().err
+
+
+def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, out = shutil.copytree(room, tmp_path / "scene"), tmp_path / "out"
+    words = [str(scene), f"out={out}", *QUICK]
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", interrupt)
+        assert cli.main(["reconstruct", *words]) == 130
+    log = out.with_name("out.reconstruction") / "log.csv"
+    text = log.read_text()
+    log.write_text(text.replace(".", "x"))
+    told = refusal(capsys, *words)
+    assert "log.csv: damaged: could not convert" in told
+    assert told.endswith("give resume=false to begin anew")
+    log.write_text(text)
+    first, second = sorted((scene / "images").iterdir())[:2]
+    shutil.copy(second, first)
+    assert "was made with photographs=" in refusal(capsys, *words)
+    assert cli.main(["reconstruct", *words, "resume=false"]) == 0
+
+
+def test_a_held_out_photograph_that_is_masked_all_over_is_named_and_not_judged_by(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    scene, out = shutil.copytree(room, tmp_path / "scene"), tmp_path / "out"
+    record = json.loads((scene / "transforms.json").read_text())
+    (scene / "masks").mkdir()
+    for number, frame in enumerate(record["frames"]):
+        Image.new("L", (120, 90), 255 if number else 0).save(scene / "masks" / f"{number}.png")
+        frame["mask_path"] = f"masks/{number}.png"
+    (scene / "transforms.json").write_text(json.dumps(record))
+    assert cli.main(["reconstruct", str(scene), f"out={out}", *QUICK]) == 0
+    assert "1 of 2 held-out photographs are masked all over and not used" in capsys.readouterr().err
+    results = summary_of(out)["results"]
+    assert results["held_out"] == 1
+    assert results["psnr"] > 5
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["holdout=1"], "holdout: expected 0 (none) or 2 and more"),
+        (["data.max_views=2", "holdout=2"], "expected at least 2 photographs to fit"),
+        (["optimize.steps=-1"], "optimize.steps: expected 0 or more"),
+        (["seeds.source=points"], "has no structure-from-motion points"),
+        pytest.param(
+            ["device=cuda"], "sees no GPU", marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is one")
+        ),
+        (["splat=nothing.ply"], "nothing.ply"),
+    ],
+)
+def test_what_cannot_be_is_told(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], told: str
+) -> None:
+    assert told in refusal(capsys, str(room), f"out={tmp_path / 'out'}", *words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bare_splat_cannot_be_fitted_to_anything(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = refusal(capsys, str(built / "splat.ply"), f"out={tmp_path / 'out'}")
+    assert "a splat without photographs" in told
+
+
+def test_every_eighth_photograph_is_kept() -> None:
+    assert split(10, 4) == ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
+    assert split(3, 0) == ([0, 1, 2], [])
+    with pytest.raises(InputError, match="at least 2 photographs"):
+        split(2, 2)

@@ -1,0 +1,131 @@
+"""`reconstruct` when it is cut off, refused by the disk, or given what it was not meant for: no work is lost."""
+
+import errno
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from reconstructions import QUICK, interrupt, never, refusal, summary_of
+
+from gsencoder.app import cli
+from gsencoder.app.commands import reconstruct
+from gsencoder.core.errors import InputError
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(
+    room: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, score, calls = tmp_path / "out", reconstruct.score, []
+
+    def cut_off_at_the_last(*given: object) -> object:
+        calls.append(given)
+        return interrupt() if len(calls) == 2 else score(*given)
+
+    words = ["reconstruct", str(room), f"out={out}", *QUICK]
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct, "score", cut_off_at_the_last)
+        assert cli.main(words) == 130
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct.Optimizer, "advance", never)
+        assert cli.main(words) == 0
+    found, whole = (summary_of(folder)["results"] for folder in (out, built))
+    assert [found[name] for name in ("psnr", "ssim")] == [whole[name] for name in ("psnr", "ssim")]
+    steps = [line.split(",")[0] for line in (out / "log.csv").read_text().splitlines()]
+    assert steps == ["step", "0", "12"]
+
+
+def test_results_that_cannot_be_written_cost_no_step(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    words = [str(room), f"out={tmp_path / 'out'}", *QUICK, "checkpoint_every=1000"]
+    with monkeypatch.context() as patched:
+        patched.setattr(reconstruct, "save_splat", full)
+        assert "no space left on the device: no result was written" in refusal(capsys, *words)
+    monkeypatch.setattr(reconstruct.Optimizer, "advance", never)
+    assert cli.main(["reconstruct", *words]) == 0
+
+
+def test_settings_that_cannot_work_leave_no_state_that_others_stumble_over(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(room), f"out={tmp_path / 'out'}", *QUICK]
+    assert "is raster.near small enough?" in refusal(capsys, *words, "raster.near=1e9")
+    assert cli.main(["reconstruct", *words]) == 0
+
+
+def test_photographs_that_are_masked_all_over_are_not_fitted(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    scene = shutil.copytree(room, tmp_path / "scene")
+    for path in (scene / "images").iterdir():
+        picture = Image.open(path).convert("RGBA")
+        picture.putalpha(0)
+        picture.save(path.with_suffix(".png"))
+    told = refusal(
+        capsys, str(scene), f"out={tmp_path / 'out'}", *QUICK, "seeds.source=mesh", f"seeds.mesh={_floor(scene)}"
+    )
+    assert "4 of 4 photographs to fit are masked all over" in told
+
+
+def _floor(folder: Path) -> Path:
+    """A mesh of one triangle."""
+    path = folder / "floor.obj"
+    path.write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nf 1 2 3\n")
+    return path
+
+
+def test_one_of_many_scenes_must_be_chosen(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(room, tmp_path / "house" / name)
+    assert "holds 2 scenes (a, b); give one of them" in refusal(capsys, str(tmp_path / "house"), "quiet=true")
+
+
+def test_photographs_are_placed_whatever_lies_in_folders_beside_them(
+    room: Path, ten: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(ten, tmp_path / "photographs")
+    shutil.copytree(room, folder / "room")
+    asked = []
+
+    def remembered(pictures: Path, *_: object) -> None:
+        asked.append(pictures)
+        raise InputError("stop")
+
+    monkeypatch.setattr("gsencoder.app.commands.reconstruct_scene.place_photographs", remembered)
+    assert "stop" in refusal(capsys, str(folder), f"out={folder / 'result'}", "quiet=true")
+    assert asked == [folder]
+
+
+def test_a_disk_without_room_for_the_database_is_told_before_it_fills(
+    ten: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room_left = shutil.disk_usage(tmp_path)._replace(free=1 << 20)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: room_left)
+    told = refusal(capsys, str(ten), f"out={tmp_path / 'out'}", "quiet=true")
+    assert "placing 11 photographs may take 14 MiB, and 1 are free on this disk; make room" in told
+
+
+def test_a_signal_is_ours_after_pycolmap_came(tmp_path: Path, ten: Path) -> None:
+    script = (
+        "import os, signal, sys\n"
+        "from gsencoder.app import cli\n"
+        "from gsencoder.app.commands import reconstruct\n"
+        "reconstruct.Optimizer.advance = lambda self: os.kill(os.getpid(), signal.SIGTERM)\n"
+        "sys.exit(cli.main(sys.argv[1:]))\n"
+    )
+    words = ["reconstruct", str(ten), f"out={tmp_path / 'out'}", "quiet=true", "data.image_scale=0.25"]
+    words += ["sfm.size=400", "sfm.features=2000", "dense.spacing=12"]
+    done = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + signal.SIGTERM
+    assert done.stderr.splitlines()[-1].startswith("stopped: SIGTERM")
+    assert not list(tmp_path.glob(".out.partial-*"))

@@ -1,0 +1,93 @@
+"""`gsencoder views`: what it writes, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from asked_rooms import ORIGIN, save_room
+from PIL import Image
+
+from gsencoder.app import cli
+from gsencoder.core.files.archive import open_archive
+
+pytestmark = pytest.mark.slow
+
+QUICK = ("choose.candidates=8", "choose.count=4", "choose.width=120", "choose.height=90", "quiet=true")
+
+
+@pytest.fixture(scope="module")
+def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("room") / "features"
+    save_room(folder)
+    return folder
+
+
+def test_views_are_written_with_what_they_show_and_why(features: Path, tmp_path: Path) -> None:
+    out = tmp_path / "views"
+    assert cli.main(["views", str(features), "query=cube", "grid=[3,4]", f"out={out}", *QUICK]) == 0
+    rows = json.loads((out / "views.json").read_text())
+    assert len(rows) == 4
+    for row in rows:
+        with Image.open(out / row["picture"]) as picture:
+            assert picture.size == (row["width"], row["height"])
+        (sight,) = row["sights"]
+        assert sight["target"] == "cube"
+        # The cube lies at (0.3, 0.2, 0.8) from the origin, before each camera.
+        at = np.array(row["cam_from_world"]) @ np.append(ORIGIN + np.array([0.3, 0.2, 0.8]), 1)
+        pixel = np.array(row["K"]) @ at[:3] / at[2]
+        assert at[2] > 0
+        assert 0 < pixel[0] < row["width"]
+        assert 0 < pixel[1] < row["height"]
+    assert sum(row["sights"][0]["visible"] > 0.9 for row in rows) >= 3
+    assert (out / "sheet.png").is_file()
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["results"]["judged"] <= 8
+    assert [box["query"] for box in summary["results"]["boxes"]] == ["cube"]
+    with open_archive(out / "tokens.safetensors") as file:
+        tokens = file.array("tokens", "float32", ("V", 12, 16))
+    assert len(tokens) == 4
+    assert np.isfinite(tokens).all()
+
+
+def test_several_words_and_boxes_are_looked_at_together(features: Path, tmp_path: Path) -> None:
+    out = tmp_path / "views"
+    assert cli.main(["views", str(features), "query=cube,crate", "boxes=2", f"out={out}", *QUICK]) == 0
+    rows = json.loads((out / "views.json").read_text())
+    assert [sight["target"] for sight in rows[0]["sights"]] == ["cube", "crate", "crate 2"]
+    shown = np.array([[sight["share"] for sight in row["sights"]] for row in rows])
+    assert (shown.max(axis=0) > 0.02).all()
+
+
+def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
+    out = tmp_path / "views"
+    assert cli.main(["views", str(features), "choose.method=uniform", f"out={out}", *QUICK]) == 0
+    rows = json.loads((out / "views.json").read_text())
+    assert [row["frame"] for row in rows] == [0, 4, 7, 11]
+    assert all(row["sights"] == [] for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ((), "query= is missing"),
+        (("query=cube", "boxes=0"), "boxes: expected 1 or more"),
+        (("query=cube", "grid=[3]"), "grid: expected lines and columns"),
+        (("query=cube", "grid=[0,3]"), "grid: expected lines and columns of 1 or more"),
+        (("query=zebra",), "not among the 4 words"),
+        (("query=pen holder",), "none of pen holder was found"),
+        (("query=cube", "choose.count=99"), "count: expected 1 to candidates"),
+        (("query=cube", "choose.source=nowhere"), "choose.source: expected one of both, frames, shells"),
+        (("query=cube", "space=other"), "other"),
+        (("choose.method=uniform", "grid=[3,4]", "space=other"), "none of 'other'"),
+        (("query=cube", "photos=nowhere"), "nowhere: no such file or folder"),
+    ],
+)
+def test_what_cannot_be_done_ends_in_one_line(
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
+) -> None:
+    assert cli.main(["views", str(features), *words, f"out={tmp_path / 'out'}"]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1
+    assert told in lines[0]
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,471 @@
+"""The command line as its users meet it: help, errors in one line, exit codes, interrupts, many runs."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsencoder import __version__
+from gsencoder.app import cli
+from gsencoder.app.commands import COMMANDS, Command
+from gsencoder.app.commands.repair import Fix
+from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.settings import compose
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.runtime.signals import Stopped
+from gsencoder.data.splat_formats.repair import FIXES
+from gsencoder.data.splats import load_splat, save_splat
+from gsencoder.types import Gaussians
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ToyConfig(CommonConfig):
+    paths: tuple[str, ...] = field(default=(), metadata={"help": "scenes", "metavar": "SCENE"})
+    size: int = field(default=1, metadata={"help": "how large"})
+    word: str = field(default="", metadata={"help": "what to say"})
+
+
+def write_toy(config: Any, summary: Any) -> None:
+    summary.results["size"] = config.size
+    if config.size < 0:
+        raise InputError("size: expected a positive number")
+    if config.out is not None:
+        with output_folder(config.out, overwrite=config.overwrite, summary=summary) as folder:
+            (folder / "word").write_text(config.word)
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Callable[[Any, Any], None]], None]:
+    """Makes `gsencoder toy` run the given function."""
+    conf = tmp_path / "conf"
+    conf.mkdir()
+    (conf / "toy.yaml").write_text("out: null\noverwrite: false\nquiet: false\npaths: []\nsize: 1\nword: ''\n")
+    monkeypatch.setattr(compose, "conf_folder", lambda: conf)
+
+    def install(run: Callable[[Any, Any], None]) -> None:
+        @dataclass(frozen=True, slots=True, kw_only=True)
+        class Toy(Command):
+            def load(self) -> tuple[type[CommonConfig], Callable[[Any, Any], None]]:
+                return ToyConfig, run
+
+        monkeypatch.setitem(COMMANDS, "toy", Toy(name="toy", config="ToyConfig", help="a toy"))
+
+    install(write_toy)
+    return install
+
+
+def splat(path: Path, count: int = 20) -> Path:
+    rng = np.random.default_rng(0)
+    gaussians = Gaussians(
+        means=rng.normal(size=(count, 3)).astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), 0.1, np.float32),
+        opacities=np.full(count, 0.5, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+    )
+    save_splat(path, gaussians)
+    return path
+
+
+def broken_splat(path: Path) -> Path:
+    """The first row has no rotation; everything else is in order."""
+    data = bytearray(splat(path).read_bytes())
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    row = np.frombuffer(data, np.float32, offset=start).reshape(20, -1).copy()
+    columns = [line.split()[-1] for line in data[:start].decode().splitlines() if line.startswith("property")]
+    row[0, [columns.index(f"rot_{i}") for i in range(4)]] = 0
+    path.write_bytes(bytes(data[:start]) + row.tobytes())
+    return path
+
+
+def test_help_lists_every_command_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ([], ["--help"], ["-h"]):
+        assert cli.main(words) == 0
+        text = capsys.readouterr().out
+        for command in COMMANDS.values():
+            assert f"{command.name} " in text
+            assert command.help in text
+            assert "\n" not in command.help
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_a_command_lists_every_setting_with_default_and_meaning(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gsencoder.app.settings.options import options_of
+
+    assert cli.main([name, "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for option in options_of(COMMANDS[name].load()[0]):
+        assert f"{option.key}=" in text or option.key == "paths"
+        assert option.help in text
+    assert "out=" in text
+    assert "[false]" in text
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"gsencoder {__version__}\n"
+
+
+def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -> None:
+    from omegaconf import OmegaConf
+
+    assert cli.main(["repair", "a b.ply", "fix=quats,huge", "out=null", "--cfg"]) == 0
+    data = OmegaConf.to_container(OmegaConf.create(capsys.readouterr().out))
+    assert data == {
+        "out": "null",
+        "overwrite": False,
+        "quiet": False,
+        "paths": ["a b.ply"],
+        "fix": ["quats", "huge"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["inspct"], "inspct: no such command; did you mean inspect?"),
+        (["zzz"], "zzz: no such command (gsencoder --help lists them)"),
+        (["inspect", "--overwrit"], "--overwrit: no such flag"),
+        (["inspect", "--hepl"], "--hepl: no such flag; did you mean --help?"),
+        (["inspect", "--out=x"], "--out=…: no such flag; settings are written out=…"),
+        (["inspect", "a.ply", "overwrit=true"], "did you mean overwrite?"),
+        (["inspect"], "SPLAT is missing: splat files"),
+        (["inspect", ""], "a path is empty"),
+        (["inspect", "no/such.ply"], "no/such.ply: no such file"),
+        (["repair", "a.ply"], "out= is missing"),
+        (["repair", "a.ply", "b.ply", "out=x.ply"], "paths: expected one splat file, got 2"),
+        (["repair", "a.ply", "fix=quat", "out=x.ply"], "got 'quat'; did you mean quats?"),
+        (["repair", "a.ply", "fix=", "out=x.ply"], "fix: expected the name of a defect, got none"),
+        (["inspect", "a.ply", "quiet=x\ny"], "quiet: expected true or false"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_and_exit_code_2(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+
+
+def test_debug_shows_where_an_error_came_from(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["inspect", "no/such.ply", "--debug"]) == 2
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert err.splitlines()[-1] == "error: no/such.ply: no such file"
+
+
+def test_inspect_prints_a_table_and_writes_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, bad = splat(tmp_path / "good.ply"), broken_splat(tmp_path / "bad.ply")
+    assert cli.main(["inspect", str(good), str(bad), f"out={tmp_path / 'out'}"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "1 rows (0); stops loading" in out
+    record = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert record["command"] == "inspect"
+    assert [item["loadable"] for item in record["results"]["splats"]] == [True, False]
+    assert [item["count"] for item in record["results"]["splats"]] == [20, 20]
+    assert record["settings"]["paths"] == [str(good), str(bad)]
+
+
+def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = splat(tmp_path / "good.ply")
+    assert cli.main(["inspect", str(path), "quiet=true", f"out={tmp_path / 'out'}"]) == 0
+    assert cli.main(["repair", str(path), "quiet=true", f"out={tmp_path / 'new.ply'}"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert (tmp_path / "out" / "summary.json").exists()
+
+
+def test_repair_mends_what_was_asked_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad, new = broken_splat(tmp_path / "bad.ply"), tmp_path / "new.ply"
+    with pytest.raises(InputError, match="gsencoder repair"):
+        load_splat(bad)
+    assert cli.main(["repair", str(bad), f"out={new}", "fix=nonfinite"]) == 2
+    assert "with a zero quaternion" in capsys.readouterr().err
+    assert not new.exists()
+    assert cli.main(["repair", str(bad), f"out={new}", "fix=nonfinite,quats"]) == 0
+    assert "quats: 1 rows set to the identity rotation" in capsys.readouterr().out
+    np.testing.assert_array_equal(load_splat(new).quats[0], [1, 0, 0, 0])
+    record = json.loads(Path(f"{new}.summary.json").read_text())
+    assert [change["count"] for change in record["results"]["changes"]] == [0, 1]
+    assert cli.main(["repair", str(bad), f"out={new}"]) == 2
+    assert "exists; give another out= or overwrite=true" in capsys.readouterr().err
+    assert cli.main(["repair", str(bad), f"out={new}", "overwrite=true"]) == 0
+
+
+def test_repair_keeps_positions_that_float32_cannot_hold(tmp_path: Path) -> None:
+    path, far = tmp_path / "far.ply", np.array([500_000.0, 4_500_000.0, 100.0])
+    gaussians = load_splat(splat(tmp_path / "near.ply"))
+    save_splat(path, gaussians, origin=far)
+    assert cli.main(["repair", str(path), f"out={tmp_path / 'new.ply'}", "quiet=true"]) == 0
+    np.testing.assert_allclose(load_splat(tmp_path / "new.ply", origin=far).means, gaussians.means, atol=1e-6)
+
+
+def test_repair_offers_every_fix_there_is() -> None:
+    from typing import get_args
+
+    assert get_args(Fix) == (*FIXES, "all")
+
+
+def test_warnings_are_lines_on_stderr_and_entries_of_the_summary(
+    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(config: Any, summary: Any) -> None:
+        for number in (1, 1, 2):
+            warnings.warn(f"{number} images\nwere left out", SceneWarning, stacklevel=1)
+        write_toy(config, summary)
+
+    toy(run)
+    assert cli.main(["toy", f"out={tmp_path / 'out'}"]) == 0
+    lines = [f"{number} images were left out" for number in (1, 1, 2)]
+    assert capsys.readouterr().err.splitlines() == [f"warning: {line}" for line in lines]
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["warnings"] == lines
+
+
+def test_a_defect_of_ours_keeps_its_traceback(toy: Any) -> None:
+    def run(config: Any, summary: Any) -> None:
+        raise ZeroDivisionError
+
+    toy(run)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["toy"])
+
+
+def wrapped(stop: Stopped) -> SystemError:
+    """As compiled code lets an exception out that a signal raised within it."""
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = stop
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (Stopped(15), 143, "stopped: SIGTERM\n"),
+        (wrapped(Stopped(15)), 143, "stopped: SIGTERM\n"),
+        (OSError(28, "No space left on device"), 2, "error: standard output: no space left on the device\n"),
+    ],
+)
+def test_what_ends_a_run_early_is_one_line(
+    toy: Any, error: BaseException, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    def run(config: Any, summary: Any) -> None:
+        with output_folder(config.out):
+            if isinstance(error, OSError):
+                pass
+            else:
+                raise error
+        raise error
+
+    monkeypatch.setattr(cli, "_discard_stdout", lambda: None)
+    toy(run)
+    assert cli.main(["toy", f"out={tmp_path / 'out'}"]) == code
+    assert capsys.readouterr().err == said
+    assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
+
+
+def test_an_input_is_never_replaced_by_the_output(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["toy", f"out={tmp_path / 'out'}", "word=old"]) == 0
+    assert cli.main(["toy", str(tmp_path / "out" / "word"), f"out={tmp_path / 'out'}", "overwrite=true"]) == 2
+    assert "holds the input" in capsys.readouterr().err
+    assert (tmp_path / "out" / "word").read_text() == "old"
+
+
+def test_many_runs_sweep_numbers_and_keep_text(
+    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "o=${t},'s"
+    words = ["toy", "-m", "a,b=", "size=1,2", "word=mug,banana", f"out={out}"]
+    (tmp_path / "a,b=").touch()
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(words) == 0
+    assert sorted(os.listdir()) == sorted(["a,b=", "conf", out.name])
+    assert sorted(os.listdir(out)) == ["0", "1", "multirun.yaml"]
+    records = [json.loads((out / str(k) / "summary.json").read_text()) for k in range(2)]
+    assert [record["results"]["size"] for record in records] == [1, 2]
+    assert {(out / str(k) / "word").read_text() for k in range(2)} == {"mug,banana"}
+    assert records[1]["settings"]["paths"] == ["a,b="]
+    assert capsys.readouterr().err == "run 0: size=1\nrun 1: size=2\n"
+
+
+def test_text_is_swept_where_it_is_asked_for(toy: Any, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert cli.main(["toy", "-m", "word=choice(mug,'red, cup')", "size=range(1,3)", f"out={out}", "quiet=true"]) == 0
+    assert [(out / str(k) / "word").read_text() for k in range(4)] == ["mug", "mug", "red, cup", "red, cup"]
+
+
+def test_a_failed_run_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert cli.main(["toy", "-m", "size=-1,x,3", f"out={out}", "quiet=true"]) == 2
+    assert sorted(os.listdir(out)) == ["2", "multirun.yaml"]
+    assert capsys.readouterr().err.splitlines() == [
+        f"error: {out / '0'}: size: expected a positive number",
+        "error: run 1: size: expected a whole number, got 'x' (how large)",
+        "error: 2 of 3 runs failed",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["toy", "-m", "size=1,2"], "-m: out= is missing"),
+        (["toy", "-m", "size=1,2", "out=choice(a,b)"], "out: cannot be swept"),
+        (["toy", "-m", "size=(", "out=x"], "size: expected a whole number, got '('"),
+        (["toy", "-m", "siez=1", "out=x"], "siez: no such option"),
+        (["toy", "-m", "--cfg", "out=x"], "--cfg: shows one run"),
+        (["repair", "-m", "a.ply", "out=x.ply"], "-m: repair writes a file"),
+    ],
+)
+def test_many_runs_complain_like_one(
+    toy: Any, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    if words[0] == "repair":
+        monkeypatch.undo()
+        monkeypatch.chdir(tmp_path)
+    assert cli.main(words) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["conf"]
+
+
+def test_a_launcher_in_another_process_can_take_a_run(tmp_path: Path) -> None:
+    from gsencoder.app.settings.multirun import _job
+
+    run = partial(cli._run_one, COMMANDS["inspect"], debug=False)
+    job = pickle.dumps(partial(_job, cls=COMMANDS["inspect"].load()[0], run=run, swept=()))
+    (tmp_path / "job").write_bytes(job)
+    code = (
+        "import pickle, sys; job = pickle.load(open(sys.argv[1], 'rb'));"
+        "from omegaconf import OmegaConf; print(OmegaConf.create({'a': '${text:x41}'}).a, job.keywords['cls'].__name__)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "job")], capture_output=True, text=True)
+    assert done.stdout == "A InspectConfig\n", done.stderr
+
+
+def run_process(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "gsencoder", *words], capture_output=True, text=True, **options)
+
+
+HEAVY = ("torch", "numba", "open3d", "numpy", "hydra", "scipy", "sklearn", "rich")
+
+
+@pytest.mark.alone
+def test_help_comes_at_once_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from gsencoder.app.cli import main; main(['--help']);"
+        f"print('LOADED', *[name for name in {HEAVY} if name in sys.modules])"
+    )
+    best = float("inf")
+    for _ in range(5):
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        best = min(best, time.perf_counter() - start)
+        assert done.stdout.splitlines()[-1] == "LOADED"
+        if best < 0.5:
+            break
+    assert best < 0.5
+
+
+def test_exit_codes_and_streams_of_the_real_program(tmp_path: Path) -> None:
+    done = run_process("inspect", "nothing.ply", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "error: nothing.ply: no such file\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_file_names_that_are_not_utf8_are_told(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9.ply")
+    (tmp_path / name).write_bytes(splat(tmp_path / "a.ply").read_bytes())
+    done = run_process("inspect", name, "out=out", cwd=tmp_path, env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"})
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "caf\\udce9.ply" in done.stdout
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes")
+def test_a_reader_that_leaves_early_is_not_an_error(tmp_path: Path) -> None:
+    path = splat(tmp_path / "a.ply")
+    read, write = os.pipe()
+    os.close(read)
+    with subprocess.Popen(
+        [sys.executable, "-m", "gsencoder", "inspect", str(path), f"out={tmp_path / 'out'}"],
+        stdout=write,
+        stderr=subprocess.PIPE,
+    ) as process:
+        os.close(write)
+        assert process.communicate()[1] == b""
+        assert process.returncode == 1
+    assert (tmp_path / "out" / "summary.json").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full")
+def test_a_full_standard_output_is_one_line(tmp_path: Path) -> None:
+    path = splat(tmp_path / "a.ply")
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "gsencoder", "inspect", str(path)], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (2, "error: standard output: no space left on the device\n")
+
+
+SLOW = """
+import sys, time
+from gsencoder.app import cli
+from gsencoder.app.commands import inspect
+from gsencoder.app.runs.output_folder import output_folder
+def run(config, summary):
+    with output_folder(config.out) as folder:
+        (folder / "half").write_text("x")
+        print("writing", flush=True)
+        time.sleep(60)
+inspect.run = run
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (signal.SIGINT, 130, b"interrupted\n"),
+        (signal.SIGTERM, 143, b"stopped: SIGTERM\n"),
+        (signal.SIGHUP, 129, b"stopped: SIGHUP\n"),
+    ],
+)
+def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code: int, said: bytes) -> None:
+    def defaults() -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+    with subprocess.Popen(
+        [sys.executable, "-c", SLOW, "inspect", "a", f"out={tmp_path / 'out'}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=defaults,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"writing\n"
+        process.send_signal(number)
+        assert process.communicate()[1] == said
+        assert process.returncode == code
+    assert list(tmp_path.iterdir()) == []

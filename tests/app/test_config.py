@@ -1,0 +1,416 @@
+"""Settings: text reaches the dataclass as it was typed, numbers are checked, YAML and dataclasses agree."""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from gsencoder.app import cli
+from gsencoder.app.commands import COMMANDS
+from gsencoder.app.settings.compose import choices_of, compose, conf_folder
+from gsencoder.app.settings.config import HIDDEN, CommonConfig, check_required, settings, typed
+from gsencoder.app.settings.options import describe, join_list, options_of, split_list
+from gsencoder.core.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LabelsConfig:
+    name: Literal["labels"] = "labels"
+    table: Path | None = field(default=None, metadata={"help": "names and embeddings"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnnxConfig:
+    name: Literal["onnx"] = "onnx"
+    weights: str = field(default="", metadata={"help": "an ONNX file"})
+    top_k: int = field(default=5, metadata={"help": "posteriors kept"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FusionConfig:
+    voxel: float = field(default=0.02, metadata={"help": "grid in metres"})
+    lift: Literal["center", "blend"] = field(default="blend", metadata={"help": "which lift"})
+    tau: float | None = field(default=None, metadata={"help": "occlusion tolerance"})
+    window: tuple[float, float] = field(default=(0.0, 1.0), metadata={"help": "depth range"})
+    ranks: tuple[int, ...] = field(default=(8, 16), metadata={"help": "ranks"})
+    against: tuple[Literal["depth", "render"], ...] = field(default=("depth",), metadata={"help": "tests"})
+
+    def __post_init__(self) -> None:
+        if self.voxel <= 0:
+            raise InputError(f"voxel: expected a positive size, got {self.voxel}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ToyConfig(CommonConfig):
+    paths: tuple[str, ...] = field(default=(), metadata={"help": "scenes", "metavar": "SCENE", "required": True})
+    query: tuple[str, ...] = field(default=(), metadata={"help": "words"})
+    question: str = field(default="", metadata={"help": "a question"})
+    device: str | None = field(default=None, metadata={"help": "where to run"})
+    seed: int = field(default=0, metadata={"help": "seed"})
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    teacher: LabelsConfig | OnnxConfig = field(default_factory=LabelsConfig)
+
+
+YAML = {
+    "common.yaml": "out: null\noverwrite: false\nquiet: false\n",
+    "toy.yaml": (
+        "defaults:\n  - common\n  - fusion: default\n  - teacher: labels\n  - _self_\n"
+        "paths: []\nquery: []\nquestion: ''\ndevice: null\nseed: 0\n"
+    ),
+    "fusion/default.yaml": (
+        "voxel: 0.02\nlift: blend\ntau: null\nwindow: [0.0, 1.0]\nranks: [8, 16]\nagainst: [depth]\n"
+    ),
+    "teacher/labels.yaml": "name: labels\ntable: null\n",
+    "teacher/onnx.yaml": "name: onnx\nweights: ''\ntop_k: 5\n",
+    "teacher/dinov2.yaml": "defaults:\n  - onnx\n  - _self_\nweights: dinov2.onnx\n",
+}
+
+
+@pytest.fixture(scope="module")
+def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("conf")
+    for name, text in YAML.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def toy(conf: Path, *words: str) -> ToyConfig:
+    return compose("toy", ToyConfig, words, conf)
+
+
+HOSTILE = [
+    "mug,banana",
+    "What's red?",
+    "(red)",
+    "é",
+    "日本語 🥄",
+    "/run=3",
+    "1",
+    "-1",
+    "1e-3",
+    "null",
+    "true",
+    "False",
+    "nan",
+    "  x ",
+    "\t",
+    "${oc.env:HOME}",
+    "${seed}",
+    "$\\{a}",
+    "\\${seed}",
+    "${",
+    "}",
+    "",
+    "a\\nb",
+    "a\nb",
+    "a\r\nb",
+    "'",
+    '"',
+    "''",
+    "'a'",
+    '"a"',
+    "\\'",
+    '\\"',
+    "\\",
+    "\\\\",
+    "a\\",
+    "'\\",
+    "[a,b]",
+    "{a: 1}",
+    "~x",
+    "+x",
+    "++x",
+    "???",
+    "choice(a,b)",
+    "range(3)",
+    "a=b",
+    "=",
+    "a#b",
+    "%s %(x)s {0}",
+    "*",
+    "@",
+    "--help",
+    "_target_",
+    "${text:x41}",
+    "\u2028",
+    "\x7f\x1b[31m",
+    "\udcff",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+@pytest.mark.slow
+def test_text_arrives_as_it_was_typed(conf: Path, text: str) -> None:
+    config = toy(conf, f"question={text}", f"device={text}", f"query={text}", f"teacher.table={text}")
+    assert config.question == text
+    assert config.device == text
+    assert config.query == split_list(text)
+    assert isinstance(config.teacher, LabelsConfig)
+    assert config.teacher.table == (Path(text) if text else None)
+
+
+@given(st.text(st.characters(exclude_characters="\0"), max_size=30), st.lists(st.text(max_size=8), max_size=12))
+@hypothesis_settings(max_examples=12, deadline=None)
+@pytest.mark.slow
+def test_any_text_arrives_as_it_was_typed(conf_for_hypothesis: Path, text: str, words: list[str]) -> None:
+    words = [word for word in words if word]
+    config = toy(conf_for_hypothesis, f"question={text}", f"query={join_list(words)}", "--", *words)
+    assert config.question == text
+    assert config.query == tuple(words)
+    assert config.paths == tuple(words)
+
+
+@pytest.fixture(scope="module")
+def conf_for_hypothesis(conf: Path) -> Path:
+    return conf
+
+
+@given(st.lists(st.text(st.sampled_from("a,\\ "), max_size=6), max_size=5))
+def test_a_list_of_text_can_be_written_whatever_its_items_hold(items: list[str]) -> None:
+    if items != [""]:
+        assert split_list(join_list(items)) == tuple(items)
+
+
+@pytest.mark.parametrize(
+    ("text", "items"),
+    [
+        ("", ()),
+        ("mug", ("mug",)),
+        ("mug,red cup", ("mug", "red cup")),
+        ("a\\,b", ("a,b",)),
+        ("a\\\\,b", ("a\\", "b")),
+        ("a\\\\\\,b", ("a\\,b",)),
+        ("a\\nb", ("a\\nb",)),
+        ("a\\", ("a\\",)),
+        (",", ("", "")),
+        (" a, b", (" a", " b")),
+    ],
+)
+def test_a_backslash_matters_only_before_a_comma(text: str, items: tuple[str, ...]) -> None:
+    assert split_list(text) == items
+
+
+def test_numbers_lists_and_choices_are_parsed(conf: Path) -> None:
+    words = ("seed=3", "voxel=1", "fusion.tau=1e-3", "lift=center", "ranks=4,8", "window=[0,2.5]", "overwrite=true")
+    config = toy(conf, *words)
+    assert config.fusion == FusionConfig(voxel=1.0, tau=1e-3, lift="center", ranks=(4, 8), window=(0.0, 2.5))
+    assert isinstance(config.fusion.voxel, float)
+    assert isinstance(config.fusion.window[0], float)
+    assert (config.seed, config.overwrite) == (3, True)
+    assert toy(conf, "ranks=4").fusion.ranks == (4,)
+    assert toy(conf, "tau=inf").fusion.tau == math.inf
+
+
+@pytest.mark.parametrize("value", ["depth,render", "[depth,render]", "[ depth , render ]"])
+def test_a_list_of_words_may_have_brackets(conf: Path, value: str) -> None:
+    assert toy(conf, f"fusion.against={value}").fusion.against == ("depth", "render")
+
+
+def test_brackets_around_a_list_of_text_are_text(conf: Path) -> None:
+    assert toy(conf, "query=[red],mug").query == ("[red]", "mug")
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("fusion.against=[depth", "fusion.against: expected a list, each one of depth, render, got '[depth'"),
+        ("voxel=2cm", "fusion.voxel: expected a number, got '2cm' (grid in metres)"),
+        ("voxel=2 cm", "fusion.voxel: expected a number, got '2 cm'"),
+        ("voxel=(2", "fusion.voxel: expected a number, got '(2'"),
+        ("voxel=", "fusion.voxel: expected a number, got ''"),
+        ("voxel=true", "fusion.voxel: expected a number, got True"),
+        ("voxel=nan", "fusion.voxel: expected a number, got nan"),
+        ("voxel=é", "fusion.voxel: expected a number, got 'é'"),
+        ("voxel=null", "fusion.voxel: expected a number, got None"),
+        ("voxel=1,2", "fusion.voxel: expected a number, got '1,2' (grid in metres); several values, one run each"),
+        ("voxel=${nothing}", "nothing"),
+        ("voxel=-1", "fusion.voxel: expected a positive size, got -1.0"),
+        ("seed=1.5", "seed: expected a whole number, got 1.5"),
+        ("seed=true", "seed: expected a whole number, got True"),
+        ("overwrite=yes", "overwrite: expected true or false, got 'yes'"),
+        ("overwrite=1", "overwrite: expected true or false, got 1"),
+        ("lift=centre", "fusion.lift: expected one of center, blend, got 'centre'; did you mean center?"),
+        ("window=1", "fusion.window: expected a list of 2 (a number, a number), got [1]"),
+        ("ranks=a", "fusion.ranks: expected a list, each a whole number, got ['a']"),
+        ("ranks=[1", "fusion.ranks: expected a list, each a whole number, got '[1'"),
+        ("ranks={a: 1}", "fusion.ranks: expected a list, each a whole number"),
+        ("voxle=1", "voxle: no such option, and no file has this name; did you mean fusion.voxel?"),
+        ("fusion.voxle=1", "fusion.voxle: no such option"),
+        ("fusion={voxel: 1}", "fusion: expected one of default"),
+        ("+seed=1", "+seed=…: is neither an option (KEY=VALUE) nor an existing file"),
+        ("~seed=1", "~seed=…: is neither an option (KEY=VALUE) nor an existing file"),
+        ("/no/such=file", "/no/such=…: is neither an option (KEY=VALUE) nor an existing file"),
+        ("hydra.run.dir=x", "hydra.run.dir: settings of Hydra itself are taken only with -m"),
+        ("seed", "seed: needs a value: seed=…"),
+        ("teacher=label", "teacher: expected one of dinov2, labels, onnx, got 'label'; did you mean labels?"),
+        ("teacher=null", "teacher: expected one of dinov2, labels, onnx, got 'null'"),
+        ("teacher.top_k=3", "teacher.top_k: is an option of teacher=onnx, and teacher is labels"),
+        ("name=onnx", "name: no such option"),
+    ],
+)
+def test_a_wrong_setting_is_told_in_one_line_with_its_full_key(conf: Path, word: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        toy(conf, word)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_setting_given_twice_is_an_error_also_under_its_short_name(conf: Path) -> None:
+    with pytest.raises(InputError, match=r"fusion\.voxel: given twice, as '1' and '2'"):
+        toy(conf, "voxel=1", "fusion.voxel=2")
+
+
+def test_a_short_name_of_two_options_must_be_written_out(conf: Path) -> None:
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Twice(CommonConfig):
+        one: FusionConfig = field(default_factory=FusionConfig)
+        two: FusionConfig = field(default_factory=FusionConfig)
+
+    with pytest.raises(InputError, match=r"voxel: stands for more than one option; write one.voxel= or two.voxel="):
+        compose("toy", Twice, ["voxel=1"], conf)
+
+
+def test_a_choice_of_yaml_file_selects_the_dataclass(conf: Path) -> None:
+    assert toy(conf, "teacher=labels").teacher == LabelsConfig()
+    assert toy(conf, "teacher=onnx", "teacher.top_k=3").teacher == OnnxConfig(top_k=3)
+    assert toy(conf, "teacher=dinov2").teacher == OnnxConfig(weights="dinov2.onnx")
+
+
+def test_paths_are_the_words_that_are_no_settings(conf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a=b.ply").touch()
+    (tmp_path / "seed=b.ply").touch()
+    config = toy(conf, "scene,1", "a=b.ply", "seed=4", "./seed=b.ply", "1")
+    assert config.paths == ("scene,1", "a=b.ply", "./seed=b.ply", "1")
+    assert config.seed == 4
+    assert toy(conf, "--", "seed=4", "--help", "--").paths == ("seed=4", "--help", "--")
+    assert toy(conf, "paths=a,b").paths == ("a", "b")
+    with pytest.raises(InputError, match="given both as paths= and as the word 'a'"):
+        toy(conf, "a", "paths=b")
+
+
+def test_a_command_without_paths_refuses_them(conf: Path) -> None:
+    with pytest.raises(InputError, match="scene: this command takes no path"):
+        compose("common", CommonConfig, ["scene"], conf)
+
+
+def test_required_settings_are_asked_for_by_name(conf: Path) -> None:
+    with pytest.raises(InputError, match="SCENE is missing: scenes"):
+        check_required(ToyConfig, toy(conf))
+    check_required(ToyConfig, toy(conf, "scene"))
+
+
+def test_settings_read_back_are_the_same_settings(conf: Path) -> None:
+    config = toy(conf, "scene", "teacher=onnx", "query=a,b", "tau=0.1", "out=x")
+    assert typed(ToyConfig, settings(config)) == config
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ({"sed": 1}, "sed: no such option; did you mean seed?"),
+        ({"fusion": {"voxl": 1}}, "fusion.voxl: no such option; did you mean fusion.voxel?"),
+        ({"fusion": 3}, "fusion: is a section with options of its own (fusion.NAME=…), got 3"),
+        ({"teacher": {"name": "onx"}}, "teacher.name: expected one of labels, onnx, got 'onx'; did you mean onnx?"),
+        ({"teacher": {"name": "onnx", "top_k": "x"}}, "teacher.top_k: expected a whole number, got 'x'"),
+        ({"query": [1]}, "query: expected a list, each text, got '1'"),
+        ({"question": 1}, "question: expected text, got 1 (a question)"),
+        ({"out": 1}, "out: expected a path or null, got 1"),
+    ],
+)
+def test_wrong_yaml_is_told_like_a_wrong_command_line(data: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        typed(ToyConfig, data)
+    assert said in str(caught.value)
+
+
+def test_types_are_told_in_plain_words() -> None:
+    assert describe(float | None) == "a number or null"
+    assert describe(float | Literal["auto"]) == "a number or auto"
+    assert describe(tuple[Path, ...]) == "a list, each a path"
+
+
+def _composed(name: str, *words: str) -> Any:
+    return compose(name, COMMANDS[name].load()[0], words)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_yaml_and_dataclass_agree(name: str) -> None:
+    cls = COMMANDS[name].load()[0]
+    assert _composed(name) == cls()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.slow
+def test_every_member_of_every_choice_composes(name: str) -> None:
+    cls = COMMANDS[name].load()[0]
+    choices = choices_of(name, cls)
+    for group, members in choices.groups.items():
+        assert members, group
+        for member in members:
+            assert settings(compose(name, cls, [f"{group}={member}"], choices=choices))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_option_has_the_name_of_a_folder_of_settings(name: str) -> None:
+    # Hydra would take its value for a file of that folder.
+    folders = {path.name for path in conf_folder().iterdir() if path.is_dir()}
+    assert not folders & {option.key for option in options_of(COMMANDS[name].load()[0])}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_setting_is_documented_and_in_the_yaml(name: str) -> None:
+    from omegaconf import OmegaConf
+
+    from gsencoder.app.settings.compose import open_hydra, plain_settings
+
+    cls = COMMANDS[name].load()[0]
+    assert dataclasses.fields(cls)
+    for option in options_of(cls):
+        assert option.help, f"{name}: {option.key} has no metadata help"
+        assert not option.help.endswith("."), f"{name}: {option.key}: help is a phrase, without a full stop"
+    with open_hydra(None) as hydra:
+        from hydra.types import RunMode
+
+        data = OmegaConf.create(plain_settings(hydra.compose_config(name, [], RunMode.RUN, from_shell=False)))
+    nothing = object()
+    for option in options_of(cls):
+        if not option.member:
+            assert OmegaConf.select(data, option.key, default=nothing) is not nothing, f"conf lacks {option.key}"
+
+
+def test_every_command_has_its_yaml() -> None:
+    assert {f"{name}.yaml" for name in COMMANDS} <= {path.name for path in conf_folder().glob("*.yaml")}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _WithSecret:
+    key: str = field(default="", metadata={"help": "a key", "secret": True})
+    name: str = field(default="", metadata={"help": "a name"})
+
+
+def test_secrets_are_never_shown() -> None:
+    assert settings(_WithSecret(key="s", name="n")) == {"key": HIDDEN, "name": "n"}
+    assert settings(_WithSecret()) == {"key": "", "name": ""}
+
+
+def test_secrets_are_repeated_by_no_error_and_taken_by_no_sweep(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words, told in (
+        (["vlm.key=sk-first1", "vlm.key=sk-second2"], "vlm.key: given twice; give it once"),
+        (["vlm.kee=sk-first1"], "vlm.kee: no such option"),
+        (["api_key=sk-first1"], "api_key: no such option"),
+        (["-m", "vlm.key=choice(sk-first1,sk-second2)", "out=o"], "vlm.key: is not taken with -m"),
+    ):
+        assert cli.main(["ask", str(tmp_path), *words]) == 2
+        error = capsys.readouterr().err
+        assert told in error
+        assert "sk-" not in error

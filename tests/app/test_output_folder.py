@@ -1,0 +1,469 @@
+"""Output folders are whole or absent; summaries are JSON whatever the results hold."""
+
+import errno
+import io
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsencoder.app.runs import output_folder as outputs
+from gsencoder.app.runs.output_folder import (
+    output_folder,
+    refuse_existing,
+    refuse_to_replace_inputs,
+    write_bytes,
+    write_json,
+)
+from gsencoder.app.runs.progress import Progress
+from gsencoder.app.runs.summary import SUMMARY_NAME, Summary, peak_memory_mb
+from gsencoder.core.errors import InputError, SceneWarning
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def write_and_raise(path: Path, error: BaseException, **options: Any) -> None:
+    with output_folder(path, **options) as folder:
+        (folder / "a").write_text("x")
+        raise error
+
+
+def fill(path: Path, text: str, **options: Any) -> None:
+    with output_folder(path, summary=Summary("fuse", {"voxel": 0.02}), **options) as folder:
+        (folder / "deep").mkdir()
+        (folder / "deep" / "data.txt").write_text(text)
+
+
+def test_a_folder_appears_whole_when_the_block_ends(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "parents" / "out"
+    with output_folder(path) as folder:
+        (folder / "a").write_text("x")
+        assert not path.exists()
+        assert folder.parent == path.parent
+    assert names(path) == ["a"]
+    assert names(path.parent) == ["out"]
+
+
+@pytest.mark.parametrize("error", [ValueError("bad"), KeyboardInterrupt(), SystemExit(3), MemoryError()])
+def test_whatever_ends_the_block_early_leaves_nothing(tmp_path: Path, error: BaseException) -> None:
+    with pytest.raises(type(error)):
+        write_and_raise(tmp_path / "out", error)
+    assert names(tmp_path) == []
+
+
+def test_a_failed_run_leaves_the_earlier_results_alone(tmp_path: Path) -> None:
+    fill(tmp_path / "out", "old")
+    with pytest.raises(ZeroDivisionError):
+        write_and_raise(tmp_path / "out", ZeroDivisionError(), overwrite=True)
+    assert (tmp_path / "out" / "deep" / "data.txt").read_text() == "old"
+    assert names(tmp_path) == ["out"]
+
+
+def test_an_existing_folder_is_refused_unless_overwrite(tmp_path: Path) -> None:
+    fill(tmp_path / "out", "old")
+    with pytest.raises(InputError, match="holds the results of an earlier run; give another out= or overwrite=true"):
+        fill(tmp_path / "out", "new")
+    fill(tmp_path / "out", "new", overwrite=True)
+    assert (tmp_path / "out" / "deep" / "data.txt").read_text() == "new"
+    assert names(tmp_path) == ["out"]
+
+
+def test_replacing_works_where_the_system_cannot_exchange_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outputs, "_exchange", lambda *_: False)
+    fill(tmp_path / "out", "old")
+    fill(tmp_path / "out", "new", overwrite=True)
+    assert (tmp_path / "out" / "deep" / "data.txt").read_text() == "new"
+    assert names(tmp_path) == ["out"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="renameat2 is Linux's")
+def test_linux_exchanges_the_two_folders_in_one_step(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+    assert outputs._exchange(tmp_path / "a", tmp_path / "b")
+    assert names(tmp_path / "a") == ["b"]
+    assert not outputs._exchange(tmp_path / "a", tmp_path / "missing")
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_that_no_run_wrote_is_never_replaced(tmp_path: Path, overwrite: bool) -> None:
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.tex").write_text("years of work")
+    with pytest.raises(InputError, match=r"is a folder with other contents \(no summary.json\)"):
+        fill(tmp_path / "home", "new", overwrite=overwrite)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="is a file, and the results are a folder"):
+        fill(tmp_path / "file", "new", overwrite=overwrite)
+    assert (tmp_path / "home" / "thesis.tex").read_text() == "years of work"
+
+
+def test_an_empty_folder_may_be_written_to(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    fill(tmp_path / "out", "new")
+    assert names(tmp_path / "out") == ["deep", SUMMARY_NAME]
+
+
+def test_a_symbolic_link_keeps_pointing_to_the_results(tmp_path: Path) -> None:
+    fill(tmp_path / "real", "old")
+    (tmp_path / "link").symlink_to("real")
+    fill(tmp_path / "link", "new", overwrite=True)
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "deep" / "data.txt").read_text() == "new"
+
+
+def test_a_folder_that_another_run_made_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    def slow() -> None:
+        with output_folder(tmp_path / "out") as folder:
+            (folder / "a").write_text("slow")
+            (tmp_path / "out").mkdir()
+            (tmp_path / "out" / SUMMARY_NAME).write_text("{}")
+
+    with pytest.raises(InputError, match="holds the results of an earlier run"):
+        slow()
+    assert names(tmp_path / "out") == [SUMMARY_NAME]
+
+
+def test_a_second_run_into_the_same_folder_is_told_of_the_first(tmp_path: Path) -> None:
+    with output_folder(tmp_path / "out") as folder:
+        with pytest.raises(InputError, match="another run is writing this folder now"):
+            fill(tmp_path / "out", "second")
+        with output_folder(tmp_path / "out2"):
+            pass
+        assert folder.is_dir()
+    assert names(tmp_path) == ["out", "out2"]
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    (tmp_path / ".out.partial-0123abcd").mkdir()
+    (tmp_path / ".out.partial-0123abcd" / "big").write_text("x")
+    others = [".out.partial-mine", ".out2.partial-0123abcd", "out.partial-0123abcd"]
+    for name in others:
+        (tmp_path / name).mkdir()
+    fill(tmp_path / "out", "new")
+    assert names(tmp_path) == sorted([*others, "out"])
+
+
+KILLED = """
+import os, sys, time
+from gsencoder.app.runs.output_folder import output_folder
+with output_folder(sys.argv[1]) as folder:
+    (folder / "half").write_text("x")
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_kill_leaves_no_output_folder_and_the_next_run_cleans_up(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path / "out")], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    (left,) = names(tmp_path)
+    assert left.startswith(".out.partial-")
+    fill(tmp_path / "out", "new")
+    assert names(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, "No space left on device", "x"),
+        OSError(errno.EDQUOT, "Disk quota exceeded"),
+        OSError("4096 requested and 100 written"),
+        RuntimeError("I/O error: No space left on device (os error 28)"),
+    ],
+)
+def test_a_full_disk_is_one_line_that_names_the_folder(tmp_path: Path, error: Exception) -> None:
+    with pytest.raises(InputError, match=r"out: no space left on the device: no result was written$") as caught:
+        write_and_raise(tmp_path / "out", error)
+    assert ".partial" not in str(caught.value)
+    assert names(tmp_path) == []
+
+
+def test_a_file_beyond_the_shells_limit_is_one_line_that_names_the_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"out: a file would grow larger than .* \(ulimit -f\): no result was written"):
+        write_and_raise(tmp_path / "out", OSError(errno.EFBIG, "File too large"))
+    assert names(tmp_path) == []
+
+
+def test_a_full_disk_at_the_last_moment_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="no space left"):
+        fill(tmp_path / "out", "new")
+    assert names(tmp_path) == []
+
+
+def test_messages_name_the_folder_asked_for_not_the_temporary_one(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match=r"out/a\.xyz: cannot write xyz") as caught, output_folder(out) as folder:
+        raise InputError(f"{folder}/a.xyz: cannot write xyz")
+    assert ".partial" not in str(caught.value)
+    with pytest.raises(InputError, match=r"out/no/a: cannot write: No such file"), output_folder(out) as folder:
+        (folder / "no" / "a").write_text("x")
+    with pytest.raises(FileNotFoundError), output_folder(tmp_path / "out"):
+        (tmp_path / "input").read_text()
+
+
+def test_a_place_that_cannot_be_written_is_a_named_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"file/out: \S*/file is a file, so no folder can be made in it"):
+        fill(tmp_path / "file" / "out", "x")
+    with pytest.raises(InputError, match="cannot write here: Not a directory"):
+        fill(tmp_path / "file" / "deep" / "out", "x")
+    with pytest.raises(InputError, match="cannot write here: File name too long"):
+        fill(tmp_path / ("a" * 300) / "out", "x")
+
+
+def test_a_name_longer_than_the_system_allows_is_refused_before_the_work(tmp_path: Path) -> None:
+    refuse_to_replace_inputs(tmp_path / ("x" * 300), {"paths": ["scene"]})
+    with (
+        pytest.raises(InputError, match="cannot write here: File name too long"),
+        output_folder(tmp_path / ("x" * 300)),
+    ):
+        raise AssertionError("the block must not begin")
+
+
+def test_names_as_long_as_the_system_allows_work(tmp_path: Path) -> None:
+    fill(tmp_path / ("ü" * 127), "x")
+    assert names(tmp_path) == ["ü" * 127]
+
+
+def test_inputs_inside_the_folder_to_replace_are_protected(tmp_path: Path) -> None:
+    fill(tmp_path / "out", "old")
+    inside, out = str(tmp_path / "out" / "deep"), str(tmp_path / "out")
+    for given in ({"paths": [inside]}, {"paths": [out]}, {"weights": out}, {"seeds": {"mesh": inside}, "voxel": 2}):
+        with pytest.raises(InputError, match="holds the input"):
+            refuse_to_replace_inputs(tmp_path / "out", given)
+    refuse_to_replace_inputs(tmp_path / "out", {"out": out, "paths": [str(tmp_path)], "splat": str(tmp_path / "out2")})
+    refuse_to_replace_inputs(tmp_path / "out", {"weights": str(tmp_path / "out" / "nothing"), "query": "a\0b"})
+    refuse_to_replace_inputs(tmp_path / "new", {"paths": [str(tmp_path / "new")]})
+    refuse_to_replace_inputs(None, {"paths": [inside]})
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [("No space left on device", "no space left"), ("File too large (os error 27)", "ulimit -f")]
+)
+def test_a_disk_that_is_full_elsewhere_is_not_said_to_be_full_here(tmp_path: Path, words: str, told: str) -> None:
+    with (
+        pytest.raises(InputError, match=rf"out: .*{told}.*: no result was written$"),
+        output_folder(tmp_path / "out") as own,
+    ):
+        raise InputError(f"{own}/a.ply: cannot be written: {words}")
+    with pytest.raises(InputError, match=rf"^/elsewhere/b: cannot be written: {re.escape(words)}$"):
+        write_and_raise(tmp_path / "out", InputError(f"/elsewhere/b: cannot be written: {words}"))
+
+
+def test_a_mount_point_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "volume").mkdir()
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path).name == "volume")
+    with (
+        pytest.raises(InputError, match="volume: is a mount point.*give a folder in it"),
+        output_folder(tmp_path / "volume"),
+    ):
+        raise AssertionError("the block must not begin")
+    fill(tmp_path / "volume" / "out", "x")
+
+
+def test_an_output_that_the_system_does_not_let_go_is_named_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(tmp_path / "out", "old")
+
+    def refused(source: str | Path, *_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted", str(source))
+
+    monkeypatch.setattr("gsencoder.app.runs.output_folder._exchange", lambda *_: False)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "rename", refused)
+        with pytest.raises(InputError, match="out: cannot be replaced by the results: Operation not permitted"):
+            fill(tmp_path / "out", "new", overwrite=True)
+    assert (tmp_path / "out" / "deep" / "data.txt").read_text() == "old"
+    assert names(tmp_path) == ["out"]
+
+
+def test_of_runs_that_begin_in_one_moment_one_gets_the_folder(tmp_path: Path) -> None:
+    """The outcome of each is its own, or that another is writing; none removes what another has just made."""
+    for turn in range(20):
+        begun, outcomes = threading.Barrier(4), []
+
+        def run(out: Path = tmp_path / str(turn), begun: threading.Barrier = begun, told: list[str] = outcomes) -> None:
+            begun.wait()
+            try:
+                with output_folder(out) as folder:
+                    (folder / "summary.json").write_text("{}")
+                    time.sleep(0.01)
+                told.append("ok")
+            except InputError as error:
+                text = str(error)
+                told.append("refused" if "another run" in text or "an earlier run" in text else text)
+
+        threads = [threading.Thread(target=run) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(outcomes) == ["ok", "refused", "refused", "refused"]
+
+
+def test_single_files_are_replaced_only_if_allowed(tmp_path: Path) -> None:
+    write_bytes(tmp_path / "a", b"1")
+    with pytest.raises(InputError, match="exists; give another out= or overwrite=true"):
+        refuse_existing(tmp_path / "a", overwrite=False)
+    refuse_existing(tmp_path / "a", overwrite=True)
+    refuse_existing(tmp_path / "b", overwrite=False)
+    with pytest.raises(InputError, match="is a folder"):
+        refuse_existing(tmp_path, overwrite=True)
+    write_bytes(tmp_path / "a", b"2")
+    assert (tmp_path / "a").read_bytes() == b"2"
+    assert names(tmp_path) == ["a"]
+
+
+@dataclass(frozen=True)
+class Thing:
+    path: Path
+    size: np.float32
+
+
+def test_numpy_values_paths_and_dataclasses_are_written_as_json(tmp_path: Path) -> None:
+    value = {
+        "array": np.arange(6, dtype=np.float32).reshape(2, 3),
+        "int": np.int64(3),
+        "bool": np.bool_(True),
+        "half": np.float16(0.5),
+        "thing": Thing(path=Path("a/b"), size=np.float32(0.5)),
+        "tuple": (1, None, "é"),
+        3: [],
+    }
+    write_json(tmp_path / "a.json", value)
+    assert json.loads((tmp_path / "a.json").read_text()) == {
+        "array": [[0, 1, 2], [3, 4, 5]],
+        "int": 3,
+        "bool": True,
+        "half": 0.5,
+        "thing": {"path": "a/b", "size": 0.5},
+        "tuple": [1, None, "é"],
+        "3": [],
+    }
+
+
+def test_numbers_that_are_not_finite_become_null_and_are_named(tmp_path: Path) -> None:
+    value = {"a": math.nan, "b": [1.0, np.float32("inf")], "c": np.array([[0.0, -np.inf]])}
+    with pytest.warns(SceneWarning, match="3 numbers are not finite and were written as null: a, b.1, c.0.1"):
+        write_json(tmp_path / "a.json", value)
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": [1.0, None], "c": [[0.0, None]]}
+
+
+def test_what_json_has_nothing_for_is_named(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"a\.0: set has no place in JSON"):
+        write_json(tmp_path / "a.json", {"a": [{1}]})
+    assert names(tmp_path) == []
+
+
+def test_a_file_name_that_is_not_utf8_can_be_written_down(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"path": os.fsdecode(b"a\xff")})
+    assert json.loads((tmp_path / "a.json").read_bytes()) == {"path": "a\udcff"}
+
+
+def test_a_summary_records_what_the_run_did(tmp_path: Path) -> None:
+    summary = Summary("fuse", {"out": Path("x"), "voxel": 0.02})
+    for _ in range(2):
+        with summary.step("fuse"):
+            time.sleep(0.01)
+    with pytest.raises(ValueError), summary.step("fail"):
+        raise ValueError
+    summary.results["miou"] = math.nan
+    summary.warnings.append("3 images were left out")
+    with output_folder(tmp_path / "out", summary=summary):
+        pass
+    record = json.loads((tmp_path / "out" / SUMMARY_NAME).read_text())
+    assert [record[key] for key in ("command", "settings")] == ["fuse", {"out": "x", "voxel": 0.02}]
+    assert 0.02 <= record["timings"]["fuse"] <= record["timings"]["total"] < 5
+    assert list(record["timings"]) == ["fuse", "fail", "total"]
+    assert record["results"] == {"miou": None}
+    assert record["non_finite"] == ["results.miou"]
+    assert record["warnings"] == ["3 images were left out"]
+    assert record["versions"]["numpy"] == np.__version__
+    assert set(record) >= {"version", "peak_memory_mb", "platform"}
+
+
+def test_a_summary_names_neither_the_machine_nor_the_user(tmp_path: Path) -> None:
+    text = json.dumps(Summary("fuse", {}).to_dict())
+    assert os.uname().nodename not in text
+    assert str(Path.home()) + os.sep not in text
+
+
+@pytest.mark.alone
+def test_peak_memory_counts_a_large_array() -> None:
+    before = peak_memory_mb()
+    assert 10 < before < 100_000
+    block = np.ones(int(before + 64) << 17)
+    assert peak_memory_mb() >= before + 32
+    del block
+
+
+class Stream(io.StringIO):
+    def __init__(self, terminal: bool) -> None:
+        super().__init__()
+        self.terminal = terminal
+
+    def isatty(self) -> bool:
+        return self.terminal
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+@pytest.mark.parametrize("quiet", [False, True])
+def test_progress_passes_every_item_on(terminal: bool, quiet: bool) -> None:
+    stream = Stream(terminal)
+    track = Progress(quiet=quiet, stream=stream, every=0.0)
+    pairs = [(a, b) for a in track(range(3), "outer") for b in track(iter("xy"), "inner", total=2)]
+    assert pairs == [(a, b) for a in range(3) for b in "xy"]
+    assert bool(stream.getvalue()) != quiet
+    assert not terminal or quiet or "\x1b" in stream.getvalue()
+
+
+def test_labels_are_shown_as_they_are() -> None:
+    for terminal in (False, True):
+        stream = Stream(terminal)
+        assert list(Progress(stream=stream, every=0.0)(range(1), "view [red]")) == [0]
+        assert "view [red]" in stream.getvalue()
+
+
+def test_progress_off_a_terminal_is_a_line_now_and_then() -> None:
+    stream = Stream(terminal=False)
+    assert list(Progress(stream=stream, every=0.0)(range(3), "views")) == [0, 1, 2]
+    assert stream.getvalue().splitlines()[0] == "views: 1/3 after 0 s"
+    assert "\x1b" not in stream.getvalue()
+    silent = Stream(terminal=False)
+    assert list(Progress(stream=silent)(range(1000), "views")) == list(range(1000))
+    assert silent.getvalue() == ""
+
+
+def test_a_loop_left_early_puts_the_bar_away() -> None:
+    stream = Stream(terminal=True)
+    track = Progress(stream=stream)
+    for item in track(range(3), "views"):
+        if item == 1:
+            break
+    assert track._depth == 0
+    assert list(track(range(2), "again")) == [0, 1]

@@ -1,0 +1,135 @@
+"""The state of a run is its own: kept when it is cut off, known again, never mixed up with what others made."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gsencoder.app.runs.work_folder import WORK_MARK, WorkFolder
+from gsencoder.core.errors import InputError
+
+
+def run(path: Path, inside: Callable[[Path], None] = lambda path: None, *, anew: bool = False) -> None:
+    with WorkFolder(path) as work:
+        work.take(anew=anew)
+        inside(work.path)
+
+
+def cut_off(path: Path, *names: str, anew: bool = False) -> list[str]:
+    """Leaves what a run leaves that was stopped after it had written these files; what it had found there."""
+    found = []
+
+    def inside(path: Path) -> None:
+        found.extend(contents(path))
+        for name in names:
+            (path / name).write_text("state")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(path, inside, anew=anew)
+    return found
+
+
+def contents(path: Path) -> list[str]:
+    return sorted(entry.name for entry in path.iterdir())
+
+
+def test_state_is_kept_when_a_run_is_cut_off_and_goes_when_it_ends(tmp_path: Path) -> None:
+    path = tmp_path / "run.training"
+    cut_off(path, "state")
+    assert contents(path) == ["state", WORK_MARK]
+    with WorkFolder(path) as work:
+        work.take(anew=False)
+        assert contents(path) == ["state", WORK_MARK]
+    assert not path.exists()
+
+
+def test_a_run_that_begins_anew_forgets_what_there_was(tmp_path: Path) -> None:
+    cut_off(tmp_path / "run", "state")
+    (tmp_path / "run" / "folder").mkdir()
+    (tmp_path / "run" / "folder" / "deep").touch()
+    with WorkFolder(tmp_path / "run") as work:
+        work.take(anew=True)
+        assert contents(tmp_path / "run") == [WORK_MARK]
+
+
+def test_a_folder_that_was_not_taken_is_left_alone(tmp_path: Path) -> None:
+    cut_off(tmp_path / "run", "state")
+    with WorkFolder(tmp_path / "run"):
+        pass
+    assert contents(tmp_path / "run") == ["state", WORK_MARK]
+
+
+@pytest.mark.parametrize("anew", [True, False])
+def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path, *, anew: bool) -> None:
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(InputError, match="holds something else"), WorkFolder(tmp_path) as work:
+        work.take(anew=anew)
+    assert (tmp_path / "notes.txt").is_file()
+    with (
+        pytest.raises(InputError, match="cannot keep the state of this run here.*give another out="),
+        WorkFolder(tmp_path / "notes.txt") as work,
+    ):
+        work.take(anew=anew)
+
+
+@pytest.mark.parametrize("anew", [True, False])
+def test_a_run_that_was_killed_in_its_first_moments_does_not_block_the_next(tmp_path: Path, *, anew: bool) -> None:
+    path = tmp_path / "run"
+    path.mkdir()
+    (path / f".{WORK_MARK}.0123456789ab.tmp").touch()
+    with WorkFolder(path) as work:
+        work.take(anew=anew)
+    assert not path.exists()
+
+
+def test_a_kill_while_the_folder_is_removed_leaves_one_that_is_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run"
+    cut_off(path, "a", "b", "z")
+    removed, unlink = [], Path.unlink
+
+    def killed(self: Path, *, missing_ok: bool = False) -> None:
+        if len(removed) == 2:
+            raise KeyboardInterrupt
+        removed.append(self)
+        unlink(self, missing_ok=missing_ok)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        run(path, lambda _: patched.setattr(Path, "unlink", killed))
+    assert WORK_MARK in contents(path)
+    run(path, anew=True)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("anew", [True, False])
+def test_two_runs_do_not_share_a_folder(tmp_path: Path, *, anew: bool) -> None:
+    with WorkFolder(tmp_path / "run") as first:
+        first.take(anew=False)
+        (first.path / "state").touch()
+        with pytest.raises(InputError, match="another run keeps its state here now"), WorkFolder(first.path) as second:
+            second.take(anew=anew)
+        assert contents(first.path) == ["state", WORK_MARK]
+    with WorkFolder(tmp_path / "run") as third:
+        third.take(anew=False)
+
+
+def test_behind_a_link_the_folder_itself_is_emptied(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "elsewhere")
+    cut_off(tmp_path / "run", "state")
+    assert cut_off(tmp_path / "run", anew=True) == [WORK_MARK]
+
+
+@pytest.mark.parametrize("anew", [True, False])
+def test_what_cannot_be_removed_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, anew: bool) -> None:
+    cut_off(tmp_path / "run", "state")
+
+    def refused(self: Path, **_: object) -> None:
+        raise PermissionError(1, "Operation not permitted", str(self))
+
+    told = "cannot keep the state of this run here" if anew else "results are in place.*remove it"
+    monkeypatch.setattr(Path, "unlink", refused)
+    with pytest.raises(InputError, match=told):
+        run(tmp_path / "run", anew=anew)

@@ -1,0 +1,239 @@
+"""Archives: what a file says is believed only where it agrees with what was asked for."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from archives import as_version_1, flip_bit, header_of, rewrite
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.checksums import BLOCK_BYTES
+from gsencoder.core.files.mapped_arrays import MappedArrays
+
+ARRAYS = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.arange(3, dtype=np.float32)}
+
+
+def taken(path: Path) -> tuple[np.ndarray, np.ndarray, Any]:
+    with open_archive(path) as file:
+        return file.array("a", "float32", ("N", "D")), file.array("b", "float32", ("D",)), file.value("name", str)
+
+
+def test_arrays_and_header_come_back(tmp_path: Path) -> None:
+    write_archive(tmp_path / "x", ARRAYS, {"name": "é"})
+    a, b, name = taken(tmp_path / "x")
+    assert (a == ARRAYS["a"]).all()
+    assert (b == ARRAYS["b"]).all()
+    assert name == "é"
+    assert [path.name for path in tmp_path.iterdir()] == ["x"]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"a": ARRAYS["a"]}, "the array 'b' is missing"),
+        ({**ARRAYS, "b": ARRAYS["b"][:2]}, r"expected b float32\[3\], got float32\[2\]"),
+        ({**ARRAYS, "b": ARRAYS["b"].astype(np.float64)}, r"expected b float32\[3\], got float64\[3\]"),
+        ({**ARRAYS, "a": ARRAYS["a"][None]}, r"expected a float32\[N, D\], got float32\[1, 2, 3\]"),
+        ({**ARRAYS, "b": np.array([0, np.nan, np.inf], np.float32)}, "2 of 3 values of b are not finite"),
+    ],
+)
+def test_an_array_that_is_not_as_asked_is_named_with_its_file(
+    tmp_path: Path, arrays: dict[str, np.ndarray], said: str
+) -> None:
+    write_archive(tmp_path / "x", arrays, {"name": "n"})
+    with pytest.raises(InputError, match=f"{tmp_path / 'x'}: .*{said}"):
+        taken(tmp_path / "x")
+
+
+@pytest.mark.parametrize("header", [{}, {"name": None}, {"name": 5}, {"name": True}])
+def test_a_header_value_that_is_not_as_asked_is_named(tmp_path: Path, header: dict[str, Any]) -> None:
+    write_archive(tmp_path / "x", ARRAYS, header)
+    with pytest.raises(InputError, match=r"expected name \(str\) in the header, got"):
+        taken(tmp_path / "x")
+
+
+@pytest.mark.parametrize("header", ["", "{", "[]", "null", "5", "[" * 50_000, json.dumps({"version": 3})])
+def test_a_header_of_another_kind_or_version_is_an_error(tmp_path: Path, header: str) -> None:
+    save_file(ARRAYS, tmp_path / "x", {"gsencoder": header})
+    with pytest.raises(InputError, match="damaged or no safetensors file|expected version 2"):
+        taken(tmp_path / "x")
+
+
+def test_what_the_types_refuse_is_told_with_the_file(tmp_path: Path) -> None:
+    write_archive(tmp_path / "x", ARRAYS, {})
+    with pytest.raises(InputError, match=rf"^{tmp_path / 'x'}: scales > 0$"), open_archive(tmp_path / "x"):
+        raise InputError("scales > 0")
+
+
+def test_every_single_bit_flip_is_refused_or_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    write_archive(path, ARRAYS, {"name": "é", "nested": {"deep": [1, 2.5]}})
+    sound, changed = path.read_bytes(), 0
+    a, b, name = taken(path)
+    for bit in range(8 * len(sound)):
+        flip_bit(path, bit)
+        try:
+            got = taken(path)
+        except InputError:
+            pass
+        else:
+            changed += not (np.array_equal(got[0], a) and np.array_equal(got[1], b) and got[2] == name)
+        path.write_bytes(sound)
+    assert changed == 0
+
+
+def test_a_file_whose_checksums_are_gone_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    write_archive(path, ARRAYS, {"name": "n"})
+    with safe_open(path, framework="numpy") as file:
+        header = json.loads(file.metadata()["gsencoder"])
+    for missing in ("checksums", "digest"):
+        save_file(ARRAYS, path, {"gsencoder": json.dumps({k: v for k, v in header.items() if k != missing})})
+        with pytest.raises(InputError, match="its header does not have the checksum"):
+            taken(path)
+    # Nor does it help to pass for the first version.
+    save_file(ARRAYS, path, {"gsencoder": json.dumps({**header, "version": 1})})
+    with pytest.raises(InputError, match="expected version 2 of the format, got 1"):
+        taken(path)
+
+
+def test_a_file_of_the_first_version_is_read_with_one_warning_a_folder(tmp_path: Path) -> None:
+    for name in ("x", "y"):
+        write_archive(tmp_path / name, ARRAYS, {"name": "n"})
+        as_version_1(tmp_path / name)
+    with pytest.warns(SceneWarning, match="without checksums"):
+        assert taken(tmp_path / "x")[2] == "n"
+    assert taken(tmp_path / "y")[2] == "n"
+
+
+@pytest.mark.parametrize(
+    "header", [{"k": {"b": 1, "a": (1, 2)}}, {"k": {2: "x", 10: "y"}}, {"k": [0.1, 1e300, -0.0, "\ud800é\u2028"]}]
+)
+def test_headers_have_the_same_digest_after_json(tmp_path: Path, header: dict[str, Any]) -> None:
+    write_archive(tmp_path / "x", ARRAYS, {"name": "n", **header})
+    taken(tmp_path / "x")
+    rewrite(tmp_path / "x")
+    assert header_of(tmp_path / "x")["k"] == json.loads(json.dumps(header))["k"]
+
+
+def test_the_same_contents_are_the_same_bytes(tmp_path: Path) -> None:
+    write_archive(tmp_path / "x", ARRAYS, {"name": "n", "other": [1]})
+    write_archive(tmp_path / "y", ARRAYS, {"name": "n", "other": [1]})
+    assert (tmp_path / "x").read_bytes() == (tmp_path / "y").read_bytes()
+
+
+ROW = BLOCK_BYTES // 4
+"""Four float32 rows of this many columns reach over four blocks."""
+SIZES = {
+    "long": np.arange(BLOCK_BYTES // 4 * 3 + 17, dtype=np.float32),
+    "wide": np.arange(4 * ROW, dtype=np.float32).reshape(4, ROW),
+    "odd": np.arange(30_000 * 7, dtype=np.float16).reshape(-1, 7),
+    "empty": np.zeros((0, 5), np.float32),
+    "hollow": np.zeros((3, 0), np.float32),
+    "number": np.array(3.0),
+}
+
+
+@pytest.fixture
+def mapped(tmp_path: Path) -> Path:
+    write_archive(tmp_path / "m", SIZES, {})
+    return tmp_path / "m"
+
+
+def open_mapped(path: Path) -> MappedArrays:
+    return MappedArrays(path, {name: (array.dtype.name, array.ndim) for name, array in SIZES.items()})
+
+
+def test_mapped_arrays_are_what_was_written(mapped: Path, rng: np.random.Generator) -> None:
+    arrays = open_mapped(mapped)
+    for name, array in SIZES.items():
+        assert arrays.shape(name) == array.shape
+        if array.ndim:
+            rows = rng.integers(0, max(len(array), 1), 50 if len(array) else 0)
+            np.testing.assert_array_equal(arrays.rows(name, rows), array[rows])
+            np.testing.assert_array_equal(arrays.part(name, 1, len(array) // 2), array[1 : len(array) // 2])
+        np.testing.assert_array_equal(arrays.whole(name), array)
+
+
+def offset_of(path: Path, name: str) -> int:
+    """Where the bytes of an array begin in a file."""
+    data = path.read_bytes()
+    begin = 8 + int.from_bytes(data[:8], "little")
+    return begin + int(json.loads(data[8:begin])[name]["data_offsets"][0])
+
+
+@pytest.mark.parametrize("name", ["long", "wide", "odd"])
+@pytest.mark.parametrize("share", [0.0, 0.26, 0.5, 0.74, 0.9999])
+def test_a_flip_is_seen_by_whoever_reads_its_block_and_by_nobody_else(mapped: Path, name: str, share: float) -> None:
+    array = SIZES[name]
+    byte = int(share * array.nbytes)
+    flip_bit(mapped, 8 * (offset_of(mapped, name) + byte))
+    size = array.nbytes // len(array)
+    blocks = {
+        row: range(row * size // BLOCK_BYTES, (row * size + size - 1) // BLOCK_BYTES + 1) for row in range(len(array))
+    }
+    touching = [row for row, touched in blocks.items() if byte // BLOCK_BYTES in touched]
+    for row in {0, len(array) - 1, touching[0], touching[-1], max(touching[0] - 1, 0), touching[len(touching) // 2]}:
+        for read in (lambda arrays: arrays.rows(name, np.array([row])), lambda arrays: arrays.part(name, row, row + 1)):  # noqa: B023
+            arrays = open_mapped(mapped)
+            if row in touching:
+                with pytest.raises(InputError, match=f"m: the file is damaged: {name} does not have the checksum"):
+                    read(arrays)
+                # It is refused again, and not only the first time.
+                with pytest.raises(InputError):
+                    read(arrays)
+            else:
+                np.testing.assert_array_equal(read(arrays)[0], array[row])
+    with pytest.raises(InputError):
+        open_mapped(mapped).whole(name)
+
+
+def test_a_block_is_checked_once(mapped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import gsencoder.core.files.checksums as checksums
+
+    looked_at: list[int] = []
+    plain = checksums._checksum
+    arrays = open_mapped(mapped)
+    monkeypatch.setattr(checksums, "_checksum", lambda data, block: looked_at.append(block) or plain(data, block))
+    arrays.rows("wide", np.array([0, 3]))
+    assert looked_at == [0, 3]
+    arrays.rows("wide", np.array([3, 3, 2]))
+    assert looked_at == [0, 3, 2]
+    arrays.whole("wide")
+    arrays.part("wide", 0, 4)
+    assert looked_at == [0, 3, 2, 1]
+
+
+def test_mapped_files_of_the_first_version_are_read(mapped: Path) -> None:
+    save_file(load_file(mapped), mapped, {"gsencoder": json.dumps({"version": 1})})
+    with pytest.warns(SceneWarning, match="without checksums"):
+        arrays = open_mapped(mapped)
+    np.testing.assert_array_equal(arrays.rows("odd", np.array([5])), SIZES["odd"][5:6])
+
+
+def test_what_was_checked_is_remembered_until_the_file_is_written_again(
+    mapped: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import gsencoder.core.files.checksums as checksums
+
+    looked_at: list[int] = []
+    plain = checksums._checksum
+    wanted = {name: (array.dtype.name, array.ndim) for name, array in SIZES.items()}
+    arrays = open_mapped(mapped)
+    arrays.rows("wide", np.array([0, 3]))
+    arrays.close()
+    monkeypatch.setattr(checksums, "_checksum", lambda data, block: looked_at.append(block) or plain(data, block))
+    again = MappedArrays(mapped, wanted, arrays)
+    np.testing.assert_array_equal(again.whole("wide"), SIZES["wide"])
+    assert looked_at == [1, 2]
+    again.close()
+    looked_at.clear()
+    os.utime(mapped, ns=(1, 1))
+    MappedArrays(mapped, wanted, again).whole("wide")
+    assert looked_at == [0, 1, 2, 3]

@@ -1,0 +1,104 @@
+"""Signals: raised where the process is, or after what must not be cut in two."""
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from gsencoder.core.runtime.signals import SIGNALS, Stopped, held_back, stop_of
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
+
+
+@pytest.fixture(params=SIGNALS)
+def number(request: pytest.FixtureRequest) -> Iterator[int]:
+    """A signal that raises `Stopped`, as it does on the command line."""
+
+    def stop(number: int, _: object) -> None:
+        raise Stopped(number)
+
+    before = signal.signal(request.param, stop)
+    yield request.param
+    signal.signal(request.param, before)
+
+
+def test_what_is_held_back_happens_as_a_whole_and_is_stopped_then(number: int) -> None:
+    handler, done = signal.getsignal(number), []
+
+    def work() -> None:
+        with held_back():
+            os.kill(os.getpid(), number)
+            done.append("all of it")
+
+    with pytest.raises(Stopped) as stop:
+        work()
+    assert stop.value.number == number
+    assert done == ["all of it"]
+    assert signal.getsignal(number) is handler
+    with pytest.raises(Stopped):
+        os.kill(os.getpid(), number)
+
+
+def test_blocks_within_blocks_end_with_the_outer_one(number: int) -> None:
+    done = []
+
+    def work() -> None:
+        with held_back():
+            with held_back():
+                os.kill(os.getpid(), number)
+            done.append("outer")
+
+    with pytest.raises(Stopped):
+        work()
+    assert done == ["outer"]
+
+
+def test_a_signal_is_heard_beside_an_error_too(number: int) -> None:
+    def work() -> None:
+        with held_back():
+            os.kill(os.getpid(), number)
+            raise ValueError("wrong")
+
+    with pytest.raises(Stopped) as stop:
+        work()
+    assert isinstance(stop.value.__context__, ValueError)
+
+
+def test_signals_that_python_does_not_handle_are_left_alone() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with held_back():
+            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_other_threads_need_nothing() -> None:
+    done = []
+
+    def work() -> None:
+        with held_back():
+            done.append(1)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert done == [1]
+
+
+def test_a_stop_is_known_by_itself_and_within_what_compiled_code_raises() -> None:
+    stop, interrupt = Stopped(15), KeyboardInterrupt()
+    assert stop_of(stop) is stop
+    assert stop_of(interrupt) is interrupt
+    for inner in (stop, interrupt):
+        caused, met = SystemError("a"), SystemError("b")
+        caused.__cause__, met.__context__ = inner, inner
+        assert stop_of(caused) is stop_of(met) is inner
+    assert stop_of(SystemError("alone")) is None
+    other = ValueError("wrong")
+    other.__cause__ = stop
+    assert stop_of(other) is None

@@ -1,0 +1,93 @@
+"""Gaussians on a leash stay near their seeds whatever pulls at them, and keep it through pruning and resuming."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from walls import wall_views
+
+from gsencoder.data.seeding.seed import seed_from_depth
+from gsencoder.reconstruct.anchor import Leash, leash_of
+from gsencoder.reconstruct.checkpoint import State, load_state, save_state
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.parameters import parameters_from
+from gsencoder.reconstruct.photographs import Photographs
+from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.row_adam import RowAdam
+
+ALL = OptimizeConfig(steps=30, sh_degree=0, shrinks=(2, 1), shares=(0.5, 0.5), means_rate=0.03)
+PRUNED = PruneConfig(at=(0.3,))
+
+
+def held(length: float, config: OptimizeConfig = ALL) -> Optimizer:
+    adam = RowAdam(parameters_from(seed_from_depth(wall_views(depth=True), voxel=0.06), 0))
+    adam.parameters["logit_opacities"][::7] = -9
+    leash = leash_of(adam.parameters, length) if length else None
+    return Optimizer(adam, Photographs(wall_views(depth=True)), [0, 1, 3], config, prune=PRUNED, leash=leash)
+
+
+def strayed(one: Optimizer, leash: Leash) -> torch.Tensor:
+    return (one.raw["means"] - leash.means).norm(dim=1) / leash.reach
+
+
+@pytest.mark.usefixtures("no_jaxtyping")
+@pytest.mark.parametrize("rate", [1e-4, 1e-2, 10.0])
+@pytest.mark.parametrize("reach", [1e-6, 0.3])
+@pytest.mark.slow
+def test_what_pulls_forever_moves_no_further_than_the_reach(rate: float, reach: float) -> None:
+    means = torch.zeros(3, 3)
+    adam = RowAdam({"means": means})
+    leash = Leash(means=torch.zeros(3, 3), reach=torch.full((3,), reach))
+    rows = torch.tensor([0, 2])
+    grads = {"means": torch.tensor([[1.0, 0, 0], [0, -1e6, 0]])}
+    # Four times the steps that a pull takes to come within 1/e of its end.
+    for _ in range(int(4 * max(5.0, reach / rate))):
+        adam.step(rows, grads, {"means": rate})
+        leash.pull(means, rows, rate)
+    assert (means[rows].norm(dim=1) <= 1.001 * reach).all()
+    if rate < reach:
+        assert means[0, 0] < -0.9 * reach
+        assert means[2, 1] > 0.9 * reach
+    assert not means[1].any()
+
+
+def test_only_rows_in_view_are_pulled() -> None:
+    leash = Leash(means=torch.zeros(3, 3), reach=torch.ones(3))
+    means = torch.full((3, 3), 4.0)
+    leash.pull(means, torch.tensor([1]), 0.25)
+    assert means[:, 0].tolist() == [4.0, 3.0, 4.0]
+
+
+@pytest.mark.slow
+def test_a_fitted_splat_stays_within_its_leash_and_strays_without() -> None:
+    free, bound = held(0), held(0.3)
+    leash = leash_of(free.raw, 0.3)
+    kept = replace(PRUNED, at=())
+    free.pruning = bound.pruning = kept
+    for _ in range(30):
+        free.advance()
+        bound.advance()
+    assert strayed(free, leash).max() > 3
+    # Adam's first steps on a row may be a little longer than the rate, and three coordinates each have their own.
+    assert strayed(bound, leash).max() < 3**0.5
+    assert strayed(bound, leash).max() > 0.1
+
+
+@pytest.mark.slow
+def test_a_leash_is_pruned_with_its_gaussians_and_taken_up_with_them(tmp_path: Path) -> None:
+    whole, cut = held(0.3), held(0.3)
+    for _ in range(20):
+        whole.advance()
+    for _ in range(12):
+        cut.advance()
+    assert cut.leash is not None
+    assert len(cut.raw["means"]) == len(cut.leash.means) < len(held(0.3).raw["means"])
+    assert strayed(cut, cut.leash).max() < 3**0.5
+    save_state(tmp_path / "state", State(adam=cut.adam, leash=cut.leash, step=12, seconds=0.0, facts={}), {})
+    found = load_state(tmp_path / "state", {}, steps=30, sh_degree=0)
+    again = Optimizer(found.adam, cut.photographs, cut.training, ALL, prune=PRUNED, leash=found.leash, step=12)
+    for _ in range(8):
+        again.advance()
+    for name, value in whole.raw.items():
+        assert torch.equal(value, again.raw[name]), name

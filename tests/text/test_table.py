@@ -1,0 +1,317 @@
+"""The closed vocabulary: what counts as the same word, and files that are whole, cut or hostile."""
+
+import io
+import json
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.text.table import TextTable, load_text_table, make_text_table, save_text_table
+
+NAMES = (
+    "mug",
+    "coffee mug",
+    "knife",
+    "glass",
+    "glasses",
+    "cherry",
+    "tennis ball",
+    "golf ball",
+    "box",
+    "scissors",
+    "T-shirt",
+)
+
+
+@pytest.fixture
+def table(rng: np.random.Generator) -> TextTable:
+    vectors = rng.normal(size=(len(NAMES), 16))
+    return make_text_table(NAMES, vectors / np.linalg.norm(vectors, axis=1, keepdims=True), "toy")
+
+
+def save_npz(path: Path, **arrays: np.ndarray) -> Path:
+    np.savez(path, **arrays)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("word", "name"),
+    [
+        ("mug", "mug"),
+        ("  MUG\t", "mug"),
+        ("mugs", "mug"),
+        ("a mug", "mug"),
+        ("the Tennis_Balls", "tennis ball"),
+        ("tennis-ball", "tennis ball"),
+        ("knives", "knife"),
+        ("cherries", "cherry"),
+        ("boxes", "box"),
+        ("glass", "glass"),
+        ("glasses", "glasses"),
+        ("scissor", "scissors"),
+        ("t shirts", "T-shirt"),
+        ("ｍｕｇ", "mug"),
+    ],
+)
+def test_simple_variations_mean_the_same_word(table: TextTable, word: str, name: str) -> None:
+    found = table.find(word)
+    assert found is not None
+    assert table.names[found] == name
+    assert np.array_equal(table.encode([word])[0], table.embeddings[NAMES.index(name)])
+
+
+def test_many_words_encode_as_they_do_one_by_one(table: TextTable) -> None:
+    words = ["box", "mugs", "box", "golf ball"]
+    assert np.array_equal(table.encode(words), np.concatenate([table.encode([word]) for word in words]))
+
+
+@pytest.mark.parametrize(
+    ("word", "near"), [("knive", "knife"), ("ball", "golf ball"), ("beer mug", "coffee mug"), ("scisors", "scissors")]
+)
+def test_an_unknown_word_is_an_error_that_names_near_ones(table: TextTable, word: str, near: str) -> None:
+    with pytest.raises(InputError, match=f"not among the 11 words of toy: '{word}'.*{near}"):
+        table.encode(["mug", word])
+
+
+def test_an_unknown_word_with_nothing_near_says_so(table: TextTable) -> None:
+    with pytest.raises(InputError, match="no name is near"):
+        table.encode(["qqqq"])
+
+
+@given(st.text(max_size=40))
+@settings(deadline=None, max_examples=100)
+def test_any_text_is_a_word_of_the_table_or_an_error_of_one_line(word: str) -> None:
+    table = make_text_table(("mug", "box"), np.eye(2), "toy")
+    known = table.find(word)
+    if known is not None:
+        assert np.array_equal(table.encode([word])[0], table.embeddings[known])
+    else:
+        with pytest.raises(InputError, match="not among the 2 words of toy"):
+            table.encode([word])
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_a_saved_table_reads_back_as_it_was(table: TextTable, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"table{suffix}"
+    if suffix == ".npz":
+        save_npz(path, names=np.array(NAMES), embeddings=table.embeddings, encoder=np.array("toy"))
+    else:
+        save_text_table(path, table)
+    read = load_text_table(path)
+    assert read.names == table.names
+    assert read.space == table.space
+    np.testing.assert_allclose(read.embeddings, table.embeddings, atol=2e-7)
+    np.testing.assert_allclose(read.mean, table.mean, atol=2e-7)
+
+
+def test_a_table_saved_in_half_precision_is_half_as_large_and_has_unit_rows(tmp_path: Path) -> None:
+    vectors = np.random.default_rng(0).normal(size=(50, 64)).astype(np.float32)
+    table = make_text_table([f"n{i}" for i in range(50)], vectors / np.linalg.norm(vectors, axis=1)[:, None], "toy")
+    save_text_table(tmp_path / "full.safetensors", table)
+    save_text_table(tmp_path / "half.safetensors", table, dtype="float16")
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * (tmp_path / "full.safetensors").stat().st_size
+    read = load_text_table(tmp_path / "half.safetensors")
+    assert read.names == table.names
+    np.testing.assert_allclose(np.linalg.norm(read.embeddings, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(read.embeddings, table.embeddings, atol=5e-4)
+
+
+def test_a_half_precision_file_gives_unit_rows_and_the_encoder_of_its_name(table: TextTable, tmp_path: Path) -> None:
+    path = save_npz(tmp_path / "toy_names.npz", names=np.array(NAMES), embeddings=table.embeddings.astype(np.float16))
+    read = load_text_table(path)
+    assert read.space.text_encoder == "toy"
+    np.testing.assert_allclose(np.linalg.norm(read.embeddings, axis=1), 1, atol=1e-6)
+    assert load_text_table(path, encoder="other").space.text_encoder == "other"
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"names": np.array(["a1"])}, "embeddings is missing"),
+        ({"names": np.array([1.0]), "embeddings": np.eye(1)}, "names: expected 1 axes"),
+        ({"names": np.array(["a1"]), "embeddings": np.ones(3)}, "embeddings: expected 2 axes"),
+        ({"names": np.array(["a1", "b1"]), "embeddings": np.eye(3)}, "one embedding a name"),
+        ({"names": np.array(["x", "X "]), "embeddings": np.eye(2)}, "'X ' in row 1 is repeated"),
+        ({"names": np.array(["x", ""]), "embeddings": np.eye(2)}, "row 1 is empty"),
+        ({"names": np.array(["x", "y"]), "embeddings": np.eye(2) * 3}, "'x' has norm 3"),
+        ({"names": np.array(["x", "y"]), "embeddings": np.eye(2) * np.nan}, "finite unit vectors"),
+        ({"names": np.array(["x"]), "embeddings": np.zeros((1, 0))}, "got shape"),
+    ],
+)
+def test_a_table_that_is_none_says_what_is_wrong(
+    tmp_path: Path, no_jaxtyping: None, arrays: dict[str, np.ndarray], message: str
+) -> None:
+    path = save_npz(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(InputError, match=message) as caught:
+        load_text_table(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_array_of_objects_is_refused_and_never_unpickled(tmp_path: Path) -> None:
+    path = tmp_path / "bad.npz"
+    np.savez(path, names=np.array([{"a": 1}], dtype=object), embeddings=np.eye(1))
+    with pytest.raises(InputError, match="names: expected 1 axes of type 'U'"):
+        load_text_table(path)
+
+
+def npy(shape: tuple[int, ...], data: bytes) -> bytes:
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    return head.getvalue() + data
+
+
+@pytest.mark.parametrize("shape", [(10**9, 10**9), (5, 2), (1, 1)])
+def test_a_header_that_claims_another_size_is_refused_before_memory_is_taken(
+    tmp_path: Path, shape: tuple[int, ...]
+) -> None:
+    path = tmp_path / "bad.npz"
+    names = io.BytesIO()
+    np.save(names, np.array(["x", "y"]))
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("names.npy", names.getvalue())
+        archive.writestr("embeddings.npy", npy(shape, b"\0" * 16))
+    with pytest.raises(InputError, match="header claims"):
+        load_text_table(path)
+
+
+def test_a_bomb_is_refused_by_the_size_that_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "bomb.npz"
+    np.savez_compressed(path, names=np.array(["x"]), embeddings=np.zeros((1, 100_000), np.float32))
+    monkeypatch.setattr("gsencoder.core.files.npz.LARGEST_ARRAY", 100_000)
+    with pytest.raises(InputError, match="claims 400,128 bytes"):
+        load_text_table(path)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_every_truncation_is_an_error_of_one_line(table: TextTable, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"table{suffix}"
+    if suffix == ".npz":
+        np.savez_compressed(path, names=np.array(NAMES), embeddings=table.embeddings)
+    else:
+        save_text_table(path, table)
+    whole = path.read_bytes()
+    for length in {0, 1, 2, 7, 8, 9, len(whole) // 3, len(whole) // 2, len(whole) - 1}:
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError) as caught:
+            load_text_table(path)
+        assert "\n" not in str(caught.value)
+
+
+@given(st.binary(max_size=200), st.integers(0, 4000), st.sampled_from([".npz", ".safetensors"]))
+@settings(deadline=None, max_examples=150)
+def test_bytes_overwritten_anywhere_give_a_table_or_an_input_error(
+    tmp_path_factory: pytest.TempPathFactory, patch: bytes, at: int, suffix: str
+) -> None:
+    path = tmp_path_factory.mktemp("fuzz") / f"table{suffix}"
+    table = make_text_table(("mug", "box"), np.eye(2), "toy")
+    if suffix == ".npz":
+        save_npz(path, names=np.array(["mug", "box"]), embeddings=np.eye(2))
+    else:
+        save_text_table(path, table)
+    data = bytearray(path.read_bytes())
+    at %= len(data)
+    data[at : at + len(patch)] = patch
+    path.write_bytes(data)
+    message = ""
+    try:
+        read: TextTable | None = load_text_table(path)
+    except InputError as error:
+        read, message = None, str(error)
+    assert (read is None) == bool(message)
+    assert "\n" not in message
+
+
+def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    from safetensors.numpy import save_file
+
+    path = tmp_path / "other.safetensors"
+    save_file({"embeddings": np.eye(2, dtype=np.float32)}, path)
+    with pytest.raises(InputError, match="expected version 2 of the format, got None"):
+        load_text_table(path)
+    header = json.dumps({"names": ["x"], "space": {"name": "s", "channels": "many"}})
+    metadata = {"format": "gsencoder text table 1", "table": header}
+    save_file({"embeddings": np.eye(2, dtype=np.float32), "mean": np.zeros(2, np.float32)}, path, metadata)
+    with pytest.warns(SceneWarning), pytest.raises(InputError, match="names and a space of text"):
+        load_text_table(path)
+
+
+def test_a_table_of_the_first_version_is_read_with_a_warning(tmp_path: Path) -> None:
+    from safetensors.numpy import save_file
+
+    path = tmp_path / "old.safetensors"
+    header = json.dumps({"names": ["x", "y"], "space": {"name": "s", "channels": 2, "text_encoder": "s"}})
+    arrays = {"embeddings": np.eye(2, dtype=np.float16), "mean": np.full(2, 0.5, np.float32)}
+    save_file(arrays, path, {"format": "gsencoder text table 1", "table": header})
+    with pytest.warns(SceneWarning, match="without checksums"):
+        table = load_text_table(path)
+    assert table.names == ("x", "y")
+    np.testing.assert_array_equal(table.embeddings, np.eye(2))
+
+
+def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"gone\.npz: no such file"):
+        load_text_table(tmp_path / "gone.npz")
+
+
+@pytest.mark.shared
+def test_the_real_table_knows_what_its_names_say(shared: Path) -> None:
+    table = load_text_table(shared / "models" / "clip_vitb32_names.npz")
+    assert len(table) == 1583
+    assert table.space.text_encoder == "clip_vitb32"
+    assert np.array_equal(table.encode(["Coffee_Cups"]), table.encode(["coffee cup"]))
+    with pytest.raises(InputError, match=r"near: coffee cup.*mug"):
+        table.encode(["coffee mug"])
+    # Names of such a space all look alike until their mean is removed.
+    raw = table.embeddings[:200] @ table.embeddings[:200].T
+    centred = table.embeddings[:200] - table.mean
+    centred /= np.linalg.norm(centred, axis=1, keepdims=True)
+    assert np.median(raw) > 0.65
+    assert abs(np.median(centred @ centred.T)) < 0.1
+
+
+def test_a_header_nested_without_end_is_refused(tmp_path: Path) -> None:
+    from safetensors.numpy import save_file
+
+    arrays = {"embeddings": np.eye(2, dtype=np.float32), "mean": np.zeros(2, np.float32)}
+    save_file(arrays, tmp_path / "t.safetensors", {"format": "gsencoder text table 1", "table": "[" * 100_000})
+    with pytest.warns(SceneWarning), pytest.raises(InputError, match="cannot be read as a text table"):
+        load_text_table(tmp_path / "t.safetensors")
+
+
+def test_a_page_of_text_taken_for_a_word_is_not_repeated_whole(table: TextTable) -> None:
+    with pytest.raises(InputError) as caught:
+        table.encode(["x" * 100_000])
+    assert len(str(caught.value)) < 300
+
+
+def test_names_longer_than_words_are_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<U2000", "fortran_order": False, "shape": (4000,)})
+    path = tmp_path / "long.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("names.npy", head.getvalue() + bytes(4000 * 8000))
+        archive.writestr("embeddings.npy", npy((4000, 4), bytes(4000 * 16)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="names: entries of 2,000 characters, expected at most 1,000"):
+            load_text_table(path)
+        assert tracemalloc.get_traced_memory()[1] < 4_000_000
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("length", [900, 1_000_000])
+@pytest.mark.parametrize("wrong", ["norm", "repeated", "unknown"])
+def test_no_error_of_a_table_repeats_a_long_name(length: int, wrong: str, no_jaxtyping: None) -> None:
+    names = ["x" * length, "x" * length if wrong == "repeated" else "y"]
+    rows = np.eye(2, dtype=np.float32) * (2 if wrong == "norm" else 1)
+    with pytest.raises(InputError) as caught:
+        make_text_table(names, rows, "toy" * length).encode(["x" * (length - 1)])
+    assert len(str(caught.value)) < 1000
