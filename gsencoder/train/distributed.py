@@ -4,6 +4,7 @@ torchrun and SLURM (srun, submitit) tell a process its place through the environ
 Nothing else in the package asks how many there are.
 """
 
+import gc
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -116,6 +117,10 @@ def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[
         yield place, chosen
         return
     backend = "nccl" if chosen.type == "cuda" else "gloo"
+    # Its functions take the group that exists when they are imported as a default argument, and would keep it forever;
+    # DistributedDataParallel imports them. A group that is still there when the interpreter ends may abort the process.
+    from torch.distributed import nn  # noqa: F401
+
     try:
         distributed.init_process_group(
             backend,
@@ -129,6 +134,8 @@ def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[
         raise InputError(f"training: process {place.rank} of {place.size} cannot meet the others: {message}") from error
     yield place, chosen
     # Not after an error: the others may be waiting for a sum, and leaving the group would wait for them.
+    # A network that was wrapped refers to itself and to the group, which ends with its last reference.
+    gc.collect()
     distributed.destroy_process_group()
 
 

@@ -173,6 +173,8 @@ class Trainer:
         finally:
             if self._log is not None:
                 self._log.close()
+        # DistributedDataParallel holds the process group, whose threads must end before the interpreter does.
+        self.distillation.encoder, self._parallel = self.encoder, None
         return self.state
 
     def _run(self, track: Track) -> None:

@@ -376,8 +376,11 @@ if __name__ == "__main__":
     names = {names!r}
     with joined("cpu") as (place, device):
         config = replace(SHORT, steps={steps}, accumulate={accumulate})
-        Trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
-                settings={{}}, place=place, device=device).run()
+        trainer = Trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
+                          settings={{}}, place=place, device=device)
+        trainer.run()
+    threads = [(task / "comm").read_text() for task in Path("/proc/self/task").glob("*")]
+    sys.exit(any("gloo" in name for name in threads) and "threads of the process group are left: " + str(threads))
 """
 
 
