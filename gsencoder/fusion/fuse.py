@@ -17,11 +17,12 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import evenly
+from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.checkpoint import PartialFusion
-from gsencoder.fusion.lift import Clock, Sums, map_rows, view_matrix
+from gsencoder.fusion.lift import Sums, map_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import BlendConfig

@@ -1,14 +1,12 @@
 """One view's part in fusion: the matrix that its map is lifted with, and the sums that all views add to."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 
+from gsencoder.core.runtime.clock import Clock
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.checkpoint import PartialFusion
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
@@ -17,19 +15,6 @@ from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import depth_image
 from gsencoder.render.rays import grid_lattice
 from gsencoder.types import FeatureBasis, FeatureMap, Gaussians, Views
-
-
-class Clock:
-    """Seconds by step."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, step: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[step] = self.seconds.get(step, 0.0) + time.perf_counter() - start
 
 
 def map_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "P D"]:

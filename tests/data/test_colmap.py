@@ -172,7 +172,8 @@ def test_pictures_can_be_written_after_pycolmap_came_in() -> None:
     """pycolmap's zlib and the system's must not meet (see load_pycolmap): the process would abort."""
     code = (
         "from gsencoder.data.readers.undistort import load_pycolmap; load_pycolmap(); "
-        "import io, zlib; from PIL import Image; Image.new('RGB', (64, 48)).save(io.BytesIO(), 'PNG'); print(len(zlib.compress(b'a' * 1000)))"
+        "import io, zlib; from PIL import Image; "
+        "Image.new('RGB', (64, 48)).save(io.BytesIO(), 'PNG'); print(len(zlib.compress(b'a' * 1000)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

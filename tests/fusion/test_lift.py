@@ -5,7 +5,8 @@ import pytest
 import torch
 from splats import front_camera, random_gaussians
 
-from gsencoder.fusion.lift import Clock, Sums, capped, center_matrix, map_rows, view_matrix
+from gsencoder.core.runtime.clock import Clock
+from gsencoder.fusion.lift import Sums, capped, center_matrix, map_rows, view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import depth_image
