@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.step_log import Log
 from gsencoder.core.runtime.device import autocast_dtype
 from gsencoder.core.runtime.device_names import Precision
 from gsencoder.core.runtime.signals import held_back, stop_of
@@ -27,7 +28,6 @@ from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.checkpoint import CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
 from gsencoder.train.distributed import STOPPED_ELSEWHERE, Place, sum_over_processes, together
-from gsencoder.train.log import Log
 from gsencoder.train.losses import Head, LossConfig
 from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
 

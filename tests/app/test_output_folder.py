@@ -19,16 +19,11 @@ import numpy as np
 import pytest
 
 from gsencoder.app.runs import output_folder as outputs
-from gsencoder.app.runs.output_folder import (
-    output_folder,
-    refuse_existing,
-    refuse_to_replace_inputs,
-    write_bytes,
-    write_json,
-)
+from gsencoder.app.runs.output_folder import output_folder, refuse_existing, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress
 from gsencoder.app.runs.summary import SUMMARY_NAME, Summary, peak_memory_mb
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.json_values import write_bytes, write_json
 
 
 def names(folder: Path) -> list[str]:

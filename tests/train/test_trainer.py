@@ -18,9 +18,9 @@ from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.step_log import LOG_FILE, read_log
 from gsencoder.core.runtime.signals import Stopped
 from gsencoder.train.checkpoint import CHECKPOINT_FILE
-from gsencoder.train.log import LOG_FILE, read_log
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene

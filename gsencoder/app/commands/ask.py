@@ -13,13 +13,14 @@ from typing import Any
 
 from gsencoder.app.commands.query_words import words_of
 from gsencoder.app.commands.views import shown_scene, views_to_json, write_pictures
-from gsencoder.app.runs.output_folder import output_folder, write_bytes, write_json
+from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import printable
 from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary, plain
+from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.files.json_values import plain, write_bytes, write_json
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.store.folder import WORDS_FILE

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.app.commands.demo_report import Asked, write_report
-from gsencoder.app.runs.output_folder import output_folder, write_json
+from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats import save_splat

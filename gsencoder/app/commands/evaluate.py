@@ -6,12 +6,13 @@ from pathlib import Path
 
 from rich.table import Table
 
-from gsencoder.app.runs.output_folder import output_folder, write_bytes
+from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.csv_text import csv_text
+from gsencoder.core.files.json_values import write_bytes
 from gsencoder.core.runtime.heap import keep_heap
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig

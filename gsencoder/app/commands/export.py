@@ -3,12 +3,13 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.runs.output_folder import refuse_existing, write_json
+from gsencoder.app.runs.output_folder import refuse_existing
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.device_names import Stored
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.app.commands.query_words import asked_words, words_of
-from gsencoder.app.runs.output_folder import output_folder, write_json
+from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.json_values import write_json
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.draw.relevancy_views import relevancy_pictures

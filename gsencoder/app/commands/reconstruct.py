@@ -19,6 +19,7 @@ from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, SceneWarning, advised
 from gsencoder.core.even_indices import evenly
+from gsencoder.core.files.step_log import LOG_FILE, Log, read_log
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import keep_heap
@@ -38,7 +39,6 @@ from gsencoder.reconstruct.score import FEWEST, Score, score, seen_pixels, split
 from gsencoder.reconstruct.sfm import SfmConfig
 from gsencoder.reconstruct.start import start_of
 from gsencoder.render.rasterize import RasterConfig
-from gsencoder.train.log import LOG_FILE, Log, read_log
 from gsencoder.types import Scene
 
 PLY_FILE, PICTURES_FILE = "splat.ply", "held_out.png"

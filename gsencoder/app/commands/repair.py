@@ -7,11 +7,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.app.runs.output_folder import refuse_existing, write_json
+from gsencoder.app.runs.output_folder import refuse_existing
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.json_values import write_json
 from gsencoder.data.splat_formats.repair import repair_splat
 from gsencoder.data.splats import READABLE, WRITABLE, RawSplat, gaussians_from_raw, read_raw, save_splat
 

@@ -21,6 +21,7 @@ from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import keep_heap
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
@@ -42,7 +43,6 @@ from gsencoder.train.adapter_heads import load_heads
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.crops import SamplingConfig
 from gsencoder.train.distributed import Place, joined, together
-from gsencoder.train.log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene

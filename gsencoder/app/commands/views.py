@@ -9,12 +9,13 @@ import numpy as np
 from PIL import Image
 
 from gsencoder.app.commands.query_words import asked_words, words_of
-from gsencoder.app.runs.output_folder import output_folder, write_json
+from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import write_archive
+from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.pictures import Picture

@@ -6,46 +6,18 @@ import os
 import re
 import secrets
 import shutil
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from hashlib import sha1
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.runs.summary import SUMMARY_NAME, Summary, json_bytes
-from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.atomic import atomic_file, is_full_disk, locked
+from gsencoder.app.runs.summary import SUMMARY_NAME, Summary
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.atomic import is_full_disk, locked
+from gsencoder.core.files.json_values import json_bytes, write_bytes
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
-
-
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Writes a file that appears whole or not at all, in place of what had its name.
-
-    Raises:
-        InputError: the folder is missing, the disk is full, or the system refuses.
-    """
-    with atomic_file(path) as stream:
-        stream.write(data)
-
-
-def write_json(path: str | Path, value: Any) -> None:
-    """Writes JSON, atomically. numpy values, paths and dataclasses become what JSON has for them.
-
-    Numbers that are not finite become null, with one counted `SceneWarning` that names them.
-
-    Raises:
-        InputError: as `write_bytes`.
-    """
-    data, lost = json_bytes(value)
-    if lost:
-        warnings.warn(
-            f"{path}: {len(lost)} numbers are not finite and were written as null: {', '.join(lost[:5])}",
-            SceneWarning,
-            stacklevel=2,
-        )
-    write_bytes(path, data)
 
 
 @contextmanager
