@@ -1,1 +1,5 @@
 """Photographs to Gaussians: start from points, optimise, prune, never grow (SplatDistill, section 3.1)."""
+
+from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
+
+__all__ = ["ReconstructConfig", "Reconstruction", "reconstruct"]

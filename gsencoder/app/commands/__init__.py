@@ -34,7 +34,7 @@ COMMANDS = {
         Command(
             name="demo", config="DemoConfig", help="the whole pipeline on a built-in scene, offline, in one report"
         ),
-        Command(name="reconstruct", config="ReconstructConfig", help="photographs to Gaussians, posed or not"),
+        Command(name="reconstruct", config="ReconstructCommandConfig", help="photographs to Gaussians, posed or not"),
         Command(name="fuse", config="FuseCommandConfig", help="per-Gaussian features from a teacher's maps"),
         Command(name="train", config="TrainConfig", help="distil a teacher into an encoder of splats"),
         Command(name="encode", config="EncodeCommandConfig", help="per-Gaussian features of a splat in one pass"),

@@ -34,9 +34,9 @@ HIDDEN = "(not shown)"
 """What stands for the value of a secret option wherever settings are shown or written."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class CommonConfig:
-    """What every command takes."""
+    """What every command takes. Without slots, so that a command can inherit from its stage's settings as well."""
 
     out: Path | None = field(default=None, metadata={"help": "where the results go", "metavar": "PATH"})
     overwrite: bool = field(default=False, metadata={"help": "replace what an earlier run wrote to out="})

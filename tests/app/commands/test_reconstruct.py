@@ -12,9 +12,9 @@ from archives import flip_bit
 from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
 from gsencoder.app import cli
-from gsencoder.app.commands import reconstruct
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats import load_splat
+from gsencoder.reconstruct import run as reconstruct
 from gsencoder.reconstruct.score import split
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,8 @@ import pytest
 from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
 from gsencoder.app import cli
-from gsencoder.app.commands import reconstruct
 from gsencoder.core.errors import InputError
+from gsencoder.reconstruct import run as reconstruct
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +47,7 @@ def test_results_that_cannot_be_written_cost_no_step(
 
     words = [str(room), f"out={tmp_path / 'out'}", *QUICK, "checkpoint_every=1000"]
     with monkeypatch.context() as patched:
-        patched.setattr(reconstruct, "save_splat", full)
+        patched.setattr("gsencoder.app.commands.reconstruct.save_splat", full)
         assert "no space left on the device: no result was written" in refusal(capsys, *words)
     monkeypatch.setattr(reconstruct.Optimizer, "advance", never)
     assert cli.main(["reconstruct", *words]) == 0
@@ -101,7 +101,7 @@ def test_photographs_are_placed_whatever_lies_in_folders_beside_them(
         asked.append(pictures)
         raise InputError("stop")
 
-    monkeypatch.setattr("gsencoder.app.commands.reconstruct_scene.place_photographs", remembered)
+    monkeypatch.setattr("gsencoder.reconstruct.open_scene.place_photographs", remembered)
     assert "stop" in refusal(capsys, str(folder), f"out={folder / 'result'}", "quiet=true")
     assert asked == [folder]
 

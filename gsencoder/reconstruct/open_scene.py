@@ -1,0 +1,87 @@
+"""The scene that a reconstruction starts from: one with poses, or a folder of photographs that SfM places first."""
+
+import os
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gsencoder.core.errors import InputError, SceneWarning, advised, listed
+from gsencoder.core.runtime.clock import Clock
+from gsencoder.data.scenes import SceneConfig, find_scenes, is_scene, load_scene
+from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
+from gsencoder.reconstruct.sfm import PLACED_FILE, Placed, SfmConfig, photographs_in, place_photographs, placed_before
+from gsencoder.types import Scene
+
+START_AGAIN = "give resume=false to begin anew"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OpenedScene:
+    """A scene with posed photographs.
+
+    Attributes:
+        scene: its poses may come from structure from motion.
+        sfm: the result of structure from motion; None where the scene had poses.
+        seconds: wall-clock time of structure from motion, under "place".
+    """
+
+    scene: Scene
+    sfm: Placed | None
+    seconds: dict[str, float]
+
+
+def open_scene(
+    path: Path, work: Path, *, splat: str = "", data: SceneConfig = SceneConfig(), sfm: SfmConfig = SfmConfig()
+) -> OpenedScene:
+    """Reads a scene; a folder that holds photographs and nothing else is placed by structure from motion first.
+
+    Args:
+        path: a scene, or a folder of photographs.
+        work: an existing folder for the COLMAP model; one that an interrupted run completed there is used again.
+        splat: file of Gaussians to refine; empty = none.
+        data: how the scene is read.
+        sfm: how photographs are placed.
+
+    Raises:
+        InputError: no photographs, several scenes, or structure from motion fails.
+
+    Warns:
+        SceneWarning: photographs that could not be placed.
+    """
+    clock = Clock()
+    pictures = next((folder for folder in (path, path / "images") if folder.is_dir() and photographs_in(folder)), None)
+    # A folder of photographs may also hold scenes of others, or the results of a run: the photographs are meant.
+    scenes = [] if pictures is not None and not is_scene(path) else find_scenes([path])
+    if len(scenes) > 1:
+        names = listed([scene.name for scene in scenes])
+        raise InputError(f"{path}: holds {len(scenes)} scenes ({names}); give one of them")
+    if pictures is None or scenes:
+        scene = load_scene(scenes[0], splat=splat or None, options=data)
+        if scene.views is None:
+            raise InputError(f"{path}: a splat without photographs; there is nothing to fit it to")
+        return OpenedScene(scene=scene, sfm=None, seconds=clock.seconds)
+    if splat:
+        raise InputError(
+            f"{path}: splat={splat} lies in a world of its own, and photographs without poses are placed "
+            "in another; give a scene with the poses that belong to the splat"
+        )
+    placed = placed_before(pictures, work, sfm)
+    if placed is None and os.path.lexists(work / CHECKPOINT_FILE):
+        raise InputError(
+            f"{work}: a run was cut off here, and where its photographs were placed ({PLACED_FILE}, sparse/0) is "
+            "gone or damaged, or belongs to other photographs or settings; put these back, or give resume=false to "
+            "begin anew"
+        )
+    if placed is None:
+        with clock("place"):
+            placed = place_photographs(pictures, work, sfm)
+    if placed.missing:
+        warnings.warn(
+            f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "
+            f"and are not used: {listed(placed.missing)}",
+            SceneWarning,
+            stacklevel=2,
+        )
+    with advised(START_AGAIN):
+        scene = load_scene(work, options=replace(data, images=str(pictures)))
+    return OpenedScene(scene=scene, sfm=placed, seconds=clock.seconds)

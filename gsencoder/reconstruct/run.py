@@ -1,0 +1,319 @@
+"""Reconstruction: posed photographs to Gaussians by seeding, optimization and pruning (SplatDistill, sec. 3.1)."""
+
+import os
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from gsencoder.core.errors import InputError, SceneWarning, advised
+from gsencoder.core.even_indices import evenly
+from gsencoder.core.files.json_values import plain
+from gsencoder.core.files.step_log import LOG_FILE, Log, read_log
+from gsencoder.core.runtime.clock import Clock
+from gsencoder.core.runtime.device import choose_device
+from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.reconstruct.anchor import leash_of
+from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
+from gsencoder.reconstruct.dense import DenseConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.parameters import parameters_from
+from gsencoder.reconstruct.photographs import Photographs
+from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.score import FEWEST, score, seen_pixels, split, unmasked
+from gsencoder.reconstruct.start import start_of
+from gsencoder.render.rasterize import RasterConfig
+from gsencoder.types import Gaussians, Scene
+
+START_AGAIN = "give resume=false to begin anew"
+MAX_COMPARISONS = 4
+"""Held-out photographs of which the result holds a render."""
+LogRow = dict[str, int | float]
+"""One line of the log: step, seconds, gaussians, and the fields of a Score."""
+Report = Callable[[str], None]
+"""Receives one line of text for people."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReconstructConfig:
+    """How photographs become Gaussians, and how the result is judged."""
+
+    holdout: int = field(default=8, metadata={"help": "of so many photographs one is kept to judge by; 0 = none"})
+    validate_every: int = field(default=500, metadata={"help": "steps between judgements; 0 = at the end alone"})
+    checkpoint_every: float = field(default=60.0, metadata={"help": "seconds between checkpoints"})
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    dense: DenseConfig = field(default_factory=DenseConfig)
+    optimize: OptimizeConfig = field(default_factory=OptimizeConfig)
+    prune: PruneConfig = field(default_factory=PruneConfig)
+    raster: RasterConfig = field(default_factory=RasterConfig)
+
+    def __post_init__(self) -> None:
+        if self.holdout < 0 or self.holdout == 1:
+            raise InputError(f"holdout: expected 0 (none) or 2 and more, got {self.holdout}")
+        for name in ("validate_every", "checkpoint_every"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+    def identity(self) -> dict[str, Any]:
+        """The settings that an interrupted run must share with the run that continues it, as JSON values."""
+        names = ("seeds", "dense", "optimize", "prune", "raster", "holdout")
+        return {name: plain(getattr(self, name)) for name in names}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Comparison:
+    """A held-out photograph and the render of the same view.
+
+    Attributes:
+        name: of the view.
+        photograph: as decoded.
+        render: of the reconstructed splat.
+    """
+
+    name: str
+    photograph: UInt8[np.ndarray, "H W 3"]
+    render: UInt8[np.ndarray, "H W 3"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reconstruction:
+    """A splat that was fitted to photographs, and how well it predicts those that were held out.
+
+    Attributes:
+        gaussians: relative to the scene's origin.
+        seeding: number and source of the seeds, and what was added to structure-from-motion points, as JSON values.
+        steps: optimization steps that were done.
+        training: row numbers of the views that were fitted.
+        held_out: row numbers of the views that were not.
+        log: one row a validation, oldest first; empty without held-out views.
+        comparisons: up to four held-out photographs beside renders of them.
+        seconds: wall-clock time by step of the stage.
+    """
+
+    gaussians: Gaussians
+    seeding: Mapping[str, Any]
+    steps: int
+    training: tuple[int, ...]
+    held_out: tuple[int, ...]
+    log: tuple[LogRow, ...]
+    comparisons: tuple[Comparison, ...]
+    seconds: Mapping[str, float]
+
+
+def reconstruct(
+    scene: Scene,
+    config: ReconstructConfig = ReconstructConfig(),
+    *,
+    device: Device = "auto",
+    work: Path | None = None,
+    made_from: Mapping[str, Any] = {},
+    track: Track = untracked,
+    report: Report = lambda line: None,  # noqa: ARG005
+) -> Reconstruction:
+    """Fits Gaussians to the photographs of a scene.
+
+    The Gaussians are the scene's own splat, or seeds from its depth, mesh or structure-from-motion points. They are
+    moved, recolored and pruned, and never split, so every surface has to be seeded at the start.
+
+    Args:
+        scene: with photographs and poses; depth and masks are used where it has them.
+        config: see there.
+        device: where to compute; on CUDA gsplat renders.
+        work: an existing folder for the checkpoint and the log. A run that was interrupted is continued from the
+            checkpoint in it, with the same result; None = a temporary folder.
+        made_from: what else a run must share with the run that it continues, as JSON values, such as the path and the
+            reading options of the scene.
+        track: progress of long loops.
+        report: receives a line after seeding and after each validation.
+
+    Raises:
+        InputError: no photographs, too few of them, nothing to seed from, no Gaussian in view, a loss or gradient that
+            is not finite, or a checkpoint of another run.
+
+    Warns:
+        SceneWarning: photographs that are masked all over, or plane sweeps that found no surface.
+    """
+    if scene.views is None:
+        raise InputError(f"reconstruct: scene {scene.name} has no photographs to fit a splat to")
+    clock = Clock()
+    with ExitStack() as stack:
+        folder = work or Path(stack.enter_context(TemporaryDirectory()))
+        with clock("read"):
+            photographs = Photographs(scene.views, track=track)
+        training, held_out = split(len(photographs), config.holdout)
+        training = unmasked(photographs, training, "photographs to fit", least=FEWEST)
+        held_out = unmasked(photographs, held_out, "held-out photographs")
+        identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
+        chosen_device, checkpoint = choose_device(device), folder / CHECKPOINT_FILE
+        if continued := os.path.lexists(checkpoint):
+            shape = {"steps": config.optimize.steps, "sh_degree": config.optimize.sh_degree}
+            state = load_state(checkpoint, identity, **shape, device=chosen_device)
+        else:
+            with clock("seeds"):
+                state = initial_state(scene, photographs, training, config, chosen_device, track, report)
+        optimizer = Optimizer(
+            state.adam,
+            photographs,
+            training,
+            config.optimize,
+            prune=config.prune,
+            raster=config.raster,
+            leash=state.leash,
+            step=state.step,
+        )
+        if not continued:
+            save_state(checkpoint, state, identity)
+        with clock("optimise"):
+            log = optimize(optimizer, state, held_out, config, folder, identity, track, report)
+        return Reconstruction(
+            gaussians=optimizer.gaussians(),
+            seeding=state.facts,
+            steps=optimizer.step,
+            training=optimizer.training,
+            held_out=tuple(held_out),
+            log=tuple(log),
+            comparisons=compare(optimizer, held_out),
+            seconds=clock.seconds,
+        )
+
+
+def initial_state(
+    scene: Scene,
+    photographs: Photographs,
+    training: Sequence[int],
+    config: ReconstructConfig,
+    device: torch.device,
+    track: Track,
+    report: Report,
+) -> State:
+    """The state before the first step: seeds as parameters, and how they came about."""
+    start = start_of(scene, photographs, training, config.seeds, config.dense, track=track)
+    seeding: dict[str, Any] = {"seeds": len(start.gaussians), "source": start.source}
+    if start.dense is not None:
+        dense = start.dense
+        seeding |= {"swept": dense.swept, "filled": dense.filled, "coverage": list(dense.coverage)}
+        report(
+            f"points reach {dense.coverage[0]:.0%} of the pictures' cells: {dense.swept:,} were added from plane "
+            f"sweeps and {dense.filled:,} between them, which reach {dense.coverage[1]:.0%}"
+        )
+        if not dense.swept:
+            warnings.warn(
+                f"plane sweeps found no surface, and points reach {dense.coverage[0]:.0%} of the pictures alone; what "
+                "they leave bare stays empty: smaller dense.spacing, dense.samples or dense.alike may find more",
+                SceneWarning,
+                stacklevel=3,
+            )
+    adam = RowAdam(parameters_from(start.gaussians, config.optimize.sh_degree, device))
+    leash = leash_of(adam.parameters, config.optimize.leash) if start.measured and config.optimize.leash else None
+    return State(adam=adam, leash=leash, step=0, seconds=0.0, facts=seeding)
+
+
+def optimize(
+    optimizer: Optimizer,
+    state: State,
+    held_out: Sequence[int],
+    config: ReconstructConfig,
+    work: Path,
+    identity: Mapping[str, Any],
+    track: Track,
+    report: Report,
+) -> list[LogRow]:
+    """All remaining steps; the rows of the log. Whatever stops the run between two steps leaves a checkpoint."""
+    steps = config.optimize.steps
+    with advised(START_AGAIN):
+        log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
+        rows = read_rows(work / LOG_FILE)
+    seen = seen_pixels(optimizer.photographs, held_out, optimizer.training)
+    start, saved_at, saved_step = time.monotonic() - state.seconds, time.monotonic(), optimizer.step
+
+    def validate() -> None:
+        every = config.validate_every
+        due = optimizer.step in (0, steps) or (every and optimizer.step % every == 0)
+        # A continued run may begin at a step whose validation was cut off, or whose row is in the log already.
+        if not held_out or not due or (rows and rows[-1]["step"] == optimizer.step):
+            return
+        scores = {
+            name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None
+        }
+        row: LogRow = {"seconds": time.monotonic() - start, "gaussians": len(optimizer.raw["means"]), **scores}
+        log.add(optimizer.step, row)
+        rows.append({"step": optimizer.step, **row})
+        report(
+            f"step {optimizer.step} of {steps}: {describe(row)}, {row['gaussians']:,} Gaussians, {row['seconds']:.0f} s"
+        )
+
+    def save() -> None:
+        now = State(
+            adam=optimizer.adam,
+            leash=optimizer.leash,
+            step=optimizer.step,
+            seconds=time.monotonic() - start,
+            facts=state.facts,
+        )
+        save_state(work / CHECKPOINT_FILE, now, identity)
+
+    try:
+        validate()
+        for _ in track(range(optimizer.step, steps), "optimising"):
+            optimizer.advance()
+            validate()
+            if time.monotonic() - saved_at >= config.checkpoint_every:
+                save()
+                saved_at, saved_step = time.monotonic(), optimizer.step
+    finally:
+        # Also after the last step: writing the results may be interrupted as well.
+        if optimizer.whole and optimizer.step > saved_step:
+            save()
+    return rows
+
+
+def read_rows(path: Path) -> list[LogRow]:
+    """The rows of a log as numbers.
+
+    Raises:
+        InputError: a cell that is not a number.
+    """
+    try:
+        return [{name: float(cell) for name, cell in row.items()} for row in read_log(path)]
+    except ValueError as error:
+        raise InputError(f"{path}: damaged: {error}") from error
+
+
+def compare(optimizer: Optimizer, held_out: Sequence[int]) -> tuple[Comparison, ...]:
+    """Evenly spaced held-out photographs beside renders of their views."""
+
+    def pixels(image: torch.Tensor) -> UInt8[np.ndarray, "H W 3"]:
+        return (image * 255 + 0.5).to(torch.uint8).numpy()
+
+    comparisons = []
+    for view in (held_out[index] for index in evenly(len(held_out), MAX_COMPARISONS)):
+        shot = optimizer.photographs.shot(view)
+        comparisons.append(
+            Comparison(
+                name=optimizer.photographs.names[view],
+                photograph=pixels(shot.image),
+                render=pixels(optimizer.picture(view, shot)),
+            )
+        )
+    return tuple(comparisons)
+
+
+def describe(row: LogRow) -> str:
+    """The scores of a row in words."""
+    overall = f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}"
+    if "seen_psnr" not in row:
+        return overall
+    return (
+        f"{row['seen_psnr']:.2f} dB where a fitted photograph shows the surface ({row['seen']:.0%}), {overall} in all"
+    )
