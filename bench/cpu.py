@@ -19,7 +19,7 @@ import torch
 from encoder import CHANNELS, surface
 from torch.nn import functional
 
-from gsencoder.app.commands.train import TrainConfig
+from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.runtime.heap import keep_heap
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
@@ -32,7 +32,7 @@ from gsencoder.train.losses import LossConfig, match_loss
 
 def steps(gaussians: int, rounds: int, *, round_up: bool) -> float:
     """Median seconds of training steps of sizes that never occur twice."""
-    config = compose("train", TrainConfig, ["scene"])
+    config = compose("train", TrainCommandConfig, ["scene"])
     encoder = GaussianEncoder(config.model, CHANNELS).train()
     whole, found = surface(2 * gaussians), []
     for turn in range(rounds):
@@ -50,7 +50,7 @@ def steps(gaussians: int, rounds: int, *, round_up: bool) -> float:
 
 def forward(gaussians: int, rounds: int) -> float:
     """Fastest of some forward passes in float32."""
-    config = compose("train", TrainConfig, ["scene"])
+    config = compose("train", TrainCommandConfig, ["scene"])
     encoder = GaussianEncoder(config.model, CHANNELS).eval()
     attributes, opacities, cloud = encoder_inputs(surface(gaussians), config.model, config.model.voxel)
     plan, found = encoder.join([cloud]), []

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gsencoder.app.commands.train import TrainConfig
+from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.runtime.device import autocast_dtype
 from gsencoder.core.runtime.heap import keep_heap
@@ -107,7 +107,7 @@ class Recorded(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def measure(config: TrainConfig, size: int, precision: str) -> dict[str, float]:
+def measure(config: TrainCommandConfig, size: int, precision: str) -> dict[str, float]:
     """The figures of one size."""
     splat = surface(size)
     encoder = GaussianEncoder(config.model, CHANNELS).eval()
@@ -163,7 +163,7 @@ def timed(module: Any, name: str, spent: dict[str, float], label: str) -> None:
     setattr(module, name, wrapped)
 
 
-def step_parts(config: TrainConfig, prepared: Path, steps: int) -> dict[str, float]:
+def step_parts(config: TrainCommandConfig, prepared: Path, steps: int) -> dict[str, float]:
     """Mean seconds of the parts of a training step on prepared scenes, one sample a step."""
     folder = PreparedDataset(prepared)
     outputs, _ = folder.load_space()
@@ -233,7 +233,7 @@ def main() -> None:
     parser.add_argument("--chunk", type=int, default=250_000)
     chosen = parser.parse_args()
     keep_heap()
-    config = compose("train", TrainConfig, ["scene", f"model={chosen.model}"])
+    config = compose("train", TrainCommandConfig, ["scene", f"model={chosen.model}"])
     if chosen.patch:
         shape = replace(config.model.transformer, patch=chosen.patch)
         config = replace(config, model=replace(config.model, transformer=shape))
@@ -253,7 +253,7 @@ def main() -> None:
         print(f"{len(splat):,} Gaussians in chunks of {chosen.chunk:,}: {took:.1f} s, {peak_gib():.2f} GiB at most")
         return
     if chosen.step:
-        config = compose("train", TrainConfig, ["scene", "experiment=house_cpu"])
+        config = compose("train", TrainCommandConfig, ["scene", "experiment=house_cpu"])
         parts = step_parts(config, Path(chosen.step), chosen.steps)
         size = parts.pop("gaussians")
         total = sum(parts.values())

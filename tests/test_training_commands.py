@@ -7,19 +7,25 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from gsencoder.app import cli
+from gsencoder.app.commands.train import TrainCommandConfig
+from gsencoder.app.settings.compose import compose
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
+from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.models.weights import load_weights
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
+from gsencoder.train import TrainConfig, train
 from gsencoder.train.adapter_heads import save_heads
 
 pytestmark = pytest.mark.slow
@@ -86,6 +92,23 @@ def test_training_leaves_weights_words_a_log_and_pictures(trained: Path) -> None
     assert list((trained / "validation").glob("features_*.png"))
     assert list((trained / "tensorboard").iterdir())
     assert not trained.with_name("encoder.training").exists()
+
+
+def test_the_python_call_trains_the_same_encoder_as_the_command(rooms: Path, trained: Path, tmp_path: Path) -> None:
+    settings = compose("train", TrainCommandConfig, [f"teacher.words={rooms / 'words.safetensors'}", *QUICK])
+    config = TrainConfig(**{item.name: getattr(settings, item.name) for item in fields(TrainConfig)})
+    scenes = [rooms / "room_0", rooms / "room_1"]
+    places = {"work": tmp_path / "work", "prepared": trained.with_name("encoder.prepared")}
+    result = train(scenes, config, held_out=[rooms / "room_2"], validate=validate_names, **places)
+    assert result.state.step == 6
+    assert result.scores == summary_of(trained)["results"]["validation"]
+    assert result.words is not None
+    assert result.words.names == load_text_table(rooms / "words.safetensors").names
+    by_command, _, _ = load_weights(trained / "encoder.safetensors")
+    for name, value in result.encoder.state_dict().items():
+        # The command stores float16.
+        torch.testing.assert_close(by_command.state_dict()[name], value.half().float(), rtol=0, atol=0)
+    assert train(scenes, config, held_out=[rooms / "room_2"], **places).state.step == 6  # Nothing is left to do.
 
 
 def test_what_was_prepared_serves_the_next_run(rooms: Path, trained: Path, tmp_path: Path) -> None:

@@ -23,6 +23,10 @@ from gsencoder.render import blend
 from gsencoder.render.images import render_image
 from gsencoder.train.class_balance import nearest_codes
 from gsencoder.train.prepared_scene import PreparedScene
+from gsencoder.train.trainer import Validated
+
+SHOWN_SCENES = 3
+"""Held-out scenes of which a view is drawn at every validation of a training."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,6 +114,20 @@ def validate_encoder(
         scene.close()
     sheet = contact_sheet(pictures, titles, columns=3, width=400) if pictures else None
     return KindAccuracy(right=right, total=total, cosine_named=cosines / max(count, 1), sheet=sheet)
+
+
+def validate_names(
+    scenes: Sequence[PreparedScene],
+    encoder: GaussianEncoder,
+    outputs: OutputSpace,
+    codebook: Float32[np.ndarray, "C channels"],
+    config: EncodeConfig = EncodeConfig(),
+) -> Validated:
+    """The scores of `validate_encoder` in the form that `gsencoder.train.train` takes: the mean accuracy over kinds as
+    "names", the mean cosine over named Gaussians as "cosine_named", and the sheet of pictures as "features"."""
+    accuracy = validate_encoder(scenes, encoder, outputs, codebook, config, shown=SHOWN_SCENES)
+    pictures = {} if accuracy.sheet is None else {"features": accuracy.sheet}
+    return Validated({"names": accuracy.score, "cosine_named": accuracy.cosine_named}, pictures)
 
 
 def view_pictures(

@@ -1,6 +1,6 @@
 """One process or many, on one machine or many: who this process is, and sums over all of them.
 
-torchrun and SLURM (srun, submitit) tell a process its place through the environment; without either there is one.
+torchrun and SLURM (srun, submitit) give a process its rank through the environment; without either there is one.
 Nothing else in the package asks how many there are.
 """
 
@@ -23,27 +23,27 @@ STOPPED_ELSEWHERE = "training: another process stopped; its own message says why
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class ProcessRank:
     """A process among those that train together.
 
     Attributes:
         rank: its number.
-        size: how many there are.
+        world_size: how many there are.
         local_rank: its number on its machine.
     """
 
     rank: int = 0
-    size: int = 1
+    world_size: int = 1
     local_rank: int = 0
 
     @property
-    def first(self) -> bool:
+    def is_first(self) -> bool:
         """Whether this is the process that writes and speaks."""
         return self.rank == 0
 
 
-def place_from(environment: Mapping[str, str]) -> tuple[Place, str]:
-    """The place that an environment tells, and where processes meet ("tcp://…", or "env://" under torchrun).
+def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, str]:
+    """The rank that an environment gives, and where processes meet ("tcp://…", or "env://" under torchrun).
 
     Raises:
         InputError: an environment that contradicts itself.
@@ -62,19 +62,19 @@ def place_from(environment: Mapping[str, str]) -> tuple[Place, str]:
         port = environment.get("MASTER_PORT") or str(20_000 + _number(environment, "SLURM_JOB_ID", "0") % 20_000)
         meeting = f"tcp://{host}:{port}"
     else:
-        return Place(), ""
+        return ProcessRank(), ""
     if not 0 <= rank < size:
         raise InputError(f"{names[0]}={rank} is not below {names[1]}={size}; start all processes with one launcher")
-    return Place(rank=rank, size=size, local_rank=local), meeting
+    return ProcessRank(rank=rank, world_size=size, local_rank=local), meeting
 
 
-def gpu_of(place: Place, meeting: str) -> int:
+def gpu_of(process: ProcessRank, meeting: str) -> int:
     """The number of this process's GPU among those that it sees.
 
     Where SLURM gives each task a GPU of its own, a task sees that one alone.
     """
     bound = meeting.startswith("tcp://") and torch.cuda.device_count() == 1
-    return 0 if bound else place.local_rank
+    return 0 if bound else process.local_rank
 
 
 def first_host(nodes: str) -> str:
@@ -98,8 +98,8 @@ def _number(environment: Mapping[str, str], name: str, default: str) -> int:
 
 
 @contextmanager
-def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[tuple[Place, torch.device]]:
-    """Meets the other processes for the block; yields the place and the device of this one.
+def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[tuple[ProcessRank, torch.device]]:
+    """Meets the other processes for the block; yields the rank and the device of this one.
 
     Args:
         device: "auto" (a GPU for each process of a machine where torch sees any, else the CPU), "cpu" or "cuda".
@@ -109,12 +109,12 @@ def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[
     Raises:
         InputError: no such device, or the others cannot be met.
     """
-    place, meeting = place_from(os.environ)
-    chosen = choose_device(device, gpu_of(place, meeting))
+    process, meeting = rank_from_environment(os.environ)
+    chosen = choose_device(device, gpu_of(process, meeting))
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
-    if place.size == 1:
-        yield place, chosen
+    if process.world_size == 1:
+        yield process, chosen
         return
     backend = "nccl" if chosen.type == "cuda" else "gloo"
     # Its functions take the group that exists when they are imported as a default argument, and would keep it forever;
@@ -125,14 +125,15 @@ def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[
         distributed.init_process_group(
             backend,
             init_method=meeting,
-            rank=place.rank,
-            world_size=place.size,
+            rank=process.rank,
+            world_size=process.world_size,
             timeout=timedelta(hours=timeout_hours),
         )
     except (RuntimeError, ValueError) as error:
         message = " ".join(str(error).split())[:200]
-        raise InputError(f"training: process {place.rank} of {place.size} cannot meet the others: {message}") from error
-    yield place, chosen
+        ranks = f"process {process.rank} of {process.world_size}"
+        raise InputError(f"training: {ranks} cannot meet the others: {message}") from error
+    yield process, chosen
     # Not after an error: the others may be waiting for a sum, and leaving the group would wait for them.
     # A network that was wrapped refers to itself and to the group, which ends with its last reference.
     gc.collect()
@@ -147,7 +148,7 @@ def sum_over_processes(values: Tensor) -> Tensor:
 
 
 @contextmanager
-def together() -> Iterator[None]:
+def fail_together() -> Iterator[None]:
     """A block that processes go through on their own, one of them perhaps doing all the work. They leave it together,
     and if one of them fails in it, all do: none is left waiting.
 

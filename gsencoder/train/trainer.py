@@ -27,7 +27,7 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.checkpoint import CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
-from gsencoder.train.distributed import STOPPED_ELSEWHERE, Place, sum_over_processes, together
+from gsencoder.train.distributed import STOPPED_ELSEWHERE, ProcessRank, fail_together, sum_over_processes
 from gsencoder.train.losses import Head, LossConfig
 from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
 
@@ -102,7 +102,7 @@ class Trainer:
         folder: Path,
         settings: Mapping[str, Any],
         heads: Sequence[tuple[Head, nn.Module]] = (),
-        place: Place = Place(),
+        process: ProcessRank = ProcessRank(),
         device: torch.device = torch.device("cpu"),
         tensorboard: bool = False,
         validate: Validation = lambda encoder: Validated({}),  # noqa: ARG005
@@ -117,7 +117,7 @@ class Trainer:
             folder: for checkpoint and log; exists.
             settings: what a run must have in common with one that it continues, as JSON values.
             heads: a teacher's adapter heads, each with what decodes standard units for it.
-            place: of this process.
+            process: this process among those that train together.
             device: of this process.
             tensorboard: whether to write events.
             validate: judges the encoder; asked of the first process alone.
@@ -125,7 +125,7 @@ class Trainer:
         Raises:
             InputError: the folder holds another run.
         """
-        self.config, self.dataset, self.place, self.device = config, dataset, place, device
+        self.config, self.dataset, self.process, self.device = config, dataset, process, device
         self.folder, self.settings, self.validate = folder, dict(settings), validate
         self.encoder = encoder.to(device)
         self.optimizer = torch.optim.AdamW(
@@ -143,10 +143,10 @@ class Trainer:
         # A line that was written for a step whose closing was cut off is written again.
         done = self.state.step - (not self.state.closed)
         begun = self.state.step > len(self.state.unlogged)
-        self._log = Log(folder, done=done, events=tensorboard, begun=begun) if place.first else None
+        self._log = Log(folder, done=done, events=tensorboard, begun=begun) if process.is_first else None
         network: nn.Module = torch.compile(encoder, dynamic=True) if config.compile else encoder  # type: ignore[assignment]
         self._parallel: nn.parallel.DistributedDataParallel | None = None
-        if place.size > 1:
+        if process.world_size > 1:
             ids = [device.index] if device.type == "cuda" else None
             network = self._parallel = nn.parallel.DistributedDataParallel(network, device_ids=ids)
         codebook = torch.from_numpy(dataset.recipe.rarity.codebook).to(device)
@@ -204,7 +204,7 @@ class Trainer:
         if logged := last or done % config.log_every == 0:
             row = {name: float(np.mean([each[name] for each in recent])) for name in recent[-1]}
         if last or (config.validate_every and done % config.validate_every == 0):
-            with together():
+            with fail_together():
                 row |= self._validated(done)
         if row and self._log is not None:
             self._log.add(done, row | {"seconds": self.state.seconds})
@@ -212,7 +212,7 @@ class Trainer:
 
     def save(self) -> None:
         """Writes the checkpoint; only the first process does."""
-        if self.place.first:
+        if self.process.is_first:
             save_checkpoint(self.folder / CHECKPOINT_FILE, self.encoder, self.optimizer, self.state, self.settings)
 
     def _loader(self, first: int) -> "DataLoader[Any]":
@@ -222,8 +222,8 @@ class Trainer:
             config.steps,
             batch=config.batch,
             accumulate=config.accumulate,
-            rank=self.place.rank,
-            world=self.place.size,
+            rank=self.process.rank,
+            world=self.process.world_size,
         )
         # Workers are started anew and not forked: a forked child would inherit kernels' threads that no longer run.
         return DataLoader(
@@ -247,7 +247,7 @@ class Trainer:
         lambdas = self.distillation.lambdas
         parts = []
         for micro, batch in enumerate(batches):
-            self._seed((step * len(batches) + micro) * self.place.size + self.place.rank)
+            self._seed((step * len(batches) + micro) * self.process.world_size + self.process.rank)
             if self._parallel is not None:
                 self._parallel.require_backward_grad_sync = micro + 1 == len(batches)
             with torch.autocast(self.device.type, self._autocast, enabled=self._autocast is not None):
@@ -255,7 +255,7 @@ class Trainer:
             shares = torch.stack([terms[name] / divisors[name] for name in lambdas])
             loss = (shares * shares.new_tensor(list(lambdas.values()))).sum()
             # Gradients of several processes are averaged; what is wanted is their sum.
-            (loss * self.place.size).backward()
+            (loss * self.process.world_size).backward()
             parts.append(shares.detach().double())
         norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), self.config.clip or math.inf).item()
         totals = self._finite_totals(step, batches, torch.stack(parts), norm)
@@ -309,7 +309,9 @@ class Trainer:
         if not blame and not math.isfinite(norm):
             # Gradients have been summed by now: with several processes any of their samples may be the cause.
             names = "; ".join(name for batch in batches for name in batch.names)
-            gradient = f"the gradient of {names}{' or of samples of other processes' if self.place.size > 1 else ''}"
+            gradient = (
+                f"the gradient of {names}{' or of samples of other processes' if self.process.world_size > 1 else ''}"
+            )
         flag = parts.new_tensor([float(bool(blame)), float(bool(gradient))])
         *totals, blamed, unsure = sum_over_processes(torch.cat((parts.sum(dim=0), flag))).tolist()
         if blamed or unsure:

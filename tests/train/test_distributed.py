@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.train.distributed import Place, first_host, gpu_of, joined, place_from, together
+from gsencoder.train.distributed import ProcessRank, fail_together, first_host, gpu_of, joined, rank_from_environment
 
 SLURM = {
     "SLURM_STEP_ID": "0",
@@ -22,21 +22,21 @@ SLURM = {
 
 
 def test_without_a_launcher_there_is_one_process() -> None:
-    assert place_from({}) == (Place(), "")
-    with joined("cpu") as (place, device):
-        assert place.first
+    assert rank_from_environment({}) == (ProcessRank(), "")
+    with joined("cpu") as (process, device):
+        assert process.is_first
         assert device.type == "cpu"
 
 
 def test_torchrun_tells_rank_and_size() -> None:
-    place, meeting = place_from({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"})
-    assert (place.rank, place.size, place.local_rank, place.first) == (3, 4, 1, False)
+    process, meeting = rank_from_environment({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"})
+    assert (process.rank, process.world_size, process.local_rank, process.is_first) == (3, 4, 1, False)
     assert meeting == "env://"
 
 
 def test_slurm_tells_rank_and_size_and_where_to_meet() -> None:
-    place, meeting = place_from(SLURM)
-    assert (place.rank, place.size, place.local_rank) == (5, 8, 1)
+    process, meeting = rank_from_environment(SLURM)
+    assert (process.rank, process.world_size, process.local_rank) == (5, 8, 1)
     assert meeting == "tcp://gpu03:23456"
 
 
@@ -48,16 +48,16 @@ def test_a_task_of_slurm_that_sees_one_gpu_takes_it(
     environment: dict[str, str], visible: int, gpu: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: visible)
-    assert gpu_of(*place_from(environment)) == gpu
+    assert gpu_of(*rank_from_environment(environment)) == gpu
 
 
 def test_an_address_that_is_given_is_taken() -> None:
-    assert place_from({**SLURM, "MASTER_ADDR": "h", "MASTER_PORT": "9"})[1] == "tcp://h:9"
+    assert rank_from_environment({**SLURM, "MASTER_ADDR": "h", "MASTER_PORT": "9"})[1] == "tcp://h:9"
 
 
 def test_a_batch_script_itself_is_one_process() -> None:
     environment = {name: value for name, value in SLURM.items() if name != "SLURM_STEP_ID"}
-    assert place_from(environment) == (Place(), "")
+    assert rank_from_environment(environment) == (ProcessRank(), "")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_the_first_machine_of_a_list(nodes: str, host: str) -> None:
 )
 def test_an_environment_that_contradicts_itself_is_refused(environment: dict[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        place_from(environment)
+        rank_from_environment(environment)
 
 
 def test_a_device_that_is_not_there_is_refused(no_gpu: None) -> None:
@@ -95,16 +95,16 @@ TOGETHER = """
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.train.distributed import joined, together
+from gsencoder.train.distributed import joined, fail_together
 
 if __name__ == "__main__":
-    with joined("cpu") as (place, device):
+    with joined("cpu") as (process, device):
         try:
-            with together():
-                if not place.first:
+            with fail_together():
+                if not process.is_first:
                     raise {error}
         except Exception as error:
-            Path(f"{{__file__}}.{{place.rank}}").write_text(f"{{type(error).__name__}}: {{error}}")
+            Path(f"{{__file__}}.{{process.rank}}").write_text(f"{{type(error).__name__}}: {{error}}")
 """
 
 
@@ -122,7 +122,7 @@ def test_if_one_of_two_processes_fails_in_a_block_both_do(tmp_path: Path, error:
 
 
 def test_one_process_leaves_a_block_as_it_entered_it() -> None:
-    with together():
+    with fail_together():
         pass
-    with pytest.raises(InputError, match="its own"), together():
+    with pytest.raises(InputError, match="its own"), fail_together():
         raise InputError("its own")

@@ -374,10 +374,10 @@ from gsencoder.train.trainer import Trainer
 if __name__ == "__main__":
     dataset = PreparedDataset(Path({prepared!r}), {{"made": "for a test"}})
     names = {names!r}
-    with joined("cpu") as (place, device):
+    with joined("cpu") as (process, device):
         config = replace(SHORT, steps={steps}, accumulate={accumulate})
         trainer = Trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
-                          settings={{}}, place=place, device=device)
+                          settings={{}}, process=process, device=device)
         trainer.run()
     threads = [(task / "comm").read_text() for task in Path("/proc/self/task").glob("*")]
     sys.exit(any("gloo" in name for name in threads) and "threads of the process group are left: " + str(threads))

@@ -36,7 +36,7 @@ COMMANDS = {
         ),
         Command(name="reconstruct", config="ReconstructCommandConfig", help="photographs to Gaussians, posed or not"),
         Command(name="fuse", config="FuseCommandConfig", help="per-Gaussian features from a teacher's maps"),
-        Command(name="train", config="TrainConfig", help="distil a teacher into an encoder of splats"),
+        Command(name="train", config="TrainCommandConfig", help="distil a teacher into an encoder of splats"),
         Command(name="encode", config="EncodeCommandConfig", help="per-Gaussian features of a splat in one pass"),
         Command(name="pack", config="PackConfig", help="features in a few bytes a Gaussian, or for other programs"),
         Command(name="export", config="ExportConfig", help="an encoder as one ONNX file that takes raw Gaussians"),

@@ -39,7 +39,8 @@ def _option(option: Option, width: int) -> list[str]:
 def command_help(name: str, meaning: str, cls: type, flags: Mapping[str, str], conf: Path | None = None) -> str:
     """The help of one command: usage, paths, settings with type, meaning and default, choices, flags."""
     width = min(shutil.get_terminal_size((100, 24)).columns, 110)
-    options = options_of(cls)
+    # The command's own options first, then those of its sections.
+    options = sorted(options_of(cls), key=lambda option: "." in option.key)
     choices = choices_of(name, cls, conf)
     paths = next((option for option in options if option.key == "paths"), None)
     word = f" {paths.metavar or 'PATH'}…" if paths else ""

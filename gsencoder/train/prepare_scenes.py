@@ -1,0 +1,152 @@
+"""Scenes on disk to a prepared dataset: read, seed and fuse each, shared among the processes of a training."""
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from gsencoder.core.errors import InputError, about
+from gsencoder.core.files.json_values import plain
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.seeding.spacing import unit_of
+from gsencoder.data.splats import READABLE
+from gsencoder.fusion.orbit_views import check_orbits, with_views
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.text.table import TextTable
+from gsencoder.train.distributed import ProcessRank, fail_together
+from gsencoder.train.prepare import PrepareConfig, PreparedDataset
+from gsencoder.types import Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceConfig:
+    """Where the targets of a training come from: how scenes are read and seeded, and which teacher is fused."""
+
+    splat: str = field(default="", metadata={"help": f"Gaussians of scenes with views; empty = seeds. {READABLE}"})
+    orbits: int = field(default=24, metadata={"help": "cameras put around a splat that has no views"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    prepare: PrepareConfig = field(default_factory=PrepareConfig)
+
+    def __post_init__(self) -> None:
+        check_orbits(self.orbits)
+
+
+def split_scenes(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[Path], list[Path]]:
+    """Scenes to train on, and those whose names match a pattern (with * and ? as in file names).
+
+    Raises:
+        InputError: a pattern that matches nothing, none left to train on, or two scenes of one name.
+    """
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"paths: two scenes are called {twice!r}; prepared scenes are told apart by name")
+    for pattern in patterns:
+        if not any(fnmatch(name, pattern) for name in names):
+            raise InputError(f"holdout: no scene is called {pattern!r}; there are {', '.join(names[:5])}, …")
+    held_out = [path for path in paths if any(fnmatch(path.name, pattern) for pattern in patterns)]
+    training = [path for path in paths if path not in held_out]
+    if not training:
+        raise InputError("holdout: matches every scene; none is left to train on")
+    return training, held_out
+
+
+def prepare_scenes(
+    training: Sequence[Path],
+    held_out: Sequence[Path],
+    words: TextTable | None,
+    config: SourceConfig,
+    folder: Path,
+    *,
+    voxel: float,
+    process: ProcessRank = ProcessRank(),
+    track: Track = untracked,
+) -> PreparedDataset:
+    """Prepares the scenes that are not in `folder` yet; the processes of a training share them.
+
+    Args:
+        training: scenes whose targets define the output space and the class balance.
+        held_out: scenes for validation.
+        words: the teacher's text table; None where it has none.
+        config: see there.
+        folder: of the prepared dataset; made if it does not exist.
+        voxel: edge of the encoder's grid in metres, by which the unit of a splat without one is estimated.
+        process: this process among those that train together.
+        track: progress.
+
+    Raises:
+        InputError: what is wrong with a scene, which is named, or with the folder; of any process.
+    """
+    sections = {name: plain(getattr(config, name)) for name in ("data", "seeds", "teacher", "prepare")}
+    made_with: dict[str, Any] = {
+        "scenes": {path.name: str(path.resolve()) for path in training},
+        "words": _digest(words),
+        **sections,
+        **{"splat": config.splat, "orbits": config.orbits, "voxel": voxel},
+    }
+    read_views, read_scene = _readers(config, words, voxel)
+    with fail_together():
+        if process.is_first:
+            dataset = PreparedDataset(folder, made_with)
+            dataset.remove_leftovers()
+            dataset.find_space(training, read_views, config.prepare)
+    dataset = PreparedDataset(folder, made_with)
+    missing = [path for path in [*training, *held_out] if not dataset.holds(path)]
+    with fail_together():
+        pass  # No process may begin before all have listed what is missing.
+    with fail_together():
+        mine: Iterable[Path] = track(missing[process.rank :: process.world_size], "preparing scenes")
+        for path in mine:
+            scene, teacher = read_scene(path)
+            with about(path):
+                dataset.prepare(scene, teacher, config.prepare, source=path)
+    with fail_together():
+        if process.is_first:
+            dataset.find_rarity([path.name for path in training], track)
+    return dataset
+
+
+ReadScene = Callable[[Path], tuple[Scene, Teacher]]
+
+
+def _readers(config: SourceConfig, words: TextTable | None, voxel: float) -> tuple[ReadScene, ReadScene]:
+    """Two functions from a path to a scene and its teacher: the first gives views alone where a scene has them, to look
+    at maps; the second also Gaussians and a unit of length, under the name of the folder."""
+    shared: list[Teacher] = []
+
+    def teacher_of(scene: Scene) -> Teacher:
+        # The labels teacher is made of the scene's own objects; every other one serves all scenes.
+        if isinstance(config.teacher, LabelsConfig):
+            return build_teacher(config.teacher, scene, words)
+        if not shared:
+            shared.append(build_teacher(config.teacher, scene, words))
+        return shared[0]
+
+    def read_views(path: Path) -> tuple[Scene, Teacher]:
+        with about(path):
+            scene = load_scene(path, splat=config.splat or None, options=config.data)
+            if scene.views is None:
+                scene = with_views(scene, config.orbits, config.prepare.fusion.blend)
+            return scene, teacher_of(scene)
+
+    def read_scene(path: Path) -> tuple[Scene, Teacher]:
+        scene, teacher = read_views(path)
+        with about(path):
+            scene = with_gaussians(scene, config.seeds)
+            return replace(scene, name=path.name, metres_per_unit=unit_of(scene, voxel)), teacher
+
+    return read_views, read_scene
+
+
+def _digest(words: TextTable | None) -> str:
+    if words is None:
+        return ""
+    return hashlib.sha256(repr(words.names).encode() + words.embeddings.tobytes()).hexdigest()[:16]
