@@ -1,12 +1,7 @@
 """`gsencoder views FEATURES query=…`: the views that show best what was found, rendered, and why they were chosen."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from PIL import Image
 
 from gsencoder.app.commands.query_words import asked_words, words_of
 from gsencoder.app.runs.output_folder import output_folder
@@ -18,18 +13,18 @@ from gsencoder.core.files.archive import write_archive
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.fusion.store.folder import load_features
-from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.localize.localize import LocalizeConfig, asked_features, box_to_json, localize
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
-from gsencoder.infer.views.pictures import picture_kinds, told, view_pictures, view_sheet
+from gsencoder.infer.views.pictures import told, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
 from gsencoder.infer.views.targets import Target, best_boxes, targets_of
 from gsencoder.infer.views.tokens import Fit, feature_tokens, token_blends, tower_grid
+from gsencoder.infer.views.write import SHEET, views_to_json, write_pictures
 from gsencoder.render import BlendConfig
 from gsencoder.types import Box, Scene
 
-SHEET, VIEWS, TOKENS = "sheet.png", "views.json", "tokens.safetensors"
+VIEWS, TOKENS = "views.json", "tokens.safetensors"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,48 +105,6 @@ def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
     """The scene of a folder of features, with photographs where a scene that has them is given."""
     scene = load_features(folder)
     return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
-
-
-def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
-    """What was chosen and why, best first: names and pictures, sights, gains, and cameras in world coordinates with the
-    origin added back (cam_from_world and K as OpenCV has them)."""
-    rows = []
-    for number, (each, kind) in enumerate(zip(views.chosen, picture_kinds(scene, views), strict=True)):
-        pose = views.cameras.cam_from_world[number].astype(np.float64)
-        pose[:3, 3] -= pose[:3, :3] @ scene.origin
-        rows.append(
-            {
-                "name": each.name,
-                "picture": f"view_{number:02d}.png",
-                "kind": kind,
-                "frame": each.frame,
-                "clearance": each.clearance,
-                "gain": each.gain,
-                "covered": each.covered,
-                "sights": [
-                    {name: getattr(sight, name) for name in type(sight).__dataclass_fields__} for sight in each.sights
-                ],
-                "cam_from_world": pose.tolist(),
-                "K": views.cameras.Ks[number].tolist(),
-                "width": int(views.cameras.widths[number]),
-                "height": int(views.cameras.heights[number]),
-            }
-        )
-    return rows
-
-
-def write_pictures(
-    folder: Path,
-    scene: Scene,
-    views: ViewSet,
-    rows: Sequence[Mapping[str, Any]],
-    pictures: Sequence[Picture],
-    boxes: Sequence[Box],
-) -> None:
-    """Each picture under the name that its row gives it, and the sheet of all."""
-    for picture, row in zip(pictures, rows, strict=True):
-        Image.fromarray(picture).save(folder / row["picture"])
-    Image.fromarray(view_sheet(scene, views, pictures, boxes)).save(folder / SHEET)
 
 
 def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:

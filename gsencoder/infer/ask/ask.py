@@ -104,7 +104,7 @@ class Asker:
         config: AskConfig = AskConfig(),
         localization: LocalizeConfig = LocalizeConfig(),
         views: ViewsConfig = ViewsConfig(),
-        side: int = 768,
+        vlm: VlmConfig = VlmConfig(),
     ) -> None:
         """Args:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
@@ -113,10 +113,10 @@ class Asker:
         config: see there.
         localization: how words become boxes.
         views: how views are chosen.
-        side: longer pictures are made smaller, pixels.
+        vlm: how requests are made; pictures are made smaller than its `image_side`.
         """
-        self._scene, self._table, self._space, self._side = scene, table, space, side
-        self._config, self._localization, self._views = config, localization, views
+        self.scene, self.table, self.space = scene, table, space
+        self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
         self._kept: dict[Hashable, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
         self._drawn: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
 
@@ -132,24 +132,24 @@ class Asker:
             InputError: words that the table does not know, a box without Gaussians, a task that needs what is missing.
         """
         words = question.query
-        if not words and not question.aabb and self._table is not None:
-            words = words_in(question.text, self._table)
+        if not words and not question.aabb and self.table is not None:
+            words = words_in(question.text, self.table)
         key = (words, question.aabb, question.task == "caption")
         if key not in self._kept:
             self._kept[key] = self._look(words, question)
         targets, boxes, views = self._kept[key]
-        if not targets and self._views.method == "greedy":
+        if not targets and self.views.method == "greedy":
             told = self._nothing(words)
             if question.task != "answer":
                 raise InputError(f"task={question.task}: {told}; give query= or aabb=")
             warnings.warn(f"{told}: evenly spread views are shown", SceneWarning, stacklevel=2)
-        marked = self._config.marks
+        marked = self.config.marks
         if marked is None:
             marked = question.task in ("ground", "caption")
         pictures, marks = self._pictures_of((*key, marked), views, targets if marked else ())
         # A thing in a box that was given has no name.
         names = [box.query for box in boxes] or ["" for _ in targets]
-        kinds = picture_kinds(self._scene, views)
+        kinds = picture_kinds(self.scene, views)
         text = prompt_text(question.task, question.text, names, marks=marks, kinds=kinds)
         return Prompt(text=text, pictures=pictures, views=views, targets=targets, boxes=boxes, words=words, marks=marks)
 
@@ -157,7 +157,7 @@ class Asker:
         self, key: Hashable, views: ViewSet, marked: Sequence[Target]
     ) -> tuple[list[Picture], frozenset[int]]:
         """Pictures of what was asked about last are kept: many questions are about the same thing."""
-        found = self._drawn.pop(key, None) or view_pictures(self._scene, views, marked)
+        found = self._drawn.pop(key, None) or view_pictures(self.scene, views, marked)
         self._drawn[key] = found
         if len(self._drawn) > KEPT_PICTURES:
             del self._drawn[next(iter(self._drawn))]
@@ -168,31 +168,31 @@ class Asker:
 
     def _look(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]:
         targets, boxes = self._targets(words, question)
-        config = self._views
+        config = self.views
         if not targets:
             config = replace(config, method="uniform", source="both")
-        views = choose_views(self._scene, targets, config)
+        views = choose_views(self.scene, targets, config)
         # Marks are drawn on pictures of the size that is sent, or their numbers would shrink.
-        small = views.cameras.resized(self._side, enlarge=False)
+        small = views.cameras.resized(self.vlm.image_side, enlarge=False)
         return targets, boxes, replace(views, cameras=small)
 
     def _targets(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...]]:
-        gaussians = self._scene.gaussians
+        gaussians = self.scene.gaussians
         if gaussians is None:
-            raise InputError(f"ask: scene {self._scene.name} has no Gaussians")
+            raise InputError(f"ask: scene {self.scene.name} has no Gaussians")
         if question.aabb:
-            low, high = _corners(question.aabb, self._scene.origin)
+            low, high = _corners(question.aabb, self.scene.origin)
             rows = np.flatnonzero(((gaussians.means >= low) & (gaussians.means <= high)).all(axis=1))
             if not len(rows):
-                raise InputError(f"aabb: no Gaussian of scene {self._scene.name} is in the box {list(question.aabb)}")
+                raise InputError(f"aabb: no Gaussian of scene {self.scene.name} is in the box {list(question.aabb)}")
             return (target_of("thing in the box", gaussians, rows),), ()
         if not words:
             return (), ()
-        if self._table is None:
-            raise InputError(f"query: no words lead into the features of {self._scene.name}; give words= or aabb=")
-        found = localize(self._scene, words, self._table, self._localization, space=self._space)
+        if self.table is None:
+            raise InputError(f"query: no words lead into the features of {self.scene.name}; give words= or aabb=")
+        found = localize(self.scene, words, self.table, self.localization, space=self.space)
         # A caption is of one thing.
-        boxes = self._config.boxes if question.task != "caption" else 1
+        boxes = self.config.boxes if question.task != "caption" else 1
         targets, kept = _distinct(targets_of(gaussians, found, boxes), best_boxes(found, boxes))
         return (targets[:1], kept[:1]) if question.task == "caption" else (targets, kept)
 

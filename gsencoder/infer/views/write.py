@@ -1,0 +1,57 @@
+"""Selected views on disk: pictures, a contact sheet, and cameras with scores as JSON values."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsencoder.infer.draw.pictures import Picture
+from gsencoder.infer.views.pictures import picture_kinds, view_sheet
+from gsencoder.infer.views.selection import ViewSet
+from gsencoder.types import Box, Scene
+
+SHEET = "sheet.png"
+
+
+def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
+    """What was chosen and why, best first: names and pictures, sights, gains, and cameras in world coordinates with the
+    origin added back (cam_from_world and K as OpenCV has them)."""
+    rows = []
+    for number, (each, kind) in enumerate(zip(views.chosen, picture_kinds(scene, views), strict=True)):
+        pose = views.cameras.cam_from_world[number].astype(np.float64)
+        pose[:3, 3] -= pose[:3, :3] @ scene.origin
+        rows.append(
+            {
+                "name": each.name,
+                "picture": f"view_{number:02d}.png",
+                "kind": kind,
+                "frame": each.frame,
+                "clearance": each.clearance,
+                "gain": each.gain,
+                "covered": each.covered,
+                "sights": [
+                    {name: getattr(sight, name) for name in type(sight).__dataclass_fields__} for sight in each.sights
+                ],
+                "cam_from_world": pose.tolist(),
+                "K": views.cameras.Ks[number].tolist(),
+                "width": int(views.cameras.widths[number]),
+                "height": int(views.cameras.heights[number]),
+            }
+        )
+    return rows
+
+
+def write_pictures(
+    folder: Path,
+    scene: Scene,
+    views: ViewSet,
+    rows: Sequence[Mapping[str, Any]],
+    pictures: Sequence[Picture],
+    boxes: Sequence[Box],
+) -> None:
+    """Each picture under the name that its row gives it, and the sheet of all."""
+    for picture, row in zip(pictures, rows, strict=True):
+        Image.fromarray(picture).save(folder / row["picture"])
+    Image.fromarray(view_sheet(scene, views, pictures, boxes)).save(folder / SHEET)
