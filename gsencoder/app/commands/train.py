@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -58,6 +58,8 @@ SHOWN_SCENES = 3
 class TrainConfig(CommonConfig):
     """Settings of `train`."""
 
+    has_experiments: ClassVar[bool] = True
+
     paths: tuple[str, ...] = field(
         default=(), metadata={"help": "scenes, or folders of scenes", "metavar": "SCENE", "required": True}
     )
@@ -85,7 +87,7 @@ class TrainConfig(CommonConfig):
     seeds: SeedConfig = field(default_factory=SeedConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
-    model: EncoderConfig = field(default_factory=EncoderConfig)
+    model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     loss: LossConfig = field(default_factory=LossConfig)
