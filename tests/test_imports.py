@@ -48,6 +48,7 @@ TORCH_FREE = [
     "gsencoder.infer.draw.report",
     "gsencoder.app.runs.output_folder",
     "gsencoder.app.settings.config",
+    "gsencoder.app.settings.config_store",
     "gsencoder.app.settings.compose",
     "gsencoder.app.settings.multirun",
     "gsencoder.app.commands.inspect",

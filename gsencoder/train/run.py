@@ -48,7 +48,7 @@ class TrainConfig(SourceConfig):
         default="",
         metadata={"help": "file of the teacher's adapter heads, behind which cells are compared; empty = none"},
     )
-    model: EncoderConfig = field(default_factory=EncoderConfig)
+    model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     loss: LossConfig = field(default_factory=LossConfig)

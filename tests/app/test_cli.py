@@ -22,7 +22,6 @@ from gsencoder.app import cli
 from gsencoder.app.commands import COMMANDS, Command
 from gsencoder.app.commands.repair import Fix
 from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.settings import compose
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.runtime.signals import Stopped
@@ -48,12 +47,8 @@ def write_toy(config: Any, summary: Any) -> None:
 
 
 @pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Callable[[Any, Any], None]], None]:
+def toy(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Any, Any], None]], None]:
     """Makes `gsencoder toy` run the given function."""
-    conf = tmp_path / "conf"
-    conf.mkdir()
-    (conf / "toy.yaml").write_text("out: null\noverwrite: false\nquiet: false\npaths: []\nsize: 1\nword: ''\n")
-    monkeypatch.setattr(compose, "conf_folder", lambda: conf)
 
     def install(run: Callable[[Any, Any], None]) -> None:
         @dataclass(frozen=True, slots=True, kw_only=True)
@@ -298,7 +293,7 @@ def test_many_runs_sweep_numbers_and_keep_text(
     (tmp_path / "a,b=").touch()
     monkeypatch.chdir(tmp_path)
     assert cli.main(words) == 0
-    assert sorted(os.listdir()) == sorted(["a,b=", "conf", out.name])
+    assert sorted(os.listdir()) == sorted(["a,b=", out.name])
     assert sorted(os.listdir(out)) == ["0", "1", "multirun.yaml"]
     records = [json.loads((out / str(k) / "summary.json").read_text()) for k in range(2)]
     assert [record["results"]["size"] for record in records] == [1, 2]
@@ -340,14 +335,11 @@ def test_many_runs_complain_like_one(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    if words[0] == "repair":
-        monkeypatch.undo()
-        monkeypatch.chdir(tmp_path)
     assert cli.main(words) == 2
     err = capsys.readouterr().err
     assert said in err
     assert err.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["conf"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_launcher_in_another_process_can_take_a_run(tmp_path: Path) -> None:

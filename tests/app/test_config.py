@@ -1,6 +1,5 @@
-"""Settings: text reaches the dataclass as it was typed, numbers are checked, YAML and dataclasses agree."""
+"""Settings: text reaches the dataclass as it was typed, numbers are checked, errors name the option."""
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,10 +11,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from gsencoder.app import cli
-from gsencoder.app.commands import COMMANDS
-from gsencoder.app.settings.compose import choices_of, compose, conf_folder
+from gsencoder.app.settings.compose import compose
 from gsencoder.app.settings.config import HIDDEN, CommonConfig, check_required, settings, typed
-from gsencoder.app.settings.options import describe, join_list, options_of, split_list
+from gsencoder.app.settings.options import describe, join_list, split_list
 from gsencoder.core.errors import InputError
 
 
@@ -57,27 +55,12 @@ class ToyConfig(CommonConfig):
     teacher: LabelsConfig | OnnxConfig = field(default_factory=LabelsConfig)
 
 
-YAML = {
-    "common.yaml": "out: null\noverwrite: false\nquiet: false\n",
-    "toy.yaml": (
-        "defaults:\n  - common\n  - fusion: default\n  - teacher: labels\n  - _self_\n"
-        "paths: []\nquery: []\nquestion: ''\ndevice: null\nseed: 0\n"
-    ),
-    "fusion/default.yaml": (
-        "voxel: 0.02\nlift: blend\ntau: null\nwindow: [0.0, 1.0]\nranks: [8, 16]\nagainst: [depth]\n"
-    ),
-    "teacher/labels.yaml": "name: labels\ntable: null\n",
-    "teacher/onnx.yaml": "name: onnx\nweights: ''\ntop_k: 5\n",
-    "teacher/dinov2.yaml": "defaults:\n  - onnx\n  - _self_\nweights: dinov2.onnx\n",
-}
-
-
 @pytest.fixture(scope="module")
 def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one preset, of the toy's teacher."""
     folder = tmp_path_factory.mktemp("conf")
-    for name, text in YAML.items():
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text(text)
+    (folder / "teacher").mkdir()
+    (folder / "teacher" / "dinov2.yaml").write_text("defaults:\n  - onnx\n  - _self_\nweights: dinov2.onnx\n")
     return folder
 
 
@@ -243,7 +226,8 @@ def test_brackets_around_a_list_of_text_are_text(conf: Path) -> None:
         ("ranks={a: 1}", "fusion.ranks: expected a list, each a whole number"),
         ("voxle=1", "voxle: no such option, and no file has this name; did you mean fusion.voxel?"),
         ("fusion.voxle=1", "fusion.voxle: no such option"),
-        ("fusion={voxel: 1}", "fusion: expected one of default"),
+        ("fusion={voxel: 1}", "fusion: is a section; set its options one by one: fusion.voxel=, fusion.lift=, "),
+        ("fusion=default", "fusion: is a section; set its options one by one: fusion.voxel=, fusion.lift=, "),
         ("+seed=1", "+seed=…: is neither an option (KEY=VALUE) nor an existing file"),
         ("~seed=1", "~seed=…: is neither an option (KEY=VALUE) nor an existing file"),
         ("/no/such=file", "/no/such=…: is neither an option (KEY=VALUE) nor an existing file"),
@@ -277,7 +261,7 @@ def test_a_short_name_of_two_options_must_be_written_out(conf: Path) -> None:
         compose("toy", Twice, ["voxel=1"], conf)
 
 
-def test_a_choice_of_yaml_file_selects_the_dataclass(conf: Path) -> None:
+def test_a_choice_selects_the_dataclass_and_a_yaml_file_its_preset(conf: Path) -> None:
     assert toy(conf, "teacher=labels").teacher == LabelsConfig()
     assert toy(conf, "teacher=onnx", "teacher.top_k=3").teacher == OnnxConfig(top_k=3)
     assert toy(conf, "teacher=dinov2").teacher == OnnxConfig(weights="dinov2.onnx")
@@ -335,59 +319,6 @@ def test_types_are_told_in_plain_words() -> None:
     assert describe(float | None) == "a number or null"
     assert describe(float | Literal["auto"]) == "a number or auto"
     assert describe(tuple[Path, ...]) == "a list, each a path"
-
-
-def _composed(name: str, *words: str) -> Any:
-    return compose(name, COMMANDS[name].load()[0], words)
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_yaml_and_dataclass_agree(name: str) -> None:
-    cls = COMMANDS[name].load()[0]
-    assert _composed(name) == cls()
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-@pytest.mark.slow
-def test_every_member_of_every_choice_composes(name: str) -> None:
-    cls = COMMANDS[name].load()[0]
-    choices = choices_of(name, cls)
-    for group, members in choices.groups.items():
-        assert members, group
-        for member in members:
-            assert settings(compose(name, cls, [f"{group}={member}"], choices=choices))
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_no_option_has_the_name_of_a_folder_of_settings(name: str) -> None:
-    # Hydra would take its value for a file of that folder.
-    folders = {path.name for path in conf_folder().iterdir() if path.is_dir()}
-    assert not folders & {option.key for option in options_of(COMMANDS[name].load()[0])}
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_setting_is_documented_and_in_the_yaml(name: str) -> None:
-    from omegaconf import OmegaConf
-
-    from gsencoder.app.settings.compose import open_hydra, plain_settings
-
-    cls = COMMANDS[name].load()[0]
-    assert dataclasses.fields(cls)
-    for option in options_of(cls):
-        assert option.help, f"{name}: {option.key} has no metadata help"
-        assert not option.help.endswith("."), f"{name}: {option.key}: help is a phrase, without a full stop"
-    with open_hydra(None) as hydra:
-        from hydra.types import RunMode
-
-        data = OmegaConf.create(plain_settings(hydra.compose_config(name, [], RunMode.RUN, from_shell=False)))
-    nothing = object()
-    for option in options_of(cls):
-        if not option.member:
-            assert OmegaConf.select(data, option.key, default=nothing) is not nothing, f"conf lacks {option.key}"
-
-
-def test_every_command_has_its_yaml() -> None:
-    assert {f"{name}.yaml" for name in COMMANDS} <= {path.name for path in conf_folder().glob("*.yaml")}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

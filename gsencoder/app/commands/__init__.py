@@ -13,8 +13,8 @@ class Command:
     """One entry of the command line.
 
     Attributes:
-        name: what the user types; `gsencoder.app.commands.NAME` is its module, `conf/NAME.yaml` its settings.
-        config: the name of the settings class in the module.
+        name: what the user types; `gsencoder.app.commands.NAME` is its module.
+        config: the name of the settings class in that module.
         help: what it does, in one line.
     """
 

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from gsencoder.app.runs.output_folder import lies_in, output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
@@ -33,6 +33,8 @@ from gsencoder.train.run import TrainConfig, Training, fit
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainCommandConfig(TrainConfig, CommonConfig):
     """Settings of `train`."""
+
+    has_experiments: ClassVar[bool] = True
 
     paths: tuple[str, ...] = field(
         default=(), metadata={"help": "scenes, or folders of scenes", "metavar": "SCENE", "required": True}

@@ -1,4 +1,4 @@
-"""From the words of a command line to a command's settings: Hydra composes the YAML files, the user's text stays text.
+"""From the words of a command line to a command's settings: Hydra composes them, the user's text stays text.
 
 Hydra's override grammar is made for numbers and sweeps. In it `query=mug,banana` is a sweep, `question=What's red?` a
 syntax error, `query=1` a number, `query=${oc.env:HOME}` a look-up. Options whose type is text, a path, or a list of
@@ -18,7 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsencoder.app.settings.config import typed
+from gsencoder.app.settings.config import CommonConfig, typed
+from gsencoder.app.settings.config_store import groups_of, store_settings
 from gsencoder.app.settings.options import (
     Option,
     is_list_of_words,
@@ -31,7 +32,7 @@ from gsencoder.app.settings.options import (
 )
 from gsencoder.core.errors import InputError
 
-T = TypeVar("T")
+Config = TypeVar("Config", bound=CommonConfig)
 
 SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
 """Under -m, and only there, a text option is swept where its value has this form."""
@@ -39,19 +40,19 @@ SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """What a command may be told.
+    """The options and choices of a command.
 
     Attributes:
         options: by full key.
         members: for each key the members of a choice that have it; none where the option always applies.
-        groups: the names that a choice of YAML file may take, by the choice's key.
+        groups: the names of each choice's members, by the choice's key.
         chosen: the default of each choice.
     """
 
     options: Mapping[str, Option]
     members: Mapping[str, tuple[str, ...]]
     groups: Mapping[str, tuple[str, ...]]
-    chosen: Mapping[str, str | None]
+    chosen: Mapping[str, str]
 
 
 def conf_folder() -> Path:
@@ -72,8 +73,8 @@ def unseal(digits: str) -> str:
 
 
 @contextmanager
-def open_hydra(conf: Path | None) -> Iterator[Any]:
-    """Hydra over a folder of YAML files (ours unless given); its errors become ours, in one line."""
+def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iterator[Any]:
+    """Hydra over a command's defaults and a folder of YAML files (ours unless given); its errors become one line."""
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
@@ -81,6 +82,7 @@ def open_hydra(conf: Path | None) -> Iterator[Any]:
     from omegaconf.errors import OmegaConfBaseException
 
     OmegaConf.register_new_resolver("text", unseal, replace=True)
+    store_settings(command, cls)
     folder = str((conf or conf_folder()).resolve())
     try:
         with initialize_config_dir(config_dir=folder, job_name="gsencoder", version_base="1.3"):
@@ -89,24 +91,13 @@ def open_hydra(conf: Path | None) -> Iterator[Any]:
         raise InputError(" ".join(str(error).split())) from error
 
 
-def choices_of(command: str, cls: type, conf: Path | None = None) -> Choices:
-    """The options and choices of a command."""
-    from hydra.types import RunMode
-
-    groups: dict[str, tuple[str, ...]] = {}
-    chosen: dict[str, str | None] = {}
-
-    def walk(tree: Any) -> None:
-        node = getattr(tree, "node", tree)
-        if hasattr(node, "group") and not node.get_override_key().startswith("hydra/"):
-            groups[node.get_override_key()] = tuple(loader.get_group_options(node.get_group_path()))
-            chosen[node.get_override_key()] = node.get_name()
-        for child in getattr(tree, "children", None) or ():
-            walk(child)
-
-    with open_hydra(conf) as hydra:
-        loader = hydra.config_loader
-        walk(loader.compute_defaults_list(command, [], RunMode.RUN).defaults_tree)
+def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
+    """The options and choices of a command; further members of a choice are YAML files (in our folder unless given)."""
+    folder, groups, chosen = conf or conf_folder(), {}, {}
+    for group in groups_of(cls):
+        files = (path.stem for path in (folder / group.key).glob("*.yaml"))
+        groups[group.key] = tuple(sorted({*group.members, *files}))
+        chosen[group.key] = group.default
     members: dict[str, tuple[str, ...]] = {}
     for option in options_of(cls):
         members[option.key] = (*members.get(option.key, ()), option.member) if option.member else ()
@@ -237,9 +228,9 @@ def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) ->
 
 
 def compose(
-    command: str, cls: type[T], words: Sequence[str], conf: Path | None = None, choices: Choices | None = None
-) -> T:
-    """The settings of one run: YAML files, then the words of the command line.
+    command: str, cls: type[Config], words: Sequence[str], conf: Path | None = None, choices: Choices | None = None
+) -> Config:
+    """The settings of one run: the defaults of its class, YAML files that were chosen, the words of the command line.
 
     Raises:
         InputError: the words, or what they come to together, are not settings of this command.
@@ -247,12 +238,12 @@ def compose(
     from hydra.errors import HydraException
     from hydra.types import RunMode
 
-    choices = choices or choices_of(command, cls, conf)
+    choices = choices or choices_of(cls, conf)
     paths, given = read_words(words, choices)
     if paths:
         given["paths"] = join_list(paths)
     written = overrides(given, choices)
-    with open_hydra(conf) as hydra:
+    with open_hydra(command, cls, conf) as hydra:
         try:
             composed = hydra.compose_config(command, written, RunMode.RUN, from_shell=False)
         except HydraException as error:

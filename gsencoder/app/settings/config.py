@@ -4,14 +4,15 @@ Each command owns a `@dataclass(frozen=True, slots=True, kw_only=True)` whose fi
 that text is what `gsencoder COMMAND --help` shows. Further metadata: `required=True` (the command cannot run without
 it), `metavar` (the word that stands for the value in the help) and `secret=True` (the value is never shown or
 written). A field whose type is a dataclass is a section, and its options are written `section.name=value`. A field
-whose type is a union of dataclasses is a choice: every member has a field `name: Literal["…"]`, and a folder of YAML
-files, one a member, makes it `section=member`.
+whose type is a union of dataclasses is a choice, written `section=member`: every member has a field
+`name: Literal["…"]`. `preset="NAME"` in the metadata of a section makes it a choice too, between its default, which has
+that name, and the presets in `conf/SECTION/*.yaml`.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_origin
+from typing import Any, ClassVar, TypeVar, get_origin
 
 from gsencoder.app.settings.options import (
     allows_none,
@@ -37,6 +38,9 @@ HIDDEN = "(not shown)"
 @dataclass(frozen=True, kw_only=True)
 class CommonConfig:
     """What every command takes. Without slots, so that a command can inherit from its stage's settings as well."""
+
+    has_experiments: ClassVar[bool] = False
+    """Whether `experiment=NAME` takes options of several sections from `conf/experiment/NAME.yaml`."""
 
     out: Path | None = field(default=None, metadata={"help": "where the results go", "metavar": "PATH"})
     overwrite: bool = field(default=False, metadata={"help": "replace what an earlier run wrote to out="})

@@ -1,4 +1,4 @@
-"""What `gsencoder COMMAND --help` prints, read off the settings classes and the folder of YAML files."""
+"""What `gsencoder COMMAND --help` prints, read off the settings classes and the names of the YAML files."""
 
 import shutil
 import textwrap
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.app.settings.compose import choices_of
+from gsencoder.app.settings.config import CommonConfig
 from gsencoder.app.settings.options import Option, describe, join_list, options_of
 
 RULES = (
@@ -36,12 +37,14 @@ def _option(option: Option, width: int) -> list[str]:
     return _entry(f"{option.key}={kind}", f"{option.help} [{_shown(option.default)}]", width)
 
 
-def command_help(name: str, meaning: str, cls: type, flags: Mapping[str, str], conf: Path | None = None) -> str:
+def command_help(
+    name: str, meaning: str, cls: type[CommonConfig], flags: Mapping[str, str], conf: Path | None = None
+) -> str:
     """The help of one command: usage, paths, settings with type, meaning and default, choices, flags."""
     width = min(shutil.get_terminal_size((100, 24)).columns, 110)
     # The command's own options first, then those of its sections.
     options = sorted(options_of(cls), key=lambda option: "." in option.key)
-    choices = choices_of(name, cls, conf)
+    choices = choices_of(cls, conf)
     paths = next((option for option in options if option.key == "paths"), None)
     word = f" {paths.metavar or 'PATH'}…" if paths else ""
     lines = [f"usage: gsencoder {name}{word} [key=value …]", "", *textwrap.wrap(meaning, width)]

@@ -66,7 +66,7 @@ def run_many(
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
-    choices = choices_of(command, cls, conf)
+    choices = choices_of(cls, conf)
     paths, given = read_words(words, choices, sweep=True)
     if paths:
         given["paths"] = join_list(paths)
@@ -84,7 +84,7 @@ def run_many(
     parsed = OverridesParser.create().parse_overrides(asked)
     swept = tuple(override.get_key_element() for override in parsed if override.is_sweep_override())
     job = partial(_job, cls=cls, run=run, swept=swept)
-    with open_hydra(conf) as hydra:
+    with open_hydra(command, cls, conf) as hydra:
         try:
             batches = hydra.multirun(command, job, written, with_log_configuration=False)
         except HydraException as error:

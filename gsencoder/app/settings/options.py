@@ -155,7 +155,8 @@ def join_list(items: Iterable[str]) -> str:
 
 def field_types(cls: type) -> dict[str, Any]:
     """The resolved types of a dataclass's fields."""
-    return typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls)
+    return {item.name: hints[item.name] for item in fields(cls)}
 
 
 def section_classes(annotation: Any) -> tuple[type, ...]:
@@ -177,12 +178,13 @@ def _default(item: Any) -> Any:
 def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
     """Every option of a settings class, sections included, in order of declaration."""
     found = []
+    annotations = field_types(cls)
     for item in fields(cls):
-        key, annotation = prefix + item.name, field_types(cls)[item.name]
+        key, annotation = prefix + item.name, annotations[item.name]
         classes = section_classes(annotation)
         if classes:
             for section in classes:
-                owner = f"{key}={member_name(section)}" if len(classes) > 1 else member
+                owner = f"{key.replace('.', '/')}={member_name(section)}" if len(classes) > 1 else member
                 found += options_of(section, key + ".", owner)
         elif not (item.name == "name" and get_origin(annotation) is Literal and len(get_args(annotation)) == 1):
             found.append(

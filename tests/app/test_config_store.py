@@ -1,0 +1,258 @@
+"""A default has one home: what Hydra composes is what the dataclasses say, and YAML holds only what differs from it."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import pytest
+
+from gsencoder.app.commands import COMMANDS
+from gsencoder.app.settings.compose import choices_of, compose, conf_folder, open_hydra, plain_settings
+from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.settings.config_store import EXPERIMENT
+from gsencoder.app.settings.options import field_types, member_name, options_of, section_classes
+from gsencoder.core.errors import InputError
+
+MISSING = object()
+
+
+def config_of(command: str) -> type[CommonConfig]:
+    return COMMANDS[command].load()[0]
+
+
+def value_at(data: Any, key: str) -> Any:
+    """The value of `a.b.c` in nested dataclasses or dicts; MISSING where there is none."""
+    for name in key.split("."):
+        data = data.get(name, MISSING) if isinstance(data, Mapping) else getattr(data, name, MISSING)
+    return data
+
+
+def union_members(cls: type, prefix: str = "") -> Iterator[tuple[str, type]]:
+    """The key of every choice between dataclasses, sections included, with each of its members."""
+    for name, annotation in field_types(cls).items():
+        classes = section_classes(annotation)
+        for member in classes:
+            if len(classes) > 1:
+                yield prefix + name, member
+            else:
+                yield from union_members(member, f"{prefix}{name}.")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_composed_defaults_are_those_of_the_dataclass(command: str) -> None:
+    cls = config_of(command)
+    assert compose(command, cls, []) == cls()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.slow
+def test_a_member_of_a_choice_has_the_defaults_of_its_dataclass(command: str) -> None:
+    cls = config_of(command)
+    choices = choices_of(cls)
+    for key, member in union_members(cls):
+        word = f"{key.replace('.', '/')}={member_name(member)}"
+        assert value_at(compose(command, cls, [word], choices=choices), key) == member()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.slow
+def test_every_member_of_every_choice_composes_and_the_default_one_changes_nothing(command: str) -> None:
+    cls = config_of(command)
+    choices = choices_of(cls)
+    for group, members in choices.groups.items():
+        for member in members:
+            config = compose(command, cls, [f"{group}={member}"], choices=choices)
+            assert (config == cls()) == (member == choices.chosen[group])
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_setting_is_documented_and_known_to_hydra(command: str) -> None:
+    from hydra.types import RunMode
+
+    cls = config_of(command)
+    with open_hydra(command, cls, None) as hydra:
+        composed = plain_settings(hydra.compose_config(command, [], RunMode.RUN, from_shell=False))
+    assert options_of(cls)
+    for option in options_of(cls):
+        assert option.help, f"{command}: {option.key} has no metadata help"
+        assert not option.help.endswith("."), f"{command}: {option.key}: help is a phrase, without a full stop"
+        assert option.member or value_at(composed, option.key) is not MISSING, f"Hydra does not know {option.key}"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_option_has_the_name_of_a_group(command: str) -> None:
+    # Hydra would take its value for the name of a member.
+    groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
+    groups |= {group for name in COMMANDS for group in choices_of(config_of(name)).groups}
+    assert not groups & {option.key for option in options_of(config_of(command))}
+
+
+def leaves(data: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """The dotted key of everything that a YAML file sets."""
+    for name, value in data.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def base_of(group: str, defaults: list[Any]) -> list[str]:
+    """The members that a YAML file builds on, by its defaults list, as words of a command line."""
+    words = []
+    for entry in defaults:
+        if isinstance(entry, Mapping):
+            (overridden, member), *others = entry.items()
+            assert not others
+            assert overridden.startswith("override /")
+            words.append(f"{overridden.removeprefix('override /')}={member}")
+        elif entry != "_self_":
+            words.append(f"{group}={entry}")
+    return words
+
+
+@pytest.mark.parametrize("path", sorted(conf_folder().rglob("*.*")), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_a_yaml_file_is_a_member_of_a_choice_and_sets_only_what_differs(path: Path) -> None:
+    from omegaconf import OmegaConf
+
+    group = path.parent.relative_to(conf_folder()).as_posix()
+    commands = [name for name in COMMANDS if group in choices_of(config_of(name)).groups]
+    assert commands, f"no command has a choice {group}"
+    assert path.suffix == ".yaml"
+    cls = config_of(commands[0])
+    assert path.stem not in {
+        member_name(member) for key, member in union_members(cls) if key.replace(".", "/") == group
+    }
+    data = OmegaConf.to_container(OmegaConf.load(path))
+    assert isinstance(data, dict)
+    base = base_of(group, data.pop("defaults", []))
+    chosen = choices_of(cls).chosen
+    assert path.stem != chosen[group]
+    assert not {f"{key}={member}" for key, member in chosen.items()} & {
+        word for word in base if word[: len(group)] != group
+    }
+    before = settings(compose(commands[0], cls, base))
+    after = settings(compose(commands[0], cls, [f"{group}={path.stem}"]))
+    keys = list(leaves(data, "" if group == EXPERIMENT else group.replace("/", ".") + "."))
+    assert keys
+    for key in keys:
+        assert value_at(after, key) is not MISSING, f"{key} is no option"
+        assert value_at(after, key) != value_at(before, key), f"{key} is what it would be without {path.name}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetworkConfig:
+    width: int = field(default=8, metadata={"help": "channels"})
+    depth: int = field(default=2, metadata={"help": "blocks"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseConfig:
+    name: Literal["noise"] = "noise"
+    sigma: float = field(default=0.1, metadata={"help": "standard deviation"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlurConfig:
+    name: Literal["blur"] = "blur"
+    radius: int = field(default=1, metadata={"help": "pixels"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudentConfig:
+    network: NetworkConfig = field(default_factory=NetworkConfig, metadata={"preset": "tiny"})
+    damage: NoiseConfig | BlurConfig = field(default_factory=lambda: NoiseConfig(sigma=0.3))
+    rate: float = field(default=0.01, metadata={"help": "learning rate"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ToyConfig(CommonConfig):
+    has_experiments: ClassVar[bool] = True
+
+    student: StudentConfig = field(default_factory=StudentConfig)
+    teacher: NoiseConfig | BlurConfig = field(default_factory=BlurConfig)
+
+
+@pytest.fixture(scope="module")
+def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("conf")
+    files = {
+        "student/network/large.yaml": "defaults: [tiny, _self_]\nwidth: 64\n",
+        "teacher/wide.yaml": "defaults: [blur, _self_]\nradius: 9\n",
+        "teacher/wrong.yaml": "defaults: [blur, _self_]\nradios: 9\n",
+        "experiment/long.yaml": (
+            "# @package _global_\ndefaults:\n  - override /student/network: large\n  - override /teacher: noise\n"
+            "student: {rate: 0.5, network: {depth: 7}}\n"
+        ),
+    }
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def toy(conf: Path, *words: str) -> ToyConfig:
+    return compose("toy", ToyConfig, words, conf)
+
+
+def test_choices_come_from_unions_presets_and_experiments_wherever_their_section_lies(conf: Path) -> None:
+    choices = choices_of(ToyConfig, conf)
+    assert choices.groups == {
+        "student/network": ("large", "tiny"),
+        "student/damage": ("blur", "noise"),
+        "teacher": ("blur", "noise", "wide", "wrong"),
+        "experiment": ("long", "none"),
+    }
+    assert choices.chosen == {
+        "student/network": "tiny",
+        "student/damage": "noise",
+        "teacher": "blur",
+        "experiment": "none",
+    }
+    assert toy(conf) == ToyConfig()
+    assert toy(conf, "network=large", "damage=blur", "student.damage.radius=3", "teacher=wide") == ToyConfig(
+        student=StudentConfig(network=NetworkConfig(width=64), damage=BlurConfig(radius=3)),
+        teacher=BlurConfig(radius=9),
+    )
+
+
+def test_a_member_has_the_values_that_the_field_gives_it(conf: Path) -> None:
+    config = toy(conf, "student/damage=noise", "teacher=noise")
+    assert config.student.damage == NoiseConfig(sigma=0.3)
+    assert config.teacher == NoiseConfig()
+
+
+def test_an_experiment_goes_over_the_defaults_and_the_command_line_over_the_experiment(conf: Path) -> None:
+    config = toy(conf, "experiment=long")
+    assert config.student == StudentConfig(network=NetworkConfig(width=64, depth=7), rate=0.5)
+    assert config.teacher == NoiseConfig()
+    config = toy(conf, "experiment=long", "network=tiny", "rate=0.25", "teacher=wide")
+    assert config.student == StudentConfig(network=NetworkConfig(depth=7), rate=0.25)
+    assert config.teacher == BlurConfig(radius=9)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("teacher=wrong", "teacher.radios: no such option; did you mean teacher.radius?"),
+        ("student.damage.radius=3", "is an option of student/damage=blur, and student/damage is noise"),
+        ("damage=blue", "student/damage: expected one of blur, noise, got 'blue'; did you mean blur?"),
+        ("experiment=short", "experiment: expected one of long, none, got 'short'"),
+    ],
+)
+def test_errors_name_the_choice_and_its_members(conf: Path, word: str, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        toy(conf, word)
+    assert message in str(caught.value)
+
+
+def test_commands_that_share_the_name_of_a_choice_have_their_own_members(conf: Path) -> None:
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class OtherConfig(CommonConfig):
+        teacher: NetworkConfig = field(default_factory=NetworkConfig, metadata={"preset": "plain"})
+
+    assert toy(conf).teacher == BlurConfig()
+    assert compose("other", OtherConfig, ["teacher.width=3"], conf).teacher == NetworkConfig(width=3)
+    with pytest.raises(InputError, match="teacher: expected one of plain, wide, wrong, got 'blur'"):
+        compose("other", OtherConfig, ["teacher=blur"], conf)
+    assert toy(conf).teacher == BlurConfig()
