@@ -119,7 +119,7 @@ def test_a_signal_is_ours_after_pycolmap_came(tmp_path: Path, ten: Path) -> None
     script = (
         "import os, signal, sys\n"
         "from gsencoder.app import cli\n"
-        "from gsencoder.app.commands import reconstruct\n"
+        "from gsencoder.reconstruct import run as reconstruct\n"
         "reconstruct.Optimizer.advance = lambda self: os.kill(os.getpid(), signal.SIGTERM)\n"
         "sys.exit(cli.main(sys.argv[1:]))\n"
     )
