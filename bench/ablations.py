@@ -25,9 +25,9 @@ GROUPS: dict[str, dict[str, list[str]]] = {
     "views": {"1 target view": ["sampling.views=1"], "8 target views": ["sampling.views=8"]},
     "patch": {"patch 32": ["model.transformer.patch=32"], "patch 512": ["model.transformer.patch=512"]},
     "inputs": {
-        "colour alone": ["model.inputs=[color]"],
-        "colour and offset": ["model.inputs=[color,offset]"],
-        "without colour": ["model.inputs=[offset,opacity,scale,rotation]"],
+        "color alone": ["model.inputs=[color]"],
+        "color and offset": ["model.inputs=[color,offset]"],
+        "without color": ["model.inputs=[offset,opacity,scale,rotation]"],
         "without rotation": ["model.inputs=[offset,color,opacity,scale]"],
     },
 }

@@ -2,7 +2,7 @@
 
     python bench/chunks.py SCENE… [--weights house_cpu] [--chunks 125000,80000,40000] [--halos 0,0.64,1.28]
 
-Cosine: centred, with the features of the whole scene in float32. Names: `evaluate`'s protocol. Seconds are of `encode`
+Cosine: centerd, with the features of the whole scene in float32. Names: `evaluate`'s protocol. Seconds are of `encode`
 alone, warm.
 """
 
@@ -11,7 +11,7 @@ import time
 from itertools import product
 
 import numpy as np
-from per_scene import labelled, quality
+from per_scene import labeled, quality
 
 from gsencoder.core.files.model_files import find_file
 from gsencoder.core.runtime.heap import keep_heap
@@ -45,7 +45,7 @@ def main() -> None:
         settings[f"chunks of {chunk:,}, halo {halo:g} m"] = EncodeConfig(chunk=chunk, halo=halo, precision="float32")
     rows: dict[str, list[tuple]] = {name: [] for name in settings}
     for path in chosen.scenes:
-        scene, teacher = labelled(path, words)
+        scene, teacher = labeled(path, words)
         assert scene.gaussians is not None
         truth = fuse(scene, teacher).features
         whole = encode(scene.gaussians, encoder, outputs, settings["whole, float32"])
@@ -54,7 +54,7 @@ def main() -> None:
             found = encode(scene.gaussians, encoder, outputs, config)
             spent = time.perf_counter() - start
             parts = len(cut(scene.gaussians.means, config.chunk, config.halo))
-            same = 1 - field_error(found, whole).centred
+            same = 1 - field_error(found, whole).centerd
             rows[name].append((*quality(scene, truth, found, teacher, words), same, spent, parts))
     print("| setting | chunks | cosine with the whole | names | Acc@0.25 | seconds |\n|---|---|---|---|---|---|")
     for name, each in rows.items():

@@ -44,7 +44,7 @@ PRODUCTS = ("mm", "addmm", "bmm", "_scaled_dot_product_flash_attention_for_cpu",
 
 
 def surface(count: int, voxel: float = 0.02) -> Gaussians:
-    """A floor of one Gaussian a cell, with boxes on it: as many neighbours as scans of rooms have."""
+    """A floor of one Gaussian a cell, with boxes on it: as many neighbors as scans of rooms have."""
     rng = np.random.default_rng(0)
     side = int(np.sqrt(count / 1.6)) + 1
     x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")

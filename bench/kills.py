@@ -2,7 +2,7 @@
 
     python bench/kills.py SCENE [--kills 25] [--seed 0] [--cases fuse train reconstruct]
 
-SCENE is a labelled RGB-D scene. Each case is run once to its end, then again, killed (SIGKILL) after a random share of
+SCENE is a labeled RGB-D scene. Each case is run once to its end, then again, killed (SIGKILL) after a random share of
 the time that it took, until the kills are used up, and then to its end. An out= folder that is there must hold whole
 results, and results must be the same arrays to the last bit.
 """

@@ -4,13 +4,13 @@
 
 Maps: `SyntheticTeacher` (rank 32 plus noise of 10 % of the energy, seed 0) on 24 × 32 cells, which is what a
 teacher with patches of 14 pixels sees of a picture resized to 336 × 448. Blending weights with their transposes, and
-the visibility of Gaussians' centres, are made beforehand and timed apart; so is finding the basis. Timed as the lift:
+the visibility of Gaussians' centers, are made beforehand and timed apart; so is finding the basis. Timed as the lift:
 allocating the sums, projecting the maps onto the basis (for lifts in a basis), adding up all views, and dividing.
 
 Ways:
     blend     the library: Bᵀ @ maps, all of B's entries
-    center    the library: one entry for each visible centre (OpenScene's and SplatDistill's rule)
-    gather    the dense loop that one would write: for each view the features of the visible centres are gathered into
+    center    the library: one entry for each visible center (OpenScene's and SplatDistill's rule)
+    gather    the dense loop that one would write: for each view the features of the visible centers are gathered into
               one reused buffer and added to the rows of their Gaussians
 The dense loops work on all channels; for each, the lift in the basis follows the same rule and is judged against it.
 
@@ -74,7 +74,7 @@ def prepare(path: str, voxel: float, count: int) -> Problem:
     maps = [teacher.feature_map(views, view) for view in chosen]
     seconds: dict[str, float] = {}
     blends = timed_list(seconds, "blending weights", lambda view: build(gaussians, views, view, maps[view]), chosen)
-    centers = timed_list(seconds, "visible centres", lambda view: visible(gaussians, views, view, maps[view]), chosen)
+    centers = timed_list(seconds, "visible centers", lambda view: visible(gaussians, views, view, maps[view]), chosen)
     start = time.perf_counter()
     moments = Moments(teacher.space.channels)
     for one in maps:
@@ -193,7 +193,7 @@ def main() -> None:
     n, channels, views = len(problem.gaussians), problem.mean.size, len(problem.maps)
     mean_columns = [round(float(np.mean([len(b.columns) for b in some]))) for some in (problem.blends, problem.centers)]
     print(f"{n:,} Gaussians, {views} views of 24 × 32 cells, {channels} channels, {torch.get_num_threads()} threads")
-    print(f"a view reaches {mean_columns[0]:,} Gaussians by blending, {mean_columns[1]:,} by visible centres")
+    print(f"a view reaches {mean_columns[0]:,} Gaussians by blending, {mean_columns[1]:,} by visible centers")
     for name, value in problem.seconds.items():
         print(f"{name + ' (apart)':24s} {value:.2f} s")
     print(f"basis of rank {problem.basis.rank} keeps {problem.basis.energy_kept:.3f} of the energy\n")
@@ -220,12 +220,12 @@ def main() -> None:
         error = field_error(narrow, wide)
         print(
             f"{rule} in the basis against {way}, all channels: {median[high] / median[low]:.1f}× faster, "
-            f"{memory[high] / max(memory[low], 1e-9):.1f}× less memory, centred cosine error {error.centred:.4f} "
+            f"{memory[high] / max(memory[low], 1e-9):.1f}× less memory, centerd cosine error {error.centerd:.4f} "
             f"(raw {error.raw:.4f}; {error.covered:.1%} of the seen Gaussians)"
         )
         if way == rule:
             truth = field(replace(problem, maps=problem.clean), *high)
-            found = field_error(narrow, truth).centred, field_error(wide, truth).centred
+            found = field_error(narrow, truth).centerd, field_error(wide, truth).centerd
             print(f"    against maps without noise: in the basis {found[0]:.4f}, all channels {found[1]:.4f}")
         del narrow, wide
 

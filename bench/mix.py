@@ -1,4 +1,4 @@
-"""Labelled rooms twice: with Gaussians from their depth images, and with the same ones fitted to the photographs.
+"""Labeled rooms twice: with Gaussians from their depth images, and with the same ones fitted to the photographs.
 
     python bench/mix.py HOUSE OUT [--names 'train_0*'] [--steps 600] [--options raster.eps2d=0.1 …]
     torchrun --nproc_per_node=2 -m gsencoder train OUT experiment=house_cpu splat=splat.ply holdout=train_04*

@@ -1,4 +1,4 @@
-"""Features optimised per scene through B, beside fused and distilled ones: quality and time (SplatDistill table 7).
+"""Features optimized per scene through B, beside fused and distilled ones: quality and time (SplatDistill table 7).
 
     python bench/per_scene.py SCENE… [--weights house_cpu] [--words clip_vitb32_names.npz] [--rounds 5,20,50]
                                      [--stride 2]
@@ -58,7 +58,7 @@ def rows_of(
         yield b, b.alpha[:, None] * torch.from_numpy(table[grid.codes.ravel()])
 
 
-def optimise(
+def optimize(
     scene: Scene, teacher: LabelsTeacher, fused: GaussianFeatures, stride: int, rounds: int
 ) -> GaussianFeatures:
     """Conjugate gradients on the normal equations, from zero."""
@@ -100,7 +100,7 @@ def quality(
     return names, ask(scene, features, words, LocalizationProtocol(), LocalizeConfig())[0]
 
 
-def labelled(path: str, words: TextTable) -> tuple[Scene, LabelsTeacher]:
+def labeled(path: str, words: TextTable) -> tuple[Scene, LabelsTeacher]:
     """A scene with seeds, and the teacher of its labels."""
     scene = load_scene(Path(path))
     scene = replace(scene, gaussians=seed(scene))
@@ -121,19 +121,19 @@ def main() -> None:
     encoder = TorchEncoder(chosen.weights)
     table: dict[str, list[tuple[SceneNames, list[Hit], float]]] = {}
     for path in chosen.scenes:
-        scene, teacher = labelled(path, words)
+        scene, teacher = labeled(path, words)
         start = time.perf_counter()
         truth = fuse(scene, teacher).features
         found = {"fused": (truth, time.perf_counter() - start)}
         for rounds in map(int, chosen.rounds.split(",")):
             start = time.perf_counter()
-            features = optimise(scene, teacher, truth, chosen.stride, rounds)
-            found[f"optimised, {rounds} rounds"] = (features, time.perf_counter() - start)
+            features = optimize(scene, teacher, truth, chosen.stride, rounds)
+            found[f"optimized, {rounds} rounds"] = (features, time.perf_counter() - start)
         features, spent = encoded(encoder)(scene)
         found["encoded"] = (features, sum(spent.values()))
         for name, (features, seconds) in found.items():
             table.setdefault(name, []).append((*quality(scene, truth, features, teacher, words), seconds))
-    print("| features | names | centred cosine | Acc@0.25 | Acc@0.5 | seconds a scene |\n|---|---|---|---|---|---|")
+    print("| features | names | centerd cosine | Acc@0.25 | Acc@0.5 | seconds a scene |\n|---|---|---|---|---|---|")
     for name, rows in table.items():
         scores = naming_scores([names for names, _, _ in rows])
         hits = [hit for _, found_hits, _ in rows for hit in found_hits]

@@ -1,8 +1,8 @@
-"""Words by example: a teacher without words gets them from labelled scenes, and is asked in others.
+"""Words by example: a teacher without words gets them from labeled scenes, and is asked in others.
 
     python bench/prototypes.py dinov2_s14_dense_int8.onnx --learn SCENE… --ask SCENE…
 
-A name's vector is the mean of the centred features of the Gaussians inside that name's boxes in the `--learn` scenes.
+A name's vector is the mean of the centerd features of the Gaussians inside that name's boxes in the `--learn` scenes.
 The `--ask` scenes are then scored by the protocol of `gsencoder evaluate`, over the names that were learned.
 """
 

@@ -1,4 +1,4 @@
-"""Views chosen of the objects of labelled scenes: held against instance masks, and against full-size renders.
+"""Views chosen of the objects of labeled scenes: held against instance masks, and against full-size renders.
 
     python bench/views.py SCENE … [--candidates 16,32,64] [--weights 0.3,0.1,0.2] [--furniture]
 

@@ -1,4 +1,4 @@
-"""How each lift and each visibility test changes what is found: SplatDistill's protocol on labelled scenes.
+"""How each lift and each visibility test changes what is found: SplatDistill's protocol on labeled scenes.
 
     python bench/visibility.py SCENE… [--voxels 0.02,0.01] [--thresholds 0.4] [--out table.csv]
 

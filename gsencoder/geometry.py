@@ -1,6 +1,6 @@
 """Rotations, covariances, projection and spherical harmonics: pure functions of torch tensors, in any float type.
 
-Frames are named in the arguments (`target_from_source`). Camera axes are OpenCV's, quaternions are wxyz, pixel centres
+Frames are named in the arguments (`target_from_source`). Camera axes are OpenCV's, quaternions are wxyz, pixel centers
 lie at .5, scales are standard deviations. Every function keeps the dtype and device that it is given.
 """
 
@@ -24,7 +24,7 @@ class Projected(NamedTuple):
     """Gaussians on one image plane.
 
     Attributes:
-        means2d: centres in pixels.
+        means2d: centers in pixels.
         conics: a, b, c of the inverse 2D covariance [[a, b], [b, c]], in 1/pixel².
         depths: z in the camera, world units.
         mahalanobis2: squared Mahalanobis radius at which alpha falls to ALPHA_MIN; 0 where it never reaches it.
@@ -46,7 +46,7 @@ def normalize_quats(quats: Float[Tensor, "*n 4"], eps: float = 1e-12) -> Float[T
 
 
 def rotmats_from_quats(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
-    """Rotation matrices of quaternions wxyz, which are normalised first."""
+    """Rotation matrices of quaternions wxyz, which are normalized first."""
     w, x, y, z = normalize_quats(quats).unbind(dim=-1)
     rows = (
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -96,8 +96,8 @@ def project(
     Gaussian just beside the camera covers the whole image. `eps2d` pixels² are added to both variances.
 
     Args:
-        means: centres, world units.
-        quats: rotations wxyz, normalised here.
+        means: centers, world units.
+        quats: rotations wxyz, normalized here.
         scales: standard deviations, world units.
         opacities: in [0, 1].
         cam_from_world: rigid.
@@ -172,7 +172,7 @@ def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n 
 def colors_from_sh(
     sh: Float[Tensor, "n K 3"], means: Float[Tensor, "n 3"], camera_center: Float[Tensor, "3"]
 ) -> Float[Tensor, "n 3"]:
-    """View-dependent colours in [0, ∞): Σ_k Y_k(direction)·sh_k + ½, negative values cut at 0."""
+    """View-dependent colors in [0, ∞): Σ_k Y_k(direction)·sh_k + ½, negative values cut at 0."""
     directions = means - camera_center
     directions = directions / torch.sqrt((directions * directions).sum(-1, keepdim=True) + 1e-24)
     basis = sh_basis(directions, math.isqrt(sh.shape[1]) - 1)

@@ -2,7 +2,7 @@
 
 Axes: N Gaussians, V views, H W pixels, h w feature-map pixels, D channels, R basis rank, K = (sh_degree + 1)²,
 Q queries, C codes. World units are metres where known; camera axes are OpenCV's (x right, y down, z forward);
-pixel centres lie at .5; quaternions are wxyz; depth is z. Values are physical: scales are standard deviations and
+pixel centers lie at .5; quaternions are wxyz; depth is z. Values are physical: scales are standard deviations and
 opacities are probabilities, never logarithms or logits.
 """
 
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Integer, UInt8
 from gsencoder.core.errors import InputError
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
-"""A colour is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction."""
+"""A color is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction."""
 
 UNIT_TOLERANCE = 1e-3
 """How far from 1 the norm of a quaternion, and from 0 an entry of RᵀR − I, may be."""
@@ -63,11 +63,11 @@ class Gaussians:
     """A splat in physical values.
 
     Attributes:
-        means: centres, in world units relative to the scene's origin.
+        means: centers, in world units relative to the scene's origin.
         quats: unit rotations wxyz, world_from_gaussian.
         scales: standard deviations along the Gaussian's own axes, > 0, world units.
         opacities: in [0, 1].
-        sh: spherical-harmonic colour coefficients, degree-major as in the INRIA files; K = 1, 4, 9 or 16.
+        sh: spherical-harmonic color coefficients, degree-major as in the INRIA files; K = 1, 4, 9 or 16.
     """
 
     means: Float32[np.ndarray, "N 3"]
@@ -120,7 +120,7 @@ class Cameras:
 
     Attributes:
         cam_from_world: rigid transforms into OpenCV camera axes; world is relative to the scene's origin.
-        Ks: intrinsics in pixels, pixel centres at .5.
+        Ks: intrinsics in pixels, pixel centers at .5.
         widths: image widths in pixels.
         heights: image heights in pixels.
     """
@@ -156,7 +156,7 @@ class Cameras:
 
     @property
     def centers(self) -> Float64[np.ndarray, "V 3"]:
-        """Camera centres in the world, −Rᵀt."""
+        """Camera centers in the world, −Rᵀt."""
         pose = self.cam_from_world.astype(np.float64)
         return -np.einsum("vji,vj->vi", pose[:, :3, :3], pose[:, :3, 3])
 
@@ -231,7 +231,7 @@ class FeatureSpace:
         teacher: the teacher's kind ("labels", "onnx", …).
         weights: what the teacher was loaded from: a fingerprint, never a path.
         layer: which output of the teacher.
-        preprocessing: resize, crop and normalisation, in words.
+        preprocessing: resize, crop and normalization, in words.
         text_encoder: what turns words into this space; empty if nothing does.
     """
 
@@ -264,7 +264,7 @@ class FeatureMap:
         features: one vector for each cell of the grid; None where the map is coded.
         codes: for each cell a row of `table`, −1 = no feature here; None where the map is dense.
         table: the vectors that codes stand for.
-        grid_from_image: affine from image pixels to grid cells, both with centres at .5: the teacher's resize and
+        grid_from_image: affine from image pixels to grid cells, both with centers at .5: the teacher's resize and
             crop. Diagonal: grid = (ax·x + bx, ay·y + by).
         space: what the vectors are.
     """
@@ -339,7 +339,7 @@ class GaussianFeatures:
     Attributes:
         features: vectors, or coordinates in `basis`; rows with weight 0 are zero and mean nothing.
         weights: how much each row was seen, in summed blending weight (pixels); 0 = never.
-        mean: the space's mean, which centred cosines remove; it equals `basis.mean` where there is a basis.
+        mean: the space's mean, which centerd cosines remove; it equals `basis.mean` where there is a basis.
         space: what the (decoded) vectors are.
         basis: what the coordinates stand for, or None where `features` holds the vectors themselves.
     """
@@ -378,7 +378,7 @@ class GaussianFeatures:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SceneObject:
-    """A labelled object, for evaluation. The box is in world coordinates, origin included.
+    """A labeled object, for evaluation. The box is in world coordinates, origin included.
 
     Attributes:
         id: its value in the instance maps.
@@ -422,8 +422,8 @@ class Scene:
         origin: float64 offset that was taken off every position; boxes add it back.
         metres_per_unit: None where the unit of length is unknown.
         up: unit vector in the world, or None where unknown.
-        objects: labelled objects, where the scene has them.
-        sfm_points: structure-from-motion points relative to `origin`, with uint8 colours beside them.
+        objects: labeled objects, where the scene has them.
+        sfm_points: structure-from-motion points relative to `origin`, with uint8 colors beside them.
         folder: that the scene was read from; None for one that was made.
     """
 

@@ -18,12 +18,12 @@ def world_from_cams(count: int, offset: tuple[float, float, float] = (0, 0, 0)) 
     poses = np.tile(np.eye(4), (count, 1, 1))
     for i in range(count):
         angle = 2 * math.pi * i / count
-        centre = np.array([math.cos(angle), math.sin(angle), 2.0])
-        forward = -centre / np.linalg.norm(centre)
+        center = np.array([math.cos(angle), math.sin(angle), 2.0])
+        forward = -center / np.linalg.norm(center)
         right = np.cross(forward, [0, 0, 1.0])
         right /= np.linalg.norm(right)
         poses[i, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-        poses[i, :3, 3] = centre + offset
+        poses[i, :3, 3] = center + offset
     return poses
 
 

@@ -128,7 +128,7 @@ def test_spherical_harmonics_are_orthonormal_on_the_sphere() -> None:
     )
 
 
-def test_colours_survive_the_round_trip_through_degree_zero() -> None:
+def test_colors_survive_the_round_trip_through_degree_zero() -> None:
     colors = torch.rand(30, 3, dtype=torch.float64)
     means = torch.randn(30, 3, dtype=torch.float64)
     torch.testing.assert_close(
@@ -136,12 +136,12 @@ def test_colours_survive_the_round_trip_through_degree_zero() -> None:
     )
 
 
-def test_a_gaussian_at_the_camera_centre_has_a_finite_colour() -> None:
+def test_a_gaussian_at_the_camera_center_has_a_finite_color() -> None:
     sh = torch.randn(1, 16, 3)
     assert torch.isfinite(colors_from_sh(sh, torch.zeros(1, 3), torch.zeros(3))).all()
 
 
-def test_a_colour_depends_on_the_direction_from_the_camera_and_not_on_the_distance() -> None:
+def test_a_color_depends_on_the_direction_from_the_camera_and_not_on_the_distance() -> None:
     rng = np.random.default_rng(0)
     sh, away, center = rng.normal(size=(20, 16, 3)), rng.normal(size=(20, 3)), np.array([3.0, -1.0, 2.0])
     basis = sh_basis(torch.from_numpy(away / np.linalg.norm(away, axis=1, keepdims=True)), 3).numpy()

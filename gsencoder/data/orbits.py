@@ -11,10 +11,10 @@ from gsencoder.types import Cameras, Gaussians
 COVERED = 0.95
 """The opacity-weighted share of the Gaussians that must fit into the picture, …"""
 FARTHEST_COVERED = 3.0
-"""… but none further than this many opacity-weighted median distances from the centre: those are floaters."""
+"""… but none further than this many opacity-weighted median distances from the center: those are floaters."""
 MARGIN = 1.1
 NEAREST = 0.05
-"""Cameras are never closer than this to the centre: renderers cut everything nearer than 0.01 off."""
+"""Cameras are never closer than this to the center: renderers cut everything nearer than 0.01 off."""
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
@@ -27,9 +27,9 @@ def orbit_cameras(
     fov_degrees: float = 60.0,
     up: Float64[np.ndarray, "3"] | None = None,
 ) -> Cameras:
-    """Cameras on a sphere around a splat, looking at its centre.
+    """Cameras on a sphere around a splat, looking at its center.
 
-    The centre is the opacity-weighted median of the means, coordinate by coordinate, and the radius 1.1 times the
+    The center is the opacity-weighted median of the means, coordinate by coordinate, and the radius 1.1 times the
     opacity-weighted 95 % quantile of the distance from it, at most 3.3 times its median, so that floaters move neither
     far (and at least 3 median standard deviations, for a single Gaussian). The distance is the one at which a ball of
     that radius fits into the smaller field of view. Directions follow a golden-angle spiral.
@@ -56,12 +56,12 @@ def orbit_cameras(
             f"orbit cameras: expected count, width, height of at least 1 and fov_degrees in [1, 170], "
             f"got {count}, {width}, {height}, {fov_degrees}"
         )
-    centre, radius = robust_ball(gaussians)
+    center, radius = robust_ball(gaussians)
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
     half_field = math.atan(min(width, height) / 2 / focal)
     distance = max(radius / math.sin(half_field), NEAREST)
     outward, vertical = spiral_directions(count, up)
-    return looking_cameras(centre + distance * outward, -outward, vertical, focal, width, height)
+    return looking_cameras(center + distance * outward, -outward, vertical, focal, width, height)
 
 
 def spiral_directions(
@@ -121,16 +121,16 @@ def looking_cameras(
 
 
 def robust_ball(gaussians: Gaussians) -> tuple[Float64[np.ndarray, "3"], float]:
-    """The opacity-weighted median centre, and the radius that `orbit_cameras` fits into its pictures."""
+    """The opacity-weighted median center, and the radius that `orbit_cameras` fits into its pictures."""
     means = gaussians.means.astype(np.float64)
     weights = gaussians.opacities.astype(np.float64)
     if not weights.sum() > 0:
         weights = np.ones(len(means))
-    centre = np.array([_weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
-    distances = np.linalg.norm(means - centre, axis=1)
+    center = np.array([_weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
+    distances = np.linalg.norm(means - center, axis=1)
     middle, far = (_weighted_quantile(distances, weights, share) for share in (0.5, COVERED))
     size = _weighted_quantile(gaussians.scales.max(axis=1).astype(np.float64), weights, 0.5)
-    return centre, max(MARGIN * min(far, FARTHEST_COVERED * middle), 3 * size)
+    return center, max(MARGIN * min(far, FARTHEST_COVERED * middle), 3 * size)
 
 
 def _weighted_quantile(values: Float64[np.ndarray, " N"], weights: Float64[np.ndarray, " N"], share: float) -> float:

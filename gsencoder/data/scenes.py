@@ -71,11 +71,11 @@ class SceneConfig:
 def load_scene(path: str | Path, *, splat: str | Path | None = None, options: SceneConfig = SceneConfig()) -> Scene:
     """Reads a scene; pictures are opened for their size now and decoded when they are asked for.
 
-    Recognised, in this order: a transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender), a COLMAP
+    Recognized, in this order: a transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender), a COLMAP
     model (sparse/0, sparse, or its files themselves, with images/ beside), a ScanNet export (color/, pose/, …), a
     splat file, or a folder with one splat file or an unpacked .sog.
 
-    Cameras and Gaussians are relative to `Scene.origin`: the mean of the camera centres (for a bare splat the median
+    Cameras and Gaussians are relative to `Scene.origin`: the mean of the camera centers (for a bare splat the median
     of its means), each coordinate rounded to a multiple of 1000 units. It is taken off in float64.
 
     Args:
@@ -89,7 +89,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         transparency, or pinhole pixels that the distorted picture does not cover.
 
     Raises:
-        InputError: nothing recognised, no view left, or anything in the files that cannot be used.
+        InputError: nothing recognized, no view left, or anything in the files that cannot be used.
     """
     given = Path(path)
     try:

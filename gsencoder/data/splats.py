@@ -57,7 +57,7 @@ def load_splat(path: str | Path, *, origin: Float64[np.ndarray, "3"] | None = No
             they rounded away is lost (0.06 at 10⁶), and no origin brings it back.
 
     Returns:
-        Gaussians relative to `origin`, in the axes and units of the file. Quaternions are normalised (INRIA files
+        Gaussians relative to `origin`, in the axes and units of the file. Quaternions are normalized (INRIA files
         keep them at any length); nothing else is changed.
 
     Raises:
@@ -186,7 +186,7 @@ def save_splat(
 
     Precision of a round trip:
         .ply: means exact, quaternions 1e-6, scales 1e-5 relative, opacities 1e-6 (0 and 1 become logits of ±20).
-        .compressed.ply: means and log-scales half of a 1023rd of their range in a chunk, opacities ±1/510, colours
+        .compressed.ply: means and log-scales half of a 1023rd of their range in a chunk, opacities ±1/510, colors
             half of a 255th of their range in a chunk, other SH ±1/64 in ±4, quaternion components 7e-4 (the left-out
             one 2e-3).
         .spz: see `gsencoder.data.splat_formats.spz.write_spz`.

@@ -60,7 +60,7 @@ class BudgetConfig:
     """What may be spent; the cheapest setting that keeps to all of it is named."""
 
     seconds: float | None = field(default=None, metadata={"help": "for fusing one scene, without the teacher"})
-    error: float | None = field(default=None, metadata={"help": "centred cosine error against the reference"})
+    error: float | None = field(default=None, metadata={"help": "centerd cosine error against the reference"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,8 +73,8 @@ class Trade:
         seconds: a scene, median over rounds, mean over scenes.
         mib: growth of the process's peak memory, the largest over scenes.
         rank: columns of the features, mean over scenes.
-        error: 1 − centred cosine to the reference over what it saw, mean over scenes; what was missed counts as 1.
-        raw_error: the same without centring, over what both saw.
+        error: 1 − centerd cosine to the reference over what it saw, mean over scenes; what was missed counts as 1.
+        raw_error: the same without centering, over what both saw.
         covered: share of what the reference saw that this saw too.
         hits: objects asked for; empty where the teacher has no words or the scenes no objects.
         on_front: whether no other setting is both as fast and as exact.
@@ -136,7 +136,7 @@ def trade_off(
 
     Args:
         paths: scenes.
-        teacher: what is fused; with words and labelled objects there are accuracies too.
+        teacher: what is fused; with words and labeled objects there are accuracies too.
         sweep: the values of the knobs.
         base: the defaults that the knobs leave.
         protocol: which objects are asked for.

@@ -11,7 +11,7 @@ LEAST_ERROR = 1e-7
 
 
 def plot_trades(trades: Sequence[Trade]) -> bytes:
-    """A PNG: one colour a knob, the settings on the Pareto front ringed, each point with its value beside it."""
+    """A PNG: one color a knob, the settings on the Pareto front ringed, each point with its value beside it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -46,7 +46,7 @@ def plot_trades(trades: Sequence[Trade]) -> bytes:
         axes.set_axisbelow(True)
         if place == 0:
             axes.set_yscale("log")
-            axes.set_ylabel("1 − centred cosine to the reference")
+            axes.set_ylabel("1 − centerd cosine to the reference")
             axes.set_title("error (ringed: on the Pareto front)")
             axes.legend(fontsize=8)
         else:

@@ -38,7 +38,7 @@ class KindAccuracy:
         total: for each row, Gaussians that have this target.
         cosine_named: mean cosine of predicted and fused features, about the space's mean, over named Gaussians: those
             whose target is at least half a typical distance from it.
-        sheet: for the first scenes one view in colour, its fused and its predicted features; None where not asked for.
+        sheet: for the first scenes one view in color, its fused and its predicted features; None where not asked for.
     """
 
     right: Float64[np.ndarray, " C"]
@@ -136,12 +136,12 @@ def view_pictures(
     targets: Float32[np.ndarray, "n channels"],
     predicted: Float32[np.ndarray, "n channels"],
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
-    """The middle view of a scene: its colours, its targets, and what was predicted, in the same false colours."""
+    """The middle view of a scene: its colors, its targets, and what was predicted, in the same false colors."""
     gaussians = scene.gaussians(rows)
     view = len(scene.cameras) // 2
     b = blend(gaussians, scene.cameras, view)
     colors = fit_pca_colors(targets)
-    # Rendering is linear: three columns are rendered, not all channels, and colours are read off them as they are.
+    # Rendering is linear: three columns are rendered, not all channels, and colors are read off them as they are.
     plain = replace(colors, mean=np.zeros(3), axes=np.eye(3))
     found = [render_image(gaussians, scene.cameras, view, blended=b)]
     for features in (targets, predicted):

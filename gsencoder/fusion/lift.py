@@ -93,7 +93,7 @@ def view_matrix(
     visibility: VisibilityConfig,
     config: BlendConfig,
 ) -> Blend:
-    """The matrix that a view's map is lifted with: B of its cells, or one entry for each visible centre.
+    """The matrix that a view's map is lifted with: B of its cells, or one entry for each visible center.
 
     Args:
         gaussians: the splat.
@@ -152,7 +152,7 @@ def center_matrix(
     visibility: VisibilityConfig,
     config: BlendConfig,
 ) -> Blend:
-    """The paper's lift as a matrix: one entry of weight 1 for each visible centre, in the cell that it falls into."""
+    """The paper's lift as a matrix: one entry of weight 1 for each visible center, in the cell that it falls into."""
     cameras = views.cameras
     pose, K = torch.from_numpy(cameras.cam_from_world[view]), cameras.Ks[view]
     points = transform(pose, torch.from_numpy(gaussians.means)).numpy()

@@ -36,7 +36,7 @@ class VisibilityConfig:
 
 
 def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConfig:
-    """The same with "auto" replaced: sensor depth where there is one; else rendered depth for centres, which see
+    """The same with "auto" replaced: sensor depth where there is one; else rendered depth for centers, which see
     through walls without a test, and none for B, whose weights are what is left behind other Gaussians.
 
     Raises:
@@ -72,7 +72,7 @@ def visible_points(
     depth: Float32[np.ndarray, "H W"],
     config: VisibilityConfig,
 ) -> Bool[np.ndarray, " n"]:
-    """Tests Gaussians' centres at their own pixel (x, y), which must lie inside the map."""
+    """Tests Gaussians' centers at their own pixel (x, y), which must lie inside the map."""
     d = depth[pixels[:, 1], pixels[:, 0]]
     least, most = _interval(d, d, config)
     return (z >= least) & (z <= most)

@@ -42,14 +42,14 @@ def embed(
 ) -> Float[Tensor, "N C"]:
     """Input channels, each of order one.
 
-    offset: where in its voxel the centre lies, −1 to 1. color: the degree-0 colour, black −1, white 1, clipped at ±2.
+    offset: where in its voxel the center lies, −1 to 1. color: the degree-0 color, black −1, white 1, clipped at ±2.
     opacity: −1 to 1. scale: log standard deviations over the voxel's edge, largest first, a quarter of them. rotation:
     the six entries of R diag(log s − mean log s) Rᵀ, a quarter of them, the off-diagonal ones times √2, so that a
     distance between inputs is one between matrices.
 
     Args:
         means: world units.
-        quats: wxyz; normalised here.
+        quats: wxyz; normalized here.
         scales: standard deviations > 0, world units.
         opacities: in [0, 1].
         sh_dc: degree-0 spherical-harmonic coefficients.

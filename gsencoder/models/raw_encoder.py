@@ -1,4 +1,4 @@
-"""The encoder from raw Gaussians on, grid, curves, patches and neighbours included, in operators that ONNX has.
+"""The encoder from raw Gaussians on, grid, curves, patches and neighbors included, in operators that ONNX has.
 
 What `plan.plan_cloud` and `plan.join_plans` work out for a cloud is worked out here again, for one cloud whose size is
 known only when it comes: without searches for duplicates, segments or sizes that Python has to see.
@@ -61,8 +61,8 @@ class RawEncoder(nn.Module):
         """Features of a cloud of one Gaussian or more: coordinates in the basis, or vectors of the space.
 
         Args:
-            means: centres, world units.
-            quats: wxyz; normalised here.
+            means: centers, world units.
+            quats: wxyz; normalized here.
             scales: standard deviations > 0, world units.
             opacities: in [0, 1].
             sh_dc: degree-0 spherical-harmonic coefficients.

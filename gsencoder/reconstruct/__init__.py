@@ -1,4 +1,4 @@
-"""Photographs to Gaussians: start from points, optimise, prune, never grow (SplatDistill, section 3.1)."""
+"""Photographs to Gaussians: start from points, optimize, prune, never grow (SplatDistill, section 3.1)."""
 
 from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
 

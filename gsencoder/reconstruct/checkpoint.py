@@ -74,7 +74,7 @@ def load_state(
         path: the file.
         settings: of this run.
         steps: that this run takes.
-        sh_degree: of its colours.
+        sh_degree: of its colors.
         device: where it computes.
 
     Raises:

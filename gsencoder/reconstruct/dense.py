@@ -2,7 +2,7 @@
 
 Two sources, both judged by what other photographs show. Textured pixels get the depth of a plane sweep (stereo.py), if
 two other views find a surface at the same place. Pixels between those are given depths interpolated between their
-neighbours', and kept if their colours agree in two other views and no other view sees through them.
+neighbors', and kept if their colors agree in two other views and no other view sees through them.
 """
 
 import math
@@ -25,7 +25,7 @@ from gsencoder.reconstruct.stereo import (
     finds,
     in_image,
     look_up,
-    neighbours_of,
+    neighbors_of,
     sees_through,
     sweep,
     to_grid,
@@ -58,7 +58,7 @@ class DenseConfig:
     alike: float = field(default=0.6, metadata={"help": "correlation from which windows count as the same, −1 to 1"})
     agree: float = field(default=0.02, metadata={"help": "relative difference of depths that agree"})
     color: float = field(
-        default=0.06, metadata={"help": "difference of colours (of 1) up to which interpolated points are kept"}
+        default=0.06, metadata={"help": "difference of colors (of 1) up to which interpolated points are kept"}
     )
 
     def __post_init__(self) -> None:
@@ -137,7 +137,7 @@ def densify(
     before = coverage(cameras, training, points)
     if before >= config.enough:
         return None
-    neighbours = neighbours_of(cameras, points, training, config.sources)
+    neighbors = neighbors_of(cameras, points, training, config.sources)
     shots, poses = {}, {}
     for view in training:
         longest = max(int(cameras.widths[view]), int(cameras.heights[view]))
@@ -145,14 +145,14 @@ def densify(
         poses[view] = torch.from_numpy(cameras.cam_from_world[view].copy())
     maps: dict[int, DepthMap] = {}
     for view in track(training, "sweeping planes"):
-        limits, others = depth_range(cameras, view, points), neighbours[view]
+        limits, others = depth_range(cameras, view, points), neighbors[view]
         if limits is not None and len(others) >= 2:
             found = sweep(shots[view], poses[view], [shots[o] for o in others], [poses[o] for o in others], *limits)
             maps[view] = found._replace(depth=torch.where(found.score >= config.alike, found.depth, 0))
-    agreed = _agreed(maps, shots, poses, neighbours, config)
+    agreed = _agreed(maps, shots, poses, neighbors, config)
     swept = _points_of(agreed, shots, poses)
     seen = _fill_depths(agreed, shots, poses, points)
-    filled = _points_of(_gaps(seen, agreed, shots, poses, neighbours, config), shots, poses)
+    filled = _points_of(_gaps(seen, agreed, shots, poses, neighbors, config), shots, poses)
     voxel = config.spacing * _pixel_size(cameras, agreed)
     swept = carve(*thin(*swept, voxel, config.samples), agreed, shots, poses, config.agree)
     filled = thin(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
@@ -205,7 +205,7 @@ def thin(
     *,
     beside: Float32[np.ndarray, "Q 3"] | None = None,
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Means of the points and colours of each voxel with at least so many samples; none where `beside` has points."""
+    """Means of the points and colors of each voxel with at least so many samples; none where `beside` has points."""
     cells = np.floor(points.astype(np.float64) / voxel).astype(np.int64)
     taken = np.floor(np.empty((0, 3)) if beside is None else beside.astype(np.float64) / voxel).astype(np.int64)
     found, inverse, counts = np.unique(np.concatenate((cells, taken)), axis=0, return_inverse=True, return_counts=True)
@@ -222,13 +222,13 @@ def _agreed(
     maps: Mapping[int, DepthMap],
     shots: Mapping[int, Shot],
     poses: Mapping[int, Tensor],
-    neighbours: Mapping[int, Sequence[int]],
+    neighbors: Mapping[int, Sequence[int]],
     config: DenseConfig,
 ) -> dict[int, Float[Tensor, "h w"]]:
     """Depths at which two other views find a surface, too."""
     kept = {}
     for view, found in maps.items():
-        others = [(maps[other], shots[other], poses[other]) for other in neighbours[view] if other in maps]
+        others = [(maps[other], shots[other], poses[other]) for other in neighbors[view] if other in maps]
         votes = agreeing(found.depth, shots[view], poses[view], others, config.agree)
         kept[view] = torch.where(votes >= 2, found.depth, 0)
     return kept
@@ -252,7 +252,7 @@ def _fill_depths(
     poses: Mapping[int, Tensor],
     points: Float32[np.ndarray, "P 3"],
 ) -> dict[int, Float[Tensor, "h w"]]:
-    """Depth at every pixel of every view: its own, else that of other views' points, else between its neighbours'."""
+    """Depth at every pixel of every view: its own, else that of other views' points, else between its neighbors'."""
     cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(_points_of(agreed, shots, poses)[0])))
     return {
         view: interpolate(torch.where(depth > 0, depth, splat_depths(cloud, shots[view], poses[view])))
@@ -295,7 +295,7 @@ def _gaps(
     agreed: Mapping[int, Float[Tensor, "h w"]],
     shots: Mapping[int, Shot],
     poses: Mapping[int, Tensor],
-    neighbours: Mapping[int, Sequence[int]],
+    neighbors: Mapping[int, Sequence[int]],
     config: DenseConfig,
 ) -> dict[int, Float[Tensor, "h w"]]:
     """Interpolated depths that other photographs do not speak against."""
@@ -310,7 +310,7 @@ def _gaps(
         tints = smooth[view].permute(1, 2, 0)[candidates]
         votes = torch.zeros(len(where), dtype=torch.int64)
         against = torch.zeros(len(where), dtype=torch.bool)
-        for other in neighbours[view]:
+        for other in neighbors[view]:
             if other not in seen:
                 continue
             grid, inside = to_grid(transform(poses[other], where), shots[other])

@@ -36,7 +36,7 @@ class OptimizeConfig:
     """How long, how fast and against what a splat is fitted."""
 
     steps: int = field(default=1500, metadata={"help": "photographs looked at, one a step"})
-    sh_degree: int = field(default=2, metadata={"help": "how colours may depend on the direction, 0 to 3"})
+    sh_degree: int = field(default=2, metadata={"help": "how colors may depend on the direction, 0 to 3"})
     sh_every: float = field(default=0.2, metadata={"help": "share of the steps after which the degree rises by one"})
     shrinks: tuple[int, ...] = field(
         default=(2, 1), metadata={"help": "photographs are made smaller so many times, one stage after the other"}
@@ -60,7 +60,7 @@ class OptimizeConfig:
     scales_rate: float = field(default=2e-2, metadata={"help": "learning rate of the logarithms of scales"})
     quats_rate: float = field(default=1e-3, metadata={"help": "learning rate of rotations"})
     opacities_rate: float = field(default=5e-2, metadata={"help": "learning rate of the logits of opacities"})
-    colors_rate: float = field(default=2.5e-3, metadata={"help": "learning rate of colours; a 20th for directions"})
+    colors_rate: float = field(default=2.5e-3, metadata={"help": "learning rate of colors; a 20th for directions"})
     seed: int = field(default=0, metadata={"help": "of the order in which photographs are looked at"})
 
     def __post_init__(self) -> None:
@@ -92,7 +92,7 @@ class OptimizeConfig:
         return self.shrinks[min(int(np.searchsorted(ends, step, side="right")), len(self.shrinks) - 1)]
 
     def degree_at(self, step: int) -> int:
-        """Degree of the colour coefficients that a step uses."""
+        """Degree of the color coefficients that a step uses."""
         return min(self.sh_degree, int(step / max(1.0, self.sh_every * self.steps)))
 
     def rates_at(self, step: int, extent: float) -> dict[str, float]:

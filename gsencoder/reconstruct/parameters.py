@@ -1,4 +1,4 @@
-"""What the optimiser moves: a splat in unbounded numbers (logarithms of scales, logits of opacities)."""
+"""What the optimizer moves: a splat in unbounded numbers (logarithms of scales, logits of opacities)."""
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
 
 
 def parameters_from(gaussians: Gaussians, sh_degree: int, device: torch.device | str = "cpu") -> Parameters:
-    """The parameters of a splat; colour coefficients above those that it has begin at zero, more are cut."""
+    """The parameters of a splat; color coefficients above those that it has begin at zero, more are cut."""
     n, wanted = len(gaussians), (sh_degree + 1) ** 2
     sh = np.zeros((n, wanted, 3), np.float32)
     kept = min(wanted, gaussians.sh.shape[1])
@@ -61,7 +61,7 @@ def gaussians_of(raw: Parameters) -> Gaussians:
 
 
 def seen_colors(raw: Parameters, degree: int, camera_center: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
-    """Colours from a camera with coefficients up to `degree`."""
+    """Colors from a camera with coefficients up to `degree`."""
     sh = torch.cat((raw["sh0"], raw["shN"][:, : (degree + 1) ** 2 - 1]), dim=1) if degree else raw["sh0"]
     return colors_from_sh(sh, raw["means"], camera_center)
 
@@ -93,6 +93,6 @@ def rows_in_view(
 
 
 def camera_of(cameras: Cameras, view: int, device: torch.device | str) -> tuple[Tensor, Tensor]:
-    """cam_from_world and centre of a camera as float32 tensors; its K depends on how small the photograph is."""
+    """cam_from_world and center of a camera as float32 tensors; its K depends on how small the photograph is."""
     center = torch.from_numpy(cameras.centers[view]).float()
     return torch.from_numpy(cameras.cam_from_world[view].copy()).to(device), center.to(device)

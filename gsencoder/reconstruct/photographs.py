@@ -84,7 +84,7 @@ class Photographs:
     def shot(self, view: int, shrink: int = 1) -> Shot:
         """A view; each of its pixels stands for `shrink` × `shrink` of the photograph's.
 
-        Colours are averaged. A pixel is looked at if all it covers is, and its depth is known if all it covers
+        Colors are averaged. A pixel is looked at if all it covers is, and its depth is known if all it covers
         differ by less than 5 %. Lines and columns that do not fill a pixel are left out.
         """
         image = self._images[view].float() / 255

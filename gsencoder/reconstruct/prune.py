@@ -46,8 +46,8 @@ def rows_to_keep(
 ) -> Int64[Tensor, " n"]:
     """Rows that are opaque enough, of sane size on every screen, and seen somewhere.
 
-    A splat's contribution to a view is its column sum of B. Rendering is linear in the colours, so that is the
-    gradient of the sum of a picture in which every colour is 1.
+    A splat's contribution to a view is its column sum of B. Rendering is linear in the colors, so that is the
+    gradient of the sum of a picture in which every color is 1.
 
     Args:
         raw: parameters.

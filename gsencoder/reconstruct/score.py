@@ -115,7 +115,7 @@ def _pose(photographs: Photographs, view: int) -> Float[Tensor, "4 4"]:
 
 @torch.no_grad()
 def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Tensor, "H W"]] = {}) -> Score:
-    """How well an optimiser's splat shows some views.
+    """How well an optimizer's splat shows some views.
 
     Args:
         optimizer: as it is now.

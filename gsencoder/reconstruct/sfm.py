@@ -34,7 +34,7 @@ class SfmConfig:
     pairs: Literal["auto", "exhaustive", "sequential"] = field(
         default="auto",
         metadata={
-            "help": "which photographs are compared: all pairs, or neighbours by name; auto = all pairs up to "
+            "help": "which photographs are compared: all pairs, or neighbors by name; auto = all pairs up to "
             f"{MOST_EXHAUSTIVE} photographs"
         },
     )
@@ -245,7 +245,7 @@ def _match(pycolmap: Any, database: Path, count: int, config: SfmConfig) -> None
     if every:
         pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
         return
-    # Neighbours by name, and those 2, 4, 8, … places away.
+    # Neighbors by name, and those 2, 4, 8, … places away.
     pairing = pycolmap.SequentialPairingOptions()
     pairing.overlap = max(10, math.ceil(math.log2(count)))
     pairing.quadratic_overlap = True

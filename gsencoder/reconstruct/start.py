@@ -22,7 +22,7 @@ class Start:
     """The first Gaussians.
 
     Attributes:
-        gaussians: to be optimised.
+        gaussians: to be optimized.
         source: splat, depth, points, mesh or tsdf.
         dense: what was added to structure-from-motion points; None where nothing was.
     """

@@ -1,4 +1,4 @@
-"""Depth along the rays of textured pixels: plane sweeps between neighbouring photographs (Collins 1996).
+"""Depth along the rays of textured pixels: plane sweeps between neighboring photographs (Collins 1996).
 
 For every pixel of a reference view, planes z = d of many depths carry it into a few other views; the depth at which
 small windows look most alike there is kept, if they look alike enough.
@@ -19,10 +19,10 @@ from gsencoder.types import Cameras
 WINDOW = 5
 """Side of the windows that are compared, in pixels of the small pictures."""
 PLANE_STEP = 0.7
-"""Neighbouring planes move a pixel by so many pixels in the view where it moves most."""
+"""Neighboring planes move a pixel by so many pixels in the view where it moves most."""
 MOST_PLANES = 128
 LEAST_CONTRAST = 0.01
-"""Windows whose colours deviate less (of 1) say nothing."""
+"""Windows whose colors deviate less (of 1) say nothing."""
 BEST_ANGLE = np.deg2rad(8.0)
 """Views whose rays meet at about this angle are compared: further ones look different, nearer ones measure little."""
 
@@ -32,8 +32,8 @@ class DepthMap(NamedTuple):
 
     Attributes:
         depth: z in world units; 0 = not found.
-        score: mean zero-mean normalised cross-correlation with the two most alike views, −1 to 1.
-        step: relative distance of neighbouring planes at each pixel's depth.
+        score: mean zero-mean normalized cross-correlation with the two most alike views, −1 to 1.
+        step: relative distance of neighboring planes at each pixel's depth.
     """
 
     depth: Float[Tensor, "h w"]
@@ -41,7 +41,7 @@ class DepthMap(NamedTuple):
     step: Float[Tensor, "h w"]
 
 
-def neighbours_of(
+def neighbors_of(
     cameras: Cameras, points: Float32[np.ndarray, "P 3"], chosen: Sequence[int], count: int
 ) -> dict[int, list[int]]:
     """For each of the chosen views the others to compare it with: those that share many points at a good angle.
@@ -93,7 +93,7 @@ def _relative(reference: Float[Tensor, "4 4"], source: Float[Tensor, "4 4"]) -> 
 
 
 def _pixel_rays(shot: Shot) -> Float[Tensor, "h w 3"]:
-    """Directions of z = 1 through the pixel centres."""
+    """Directions of z = 1 through the pixel centers."""
     v, u = torch.meshgrid(torch.arange(shot.height) + 0.5, torch.arange(shot.width) + 0.5, indexing="ij")
     K = shot.K
     return torch.stack(((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)), dim=-1).float()
@@ -150,7 +150,7 @@ def sweep(
     )
     best = scores.topk(min(2, len(sources)), dim=0).values.mean(dim=0)
     score, plane = best.max(dim=0)
-    # A parabola through the best plane and its neighbours, in 1/depth, where planes are evenly spaced.
+    # A parabola through the best plane and its neighbors, in 1/depth, where planes are evenly spaced.
     inner = plane.clamp(1, len(depths) - 2)
     left, middle, right = (best.gather(0, (inner + shift)[None])[0] for shift in (-1, 0, 1))
     bend = left - 2 * middle + right
@@ -185,7 +185,7 @@ def window_mean(maps: Float[Tensor, "n c h w"], side: int = WINDOW) -> Float[Ten
 def _alike(
     reference: _Windows, rays: Tensor, rotation: Tensor, translation: Tensor, source: Shot, depths: Tensor
 ) -> Float[Tensor, "D h w"]:
-    """Zero-mean normalised cross-correlation of each pixel's window with where each plane carries it."""
+    """Zero-mean normalized cross-correlation of each pixel's window with where each plane carries it."""
     turned = rays @ rotation.T
     points = depths[:, None, None, None] * turned + translation
     grid, inside = to_grid(points, source)

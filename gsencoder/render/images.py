@@ -1,4 +1,4 @@
-"""Pictures of a splat: colours through SH, composited by the same Blend that everything else uses."""
+"""Pictures of a splat: colors through SH, composited by the same Blend that everything else uses."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from gsencoder.types import Cameras, Gaussians
 
 
 def view_colors(gaussians: Gaussians, cameras: Cameras, view: int) -> Float[torch.Tensor, "N 3"]:
-    """Colours of all Gaussians as this camera sees them, in [0, ∞)."""
+    """Colors of all Gaussians as this camera sees them, in [0, ∞)."""
     sh, means = torch.as_tensor(gaussians.sh), torch.as_tensor(gaussians.means)
     if gaussians.sh_degree == 0:
         # Degree 0 does not depend on the direction; one direction for all saves the rest.
@@ -30,7 +30,7 @@ def render_image(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     config: BlendConfig = BlendConfig(),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """One view in colour.
+    """One view in color.
 
     Args:
         gaussians: the splat.

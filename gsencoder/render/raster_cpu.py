@@ -20,7 +20,7 @@ from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 
 TILE = 16
 CHANNELS = 5
-"""What is composited of each Gaussian: three colours, depth, and 1 (whose sum is alpha)."""
+"""What is composited of each Gaussian: three colors, depth, and 1 (whose sum is alpha)."""
 SPLAT = 9
 """Columns of a splat on the image plane: u, v, half width, half height, conic a, b, c, squared radius, opacity."""
 PARTIAL = 10
@@ -92,7 +92,7 @@ def bin_splats(splats: Float[np.ndarray, "M 9"], depths: Float[np.ndarray, " M"]
 @kernel
 @no_type_check
 def _row_span(a, b, c, u, dv, limit, last):
-    """First and last pixel of a row `dv` below a centre at `u` that lie in the ellipse; first > last if none does."""
+    """First and last pixel of a row `dv` below a center at `u` that lie in the ellipse; first > last if none does."""
     root = b * b * dv * dv - a * (c * dv * dv - limit)
     if not root >= 0:
         return 0, -1

@@ -1,4 +1,4 @@
-"""gsplat as the differentiable rasteriser on CUDA."""
+"""gsplat as the differentiable rasterizer on CUDA."""
 
 from typing import TYPE_CHECKING
 

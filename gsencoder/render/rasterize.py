@@ -45,10 +45,10 @@ class Raster(NamedTuple):
     """One view of N Gaussians.
 
     Attributes:
-        rgb: Σ w·colour, without a background.
+        rgb: Σ w·color, without a background.
         alpha: Σ w.
         depth: Σ w·z in world units; divide by alpha for the expected depth.
-        means2d: where the centres lie, in pixels; its gradient is what screen-space rules look at.
+        means2d: where the centers lie, in pixels; its gradient is what screen-space rules look at.
         radii: half the larger side of each Gaussian's box on the screen in pixels, 0 where it is not in view.
     """
 
@@ -75,8 +75,8 @@ def rasterize(
     """One view, differentiable in everything but the camera.
 
     Args:
-        means: centres, world units.
-        quats: rotations wxyz, normalised here.
+        means: centers, world units.
+        quats: rotations wxyz, normalized here.
         scales: standard deviations, world units.
         opacities: in [0, 1].
         colors: as seen from this camera.

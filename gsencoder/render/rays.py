@@ -1,7 +1,7 @@
 """Where the rays of a blend pierce the image: a regular lattice, grouped into rows of B.
 
-Pixel rows are the lattice of pixel centres with one ray a row. Patch rows put `side × side` rays into each cell of a
-coarser grid (a teacher's patch grid, seen through its resize and crop), at the centres of equal sub-cells: a fixed
+Pixel rows are the lattice of pixel centers with one ray a row. Patch rows put `side × side` rays into each cell of a
+coarser grid (a teacher's patch grid, seen through its resize and crop), at the centers of equal sub-cells: a fixed
 stratified pattern, so that the same scene gives the same numbers on every run.
 """
 
@@ -44,7 +44,7 @@ class Lattice:
 
 
 def pixel_lattice(width: int, height: int) -> Lattice:
-    """One ray through each pixel centre."""
+    """One ray through each pixel center."""
     return Lattice(height=height, width=width, side=1, x0=0.5, y0=0.5, dx=1.0, dy=1.0)
 
 

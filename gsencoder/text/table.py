@@ -26,7 +26,7 @@ LONGEST_NAME = 1000
 """Characters of a name: longer than any word or caption, and short enough to compare with each other."""
 
 
-def normalise(word: str) -> str:
+def normalize(word: str) -> str:
     """A word as the table compares it: NFKC, lower case, one blank where there were blanks, `_` or `-`, no article."""
     text = " ".join(re.split(r"[\s_\-]+", unicodedata.normalize("NFKC", word).casefold())).strip()
     return re.sub(r"^(?:a|an|the) (?=.)", "", text)
@@ -53,11 +53,11 @@ class TextTable:
     """A closed vocabulary: names and their embeddings.
 
     Attributes:
-        names: the words, unique after `normalise`.
+        names: the words, unique after `normalize`.
         embeddings: one unit vector a name.
         space: what the vectors are; `text_encoder` names the encoder that made them.
         mean: the mean of the embeddings. Text and image features of a joint model have different means, so each side
-            is centred by its own.
+            is centerd by its own.
     """
 
     names: tuple[str, ...]
@@ -89,7 +89,7 @@ class TextTable:
                 first = f"{self.names[bad[0]][:LONGEST_SHOWN]!r} has norm {norms[bad[0]]:.4g}"
             raise InputError(f"TextTable: expected finite unit vectors, {first} ({bad.size} bad of {len(norms)} rows)")
         for row, name in enumerate(self.names):
-            key = normalise(name)
+            key = normalize(name)
             if not key or key in self._row_of:
                 wrong = "repeated" if key else "empty"
                 raise InputError(f"TextTable: name {name[:LONGEST_SHOWN]!r} in row {row} is {wrong}")
@@ -100,12 +100,12 @@ class TextTable:
 
     def find(self, word: str) -> int | None:
         """The row that a word means (itself, else its singular or plural), or None."""
-        key = normalise(word)
+        key = normalize(word)
         return next((self._row_of[form] for form in (key, *_other_numbers(key)) if form in self._row_of), None)
 
     def near(self, word: str, count: int = 6) -> tuple[str, ...]:
         """Names that a user may have meant: names that share a word with it first, then those spelt alike."""
-        row_of, key = self._row_of, normalise(word)
+        row_of, key = self._row_of, normalize(word)
         tokens = {form for token in key.split() for form in (token, *_other_numbers(token))}
         sharing = [name for name in row_of if tokens & set(name.split())]
         sharing.sort(key=lambda name: (-difflib.SequenceMatcher(None, key, name).ratio(), name))
@@ -136,7 +136,7 @@ def _did_you_mean(names: Sequence[str]) -> str:
 def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) -> TextTable:
     """A table from names and their unit vectors of any float type; `encoder` names what made them.
 
-    Rows are normalised in float32, which undoes the rounding of a float16 file.
+    Rows are normalized in float32, which undoes the rounding of a float16 file.
 
     Raises:
         InputError: repeated or empty names, rows that are not finite unit vectors, sizes that differ.

@@ -23,13 +23,13 @@ class AugmentConfig:
     tilt: float = field(default=3.0, metadata={"help": "standard deviation of the tilt of up, degrees"})
     mirror: float = field(default=0.5, metadata={"help": "share of samples that are mirrored"})
     scale: float = field(default=0.1, metadata={"help": "largest change of size, as a share"})
-    jitter: float = field(default=0.1, metadata={"help": "standard deviation of each centre's shift, in voxels"})
+    jitter: float = field(default=0.1, metadata={"help": "standard deviation of each center's shift, in voxels"})
     drop: float = field(default=0.2, metadata={"help": "largest share of Gaussians that are left out"})
     light: float = field(default=0.2, metadata={"help": "largest change of brightness, as a share"})
     tint: float = field(
-        default=0.08, metadata={"help": "largest change of each colour channel, and of black, as a share"}
+        default=0.08, metadata={"help": "largest change of each color channel, and of black, as a share"}
     )
-    noise: float = field(default=0.02, metadata={"help": "standard deviation of each Gaussian's colour, white being 1"})
+    noise: float = field(default=0.02, metadata={"help": "standard deviation of each Gaussian's color, white being 1"})
 
     def __post_init__(self) -> None:
         for name in ("turn", "tilt", "jitter", "noise"):
@@ -91,7 +91,7 @@ def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float
     if np.abs(to_from @ to_from.T - np.eye(3)).max() > 1e-6 or not 0 < scale < math.inf:
         raise InputError("turn: expected an orthonormal matrix and a positive scale")
     mirrored = np.linalg.det(to_from) < 0
-    # A Gaussian looks the same mirrored through its centre, so −M turns its axes as M does, and is a rotation.
+    # A Gaussian looks the same mirrored through its center, so −M turns its axes as M does, and is a rotation.
     quat = _quat(-to_from if mirrored else to_from)
     return Gaussians(
         means=(gaussians.means.astype(np.float64) @ (scale * to_from.T)).astype(np.float32),
@@ -121,7 +121,7 @@ def _turn_sh(sh: Float32[np.ndarray, "N K 3"], to_from: np.ndarray) -> Float32[n
 def _relight(
     sh: Float32[np.ndarray, "N K 3"], rng: np.random.Generator, config: AugmentConfig
 ) -> Float32[np.ndarray, "N K 3"]:
-    """Brighter or darker, tinted, with noise; colours are ½ + SH_C0·dc, and all degrees are scaled alike."""
+    """Brighter or darker, tinted, with noise; colors are ½ + SH_C0·dc, and all degrees are scaled alike."""
     gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
     changed = sh * gain
     black = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
@@ -143,7 +143,7 @@ def _quat(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "4"]:
 
 
 def _multiply(left: Float64[np.ndarray, "4"], right: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
-    """Hamilton's product left · right, wxyz, normalised."""
+    """Hamilton's product left · right, wxyz, normalized."""
     w, x, y, z = left
     matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     product = right @ matrix.T

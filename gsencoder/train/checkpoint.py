@@ -1,4 +1,4 @@
-"""Where a training stands: parameters, optimiser and step in one safetensors file that appears whole or not at all.
+"""Where a training stands: parameters, optimizer and step in one safetensors file that appears whole or not at all.
 
 The schedule, the order of samples and everything random are functions of the seed and the step, so the step is all
 that has to be kept of them.
@@ -65,7 +65,7 @@ def save_checkpoint(
 def load_checkpoint(
     path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, settings: dict[str, Any]
 ) -> TrainingState:
-    """Puts model and optimiser where the checkpoint was made.
+    """Puts model and optimizer where the checkpoint was made.
 
     Raises:
         InputError: damaged, of another network, or of a run with other settings; the first that differs is named.

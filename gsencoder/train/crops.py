@@ -27,7 +27,7 @@ class SamplingConfig:
         default=4_000, metadata={"help": "crops are of sizes from this up to the most, in equal ratios; 0 = all of one"}
     )
     rare_centers: float = field(
-        default=0.8, metadata={"help": "share of crops whose centre is of any kind of target alike, not just anywhere"}
+        default=0.8, metadata={"help": "share of crops whose center is of any kind of target alike, not just anywhere"}
     )
 
     def __post_init__(self) -> None:
@@ -42,7 +42,7 @@ class SamplingConfig:
 
 
 def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras, *, near: float = 0.01) -> Bool[np.ndarray, " N"]:
-    """True for Gaussians whose centre lies in the image of at least one camera and beyond its near plane.
+    """True for Gaussians whose center lies in the image of at least one camera and beyond its near plane.
 
     Args:
         means: in the cameras' world.
@@ -96,13 +96,13 @@ def choose_part(
     """Target views, and the rows of the sample that is cut for them.
 
     Without a limit the views are drawn first, and everything in their frusta is taken, as in the paper. With one, the
-    centre of the crop is drawn first and the views are among those that look at it: views that look elsewhere would
+    center of the crop is drawn first and the views are among those that look at it: views that look elsewhere would
     show nothing of the sample.
 
     Args:
         means: of the whole scene.
         cameras: of all its views.
-        chances: of each Gaussian to be the centre of a crop; 0 = has no target, and never is.
+        chances: of each Gaussian to be the center of a crop; 0 = has no target, and never is.
         config: see there.
         size: most Gaussians (`crop_size`); 0 = all.
         rng: everything random comes from it.
@@ -134,7 +134,7 @@ def choose_part(
             rows = rows[in_frusta(means[rows], chosen)]
             if len(rows) < size:
                 rows = np.flatnonzero(in_frusta(means, chosen))
-            if not len(rows):  # Nobody looks at the centre, and these views see nothing: take whoever sees something.
+            if not len(rows):  # Nobody looks at the center, and these views see nothing: take whoever sees something.
                 views = rng.permutation(len(cameras))
                 rows = np.flatnonzero(in_frusta(means, cameras))
         rows = rows[nearest(means[rows], center, size)]
@@ -144,7 +144,7 @@ def choose_part(
 
 
 def _draw(chances: Float32[np.ndarray, " N"], config: SamplingConfig, rng: np.random.Generator) -> int:
-    """The centre of a crop."""
+    """The center of a crop."""
     each = chances.astype(np.float64)
     if rng.random() >= config.rare_centers:
         each = (each > 0).astype(np.float64)

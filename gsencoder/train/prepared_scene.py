@@ -136,7 +136,7 @@ class PreparedScene:
         return self._arrays.whole("weights")
 
     def gaussians(self, rows: np.ndarray) -> Gaussians:
-        """Some of the Gaussians, with degree-0 colours."""
+        """Some of the Gaussians, with degree-0 colors."""
         with self._whole():
             parts = {name: self._arrays.rows(name, rows) for name in ("means", "quats", "scales", "opacities", "sh_dc")}
         sh = parts.pop("sh_dc")[:, None]

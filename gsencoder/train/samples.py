@@ -210,7 +210,7 @@ def make_sample(
     Raises:
         InputError: the chosen views see none of the scene's Gaussians.
     """
-    # Code −1 is the last row of these tables, which gives the unseen 0. All kinds are equally often the centre.
+    # Code −1 is the last row of these tables, which gives the unseen 0. All kinds are equally often the center.
     chances = np.append(recipe.rarity.each(1.0), np.float32(0))[codes]
     weights = np.append(recipe.rarity.each(recipe.losses.rarity), np.float32(0))[codes]
     views, selected = choose_part(scene.means, scene.cameras, chances, recipe.sampling, size, rng)

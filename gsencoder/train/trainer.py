@@ -36,7 +36,7 @@ from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samp
 class TrainerConfig:
     """How long, how fast, how much at a time."""
 
-    steps: int = field(default=2000, metadata={"help": "optimiser steps"})
+    steps: int = field(default=2000, metadata={"help": "optimizer steps"})
     batch: int = field(default=1, metadata={"help": "samples that one process takes at a time"})
     accumulate: int = field(default=1, metadata={"help": "such micro-batches of a process in one step"})
     learning_rate: float = field(default=2e-3, metadata={"help": "highest learning rate"})
@@ -70,7 +70,7 @@ class TrainerConfig:
             raise InputError(f"final_rate: expected a share in [0, 1], got {self.final_rate}")
 
     def samples_per_step(self, processes: int) -> int:
-        """Samples of one optimiser step, over all processes."""
+        """Samples of one optimizer step, over all processes."""
         return self.batch * self.accumulate * processes
 
 
@@ -237,7 +237,7 @@ class Trainer:
         )
 
     def _gradients(self, step: int, made: list[Batch | InputError]) -> dict[str, float]:
-        """What one optimiser step goes by; returns the losses of all processes together."""
+        """What one optimizer step goes by; returns the losses of all processes together."""
         self.optimizer.zero_grad(set_to_none=True)
         rate = self.rate_at(step)
         for group in self.optimizer.param_groups:

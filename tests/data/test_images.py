@@ -29,7 +29,7 @@ def grid(camera: CameraModel = PINHOLE, width: int = 32, height: int = 24) -> Pi
     return PixelGrid(source=camera, pinhole=pinhole_for(camera, "test"), width=width, height=height)
 
 
-def test_colour_of_every_mode_becomes_rgb(tmp_path: Path) -> None:
+def test_color_of_every_mode_becomes_rgb(tmp_path: Path) -> None:
     rgb = photograph(0)
     assert (read_rgba(save(tmp_path / "rgb.png", rgb))[0] == rgb).all()
     grey = rgb[..., 0].copy()
@@ -37,8 +37,8 @@ def test_colour_of_every_mode_becomes_rgb(tmp_path: Path) -> None:
     wide = grey.astype(np.uint16) * 256 + 7
     assert (read_rgba(save(tmp_path / "wide.png", wide))[0] == grey[..., None]).all()
     Image.fromarray(rgb).quantize(256).save(tmp_path / "palette.png")
-    colour, alpha = read_rgba(tmp_path / "palette.png")
-    assert colour.shape == rgb.shape
+    color, alpha = read_rgba(tmp_path / "palette.png")
+    assert color.shape == rgb.shape
     assert alpha is None
     Image.fromarray(rgb).convert("CMYK").save(tmp_path / "cmyk.jpg")
     assert read_rgba(tmp_path / "cmyk.jpg")[0].shape == rgb.shape
@@ -49,8 +49,8 @@ def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path: Path) -> Non
     rgba[:, :8, 3], rgba[:, 8:16, 3], rgba[:, 16:20, 3] = 0, 127, 128
     path = save(tmp_path / "a.png", rgba)
     assert picture_info(path) == ((32, 24), True)
-    colour = ImageFiles([path], [grid()], RemapCache())[0]
-    assert np.abs(colour - rgba[..., :3] * (rgba[..., 3:] / 255.0)).max() <= 0.5
+    color = ImageFiles([path], [grid()], RemapCache())[0]
+    assert np.abs(color - rgba[..., :3] * (rgba[..., 3:] / 255.0)).max() <= 0.5
     mask = MaskFiles([None], [grid()], RemapCache(), [path])[0]
     assert not mask[:, :16].any()
     assert mask[:, 16:].all()
@@ -192,12 +192,12 @@ def test_mutated_pictures_give_a_picture_or_an_input_error(tmp_path: Path, data:
     path = tmp_path / f"mutated.{suffix}"
     path.write_bytes(bytes(mutated))
     try:
-        colour, _ = read_rgba(path)
+        color, _ = read_rgba(path)
     except InputError as error:
         said = str(error)
     else:
         said = "mutated"
-        assert colour.dtype == np.uint8
-        assert colour.shape[2] == 3
+        assert color.dtype == np.uint8
+        assert color.shape[2] == 3
     assert "mutated" in said
     assert "\n" not in said

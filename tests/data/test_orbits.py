@@ -8,17 +8,17 @@ from gsencoder.types import Gaussians
 
 
 def looks(gaussians: Gaussians, **options: object) -> tuple[np.ndarray, np.ndarray]:
-    """Where each orbit camera sees the centre, in pixels, and at what depth."""
+    """Where each orbit camera sees the center, in pixels, and at what depth."""
     cameras = orbit_cameras(gaussians, **options)  # type: ignore[arg-type]
-    centre, _ = robust_ball(gaussians)
+    center, _ = robust_ball(gaussians)
     pose = cameras.cam_from_world.astype(float)
-    seen = pose[:, :3, :3] @ centre + pose[:, :3, 3]
+    seen = pose[:, :3, :3] @ center + pose[:, :3, 3]
     pixel = np.einsum("vij,vj->vi", cameras.Ks.astype(float), seen)
     return pixel[:, :2] / pixel[:, 2:], seen[:, 2]
 
 
 @pytest.mark.parametrize("up", [None, np.array([0.0, 0.0, 1.0]), np.array([0.0, 3.0, 0.0])])
-def test_orbit_cameras_see_the_centre_from_one_distance(rng: np.random.Generator, up: np.ndarray | None) -> None:
+def test_orbit_cameras_see_the_center_from_one_distance(rng: np.random.Generator, up: np.ndarray | None) -> None:
     ball = rng.normal(size=(4000, 3))
     ball *= (rng.random((4000, 1)) ** (1 / 3)) / np.linalg.norm(ball, axis=1, keepdims=True)
     gaussians = some_gaussians(ball + np.array([4, 5, 6]))

@@ -33,7 +33,7 @@ def test_depth_of_another_size_is_resampled_by_its_own_intrinsics(tmp_path: Path
     assert views.depths is not None
     depth = views.depths[0]
     assert depth.shape == (24, 32)
-    # The centre of colour pixel c is the edge between depth pixels at factor·(c + ½), up to float rounding.
+    # The center of color pixel c is the edge between depth pixels at factor·(c + ½), up to float rounding.
     wanted = 1 + (np.arange(32) + 0.5) * factor * 1e-3
     assert np.abs(depth - wanted).max() <= 1.01e-3
 

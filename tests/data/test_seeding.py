@@ -157,7 +157,7 @@ class TestDepth:
         mixed[60:180, 99] = 1.4  # What a sensor returns across the edge.
         use = surface_pixels(mixed, K).use
         assert not use[61:179, 99].any()
-        # Beside it only the ring of background whose colour the outline is mixed into is left out.
+        # Beside it only the ring of background whose color the outline is mixed into is left out.
         ring = np.zeros_like(use)
         ring[59:181, 98:201] = True
         ring[60:180, 100:200] = False
@@ -328,7 +328,7 @@ def test_coincident_points_get_a_finite_size():
 
 
 class TestPoints:
-    def test_a_sphere_of_points_gets_normals_spacing_and_colours(self, rng):
+    def test_a_sphere_of_points_gets_normals_spacing_and_colors(self, rng):
         points = rng.standard_normal((4000, 3))
         points = (points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
         colors = np.where(points[:, :1] > 0, [[250, 10, 10]], [[10, 10, 250]]).astype(np.uint8)
@@ -374,13 +374,13 @@ class TestPoints:
             seed_from_points(np.zeros((0, 3), np.float32), None)
         with pytest.raises(InputError, match=r"1 of 2 points are not finite \(first: row 1\)"):
             seed_from_points(np.array([[0, 0, 0], [0, np.nan, 0]], np.float32), black)
-        with pytest.raises(InputError, match="expected 3 colours"):
+        with pytest.raises(InputError, match="expected 3 colors"):
             seed_from_points(np.zeros((3, 3), np.float32), black)
         with pytest.raises(InputError, match="too small"):
             seed_from_points(np.full((2, 3), 1e30, np.float32), black, voxel=1e-6)
 
-    def test_points_without_colours_are_grey_with_a_warning(self):
-        with pytest.warns(SceneWarning, match="2 points without colours"):
+    def test_points_without_colors_are_grey_with_a_warning(self):
+        with pytest.warns(SceneWarning, match="2 points without colors"):
             g = seed_from_points(np.float32([[0, 0, 0], [1, 0, 0]]), None)
         assert np.abs(colors_of(g) - 0.5).max() < 0.01
 
@@ -399,17 +399,17 @@ class TestMesh:
         assert np.abs(g.means).max(axis=0) == pytest.approx([0.5, 0.3, 0.2], abs=1e-5)
         assert np.abs(normals_of(g)).max(axis=1).min() > 0.999
 
-    def test_a_fine_sphere_keeps_its_shape_and_vertex_colours(self, tmp_path):
+    def test_a_fine_sphere_keeps_its_shape_and_vertex_colors(self, tmp_path):
         mesh = self.trimesh.creation.icosphere(subdivisions=5, radius=0.5)
         mesh.visual.vertex_colors = np.where(mesh.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
         mesh.export(tmp_path / "ball.ply")
         g = seed_from_mesh(tmp_path / "ball.ply", voxel=0.05, origin=np.array([10.0, 0, 0]))
-        centred = g.means + np.float32([10, 0, 0])
-        assert np.abs(np.linalg.norm(centred, axis=1) - 0.5).max() < 0.005
-        assert np.abs((normals_of(g) * centred).sum(1) / 0.5).min() > 0.98
+        centerd = g.means + np.float32([10, 0, 0])
+        assert np.abs(np.linalg.norm(centerd, axis=1) - 0.5).max() < 0.005
+        assert np.abs((normals_of(g) * centerd).sum(1) / 0.5).min() > 0.98
         red = colors_of(g)[:, 0] > 0.5
-        away = np.abs(centred[:, 2]) > 0.05
-        assert np.array_equal(red[away], centred[away, 2] > 0)
+        away = np.abs(centerd[:, 2]) > 0.05
+        assert np.array_equal(red[away], centerd[away, 2] > 0)
 
     def test_slivers_take_few_samples_and_leave_no_hole(self, tmp_path):
         sliver = self.trimesh.Trimesh([[0, 0, 0], [10, 0, 0], [10, 0.001, 0]], [[0, 1, 2]], process=False)
@@ -510,7 +510,7 @@ class TestSeed:
         assert same(g, seed_from_depth(views, voxel=1.5))
         points = rng.uniform(0, 9, (300, 3)).astype(np.float32)
         cloud = Scene(name="x", sfm_points=points, sfm_colors=np.zeros((300, 3), np.uint8))
-        with pytest.warns(SceneWarning, match="median nearest-neighbour distance"):
+        with pytest.warns(SceneWarning, match="median nearest-neighbor distance"):
             assert 100 < len(seed(cloud)) <= 300
 
     def test_a_mesh_without_a_unit_takes_its_voxel_from_the_cameras(self, tmp_path):

@@ -134,8 +134,8 @@ def test_depths_up_to_the_greatest_count_and_masked_ones_do_not() -> None:
     assert set(np.round(samples.points[:, 2], 4).tolist()) == {3.0}
 
 
-def test_pixels_lie_on_the_rays_through_their_centres() -> None:
-    """A wall as fine as a voxel: its samples are the centres of pixels."""
+def test_pixels_lie_on_the_rays_through_their_centers() -> None:
+    """A wall as fine as a voxel: its samples are the centers of pixels."""
     samples, _ = depth_samples(views_of(np.full((8, 10), 2.0), focal=20.0), voxel=0.05)
     x, y = ((np.arange(size) + 0.5 - size / 2) / 20 * 2 for size in (10, 8))
     expected = np.stack([*np.meshgrid(x, y), np.full((8, 10), 2.0)], axis=-1).reshape(-1, 3)

@@ -103,7 +103,7 @@ def test_views_and_pixels_are_counted_from_the_instance_maps(room):
         assert found.max_pixels == max(counts)
 
 
-def test_gaussians_lie_on_the_surfaces_with_the_colours_of_the_pictures(room):
+def test_gaussians_lie_on_the_surfaces_with_the_colors_of_the_pictures(room):
     g = room.gaussians
     assert 5_000 < len(g) < 40_000
     assert (np.abs(g.means[:, 2]) < 3).all()
@@ -135,7 +135,7 @@ def test_every_pixel_has_a_gaussian_of_its_surface_beside_it(room):
         assert distance.max() < 0.08
 
 
-def test_colour_words_are_the_hues_of_the_pictures():
+def test_color_words_are_the_hues_of_the_pictures():
     words = color_words(3)
     scene = make_room(3)
     assert len({words[found.id] for found in scene.objects if found.placed}) == 8

@@ -53,7 +53,7 @@ def test_rendered_depth_is_that_of_pixels_whatever_cells_are_lifted() -> None:
     assert torch.equal(b.col, expected.col)
 
 
-def test_a_centre_is_lifted_from_the_cell_that_it_projects_into() -> None:
+def test_a_center_is_lifted_from_the_cell_that_it_projects_into() -> None:
     """The map is a crop: the image begins a cell and a half to the left of it, and goes on for a cell below."""
     gaussians = random_gaussians(300, center=(0.3, -0.2, 2.0))
     feature_map = map_of(np.zeros((5, 7, 2), np.float32), bx=-1.5)

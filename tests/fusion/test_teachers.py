@@ -9,7 +9,7 @@ from splats import front_camera
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
-from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteConfig, PaletteTeacher, lab_from_rgb
+from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher, lab_from_rgb
 from gsencoder.types import SceneObject, Views
 
 
@@ -33,13 +33,13 @@ def views_of(image: np.ndarray | None = None, instances: np.ndarray | None = Non
         ((255, 192, 203), "pink"), ((128, 0, 128), "purple"), ((139, 69, 19), "brown"),
     ],
 )  # fmt: skip
-def test_the_palette_calls_css_colours_by_their_names(rgb: tuple[int, int, int], name: str) -> None:
+def test_the_palette_calls_css_colors_by_their_names(rgb: tuple[int, int, int], name: str) -> None:
     image = np.broadcast_to(np.array(rgb, np.uint8), (6, 8, 3)).copy()
     teacher = PaletteTeacher()
     features = teacher.feature_map(views_of(image), 0).features
     assert features is not None
     assert features.shape == (3, 4, 11)
-    assert COLOUR_NAMES[int(features[0, 0].argmax())] == name
+    assert COLOR_NAMES[int(features[0, 0].argmax())] == name
     np.testing.assert_allclose(features.sum(axis=-1), 1, rtol=1e-5)
 
 
@@ -83,7 +83,7 @@ def test_labels_without_objects_names_or_maps_say_so() -> None:
 
 
 def write_mean_model(path: Path, patch: int = 4) -> None:
-    """A backbone whose features are each patch's mean colour, as tokens after one CLS token of zeros."""
+    """A backbone whose features are each patch's mean color, as tokens after one CLS token of zeros."""
     onnx = pytest.importorskip("onnx")
     helper, numpy_helper = onnx.helper, onnx.numpy_helper
     F = onnx.TensorProto.FLOAT
@@ -205,7 +205,7 @@ def test_settings_that_no_backbone_can_have_are_refused_by_name(name: str, value
 
 
 def write_pooling_model(path: Path, factor: float, inputs: tuple[int | str, ...], outputs: tuple[str, ...]) -> None:
-    """A grid backbone: each patch's mean colour times `factor`."""
+    """A grid backbone: each patch's mean color times `factor`."""
     onnx = pytest.importorskip("onnx")
     helper, F = onnx.helper, onnx.TensorProto.FLOAT
     nodes = [

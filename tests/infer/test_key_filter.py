@@ -84,7 +84,7 @@ def test_every_field_of_an_answer_is_without_the_key() -> None:
     assert (reply.text, reply.model, reply.finish) == ("a (key) b", "(key)", "(key)")
 
 
-def test_a_key_that_is_split_over_pieces_is_recognised() -> None:
+def test_a_key_that_is_split_over_pieces_is_recognized() -> None:
     data = events(f"a {KEY[:9]}", KEY[9:], " b")
     with serving(lambda handler, _: handler.raw(200, data, "text/event-stream")) as server:
         assert ask(server.url).text == "a (key) b"

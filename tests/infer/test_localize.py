@@ -1,4 +1,4 @@
-"""Words to boxes on a small made-up room: laws of localisation, warnings, errors, and the files it writes."""
+"""Words to boxes on a small made-up room: laws of localization, warnings, errors, and the files it writes."""
 
 import json
 import warnings

@@ -34,7 +34,7 @@ def scene(*places: tuple[float, float], half: int = 20) -> tuple[Gaussians, list
 
 
 def discs(picture: np.ndarray, numbers: int) -> list[np.ndarray]:
-    """The middle of each number's colour in a picture that was black."""
+    """The middle of each number's color in a picture that was black."""
     found = []
     for number in range(numbers):
         pixels = np.argwhere((picture == word_color(number)).all(axis=2))[:, ::-1]

@@ -31,7 +31,7 @@ def shade(view: int) -> np.ndarray:
 
 
 def write_room(folder: Path, count: int = COUNT, *, larger: int = 1) -> Path:
-    """The cameras of the room with pictures of one colour each, in world coordinates."""
+    """The cameras of the room with pictures of one color each, in world coordinates."""
     cameras = corner_cameras(COUNT)
     frames = []
     for view in range(count):

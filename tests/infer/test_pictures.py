@@ -1,4 +1,4 @@
-"""Pictures: colours mean the same everywhere, lines land where pinholes put them, labels stay inside."""
+"""Pictures: colors mean the same everywhere, lines land where pinholes put them, labels stay inside."""
 
 import numpy as np
 import pytest
@@ -129,7 +129,7 @@ def test_labels_of_boxes_in_one_place_do_not_cover_each_other() -> None:
     assert min(heights) > 60 * 12
 
 
-def test_pca_colours_are_the_same_for_the_same_feature_in_every_view(rng: np.random.Generator) -> None:
+def test_pca_colors_are_the_same_for_the_same_feature_in_every_view(rng: np.random.Generator) -> None:
     features = rng.normal(size=(400, 6)).astype(np.float32) * np.float32([5, 4, 3, 1, 1, 1])
     colors = fit_pca_colors(features)
     a = pca_picture(features[:100].reshape(10, 10, 6), colors)
@@ -138,7 +138,7 @@ def test_pca_colours_are_the_same_for_the_same_feature_in_every_view(rng: np.ran
     assert a.std(axis=(0, 1)).min() > 20
 
 
-def test_pca_colours_do_not_depend_on_the_order_of_rows(rng: np.random.Generator) -> None:
+def test_pca_colors_do_not_depend_on_the_order_of_rows(rng: np.random.Generator) -> None:
     features = rng.normal(size=(300, 4)).astype(np.float32) * np.float32([4, 3, 2, 1])
     a, b = fit_pca_colors(features), fit_pca_colors(features[::-1].copy())
     np.testing.assert_allclose(a.axes, b.axes, atol=1e-9)
@@ -155,7 +155,7 @@ def test_composited_features_are_divided_by_alpha_and_fade_to_white(rng: np.rand
 
 
 @pytest.mark.parametrize("columns", [1, 2, 3])
-def test_few_channels_and_constant_features_have_colours(columns: int) -> None:
+def test_few_channels_and_constant_features_have_colors(columns: int) -> None:
     constant = np.ones((5, columns), np.float32)
     assert pca_picture(constant[None], fit_pca_colors(constant)).shape == (1, 5, 3)
     ramp = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.ones(columns, np.float32)
@@ -173,7 +173,7 @@ def test_near_depth_is_bright_and_missing_depth_is_grey() -> None:
     assert (depth_picture(np.zeros((2, 2), np.float32)) == 48).all()
 
 
-def test_a_colour_bar_marks_the_threshold() -> None:
+def test_a_color_bar_marks_the_threshold() -> None:
     assert not np.array_equal(color_bar(200, 0.0, 1.0, mark=0.4), color_bar(200, 0.0, 1.0))
     assert np.array_equal(color_bar(200, 0.0, 1.0, mark=2.0), color_bar(200, 0.0, 1.0))
 

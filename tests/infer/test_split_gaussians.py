@@ -63,7 +63,7 @@ def test_a_sky_is_cut_into_no_more_patches_than_are_allowed() -> None:
 
 
 def test_a_wall_of_one_gaussian_stops_rays_and_is_near_all_along() -> None:
-    # The nearest centres belong to small Gaussians; the surface of the large one is nearer.
+    # The nearest centers belong to small Gaussians; the surface of the large one is nearer.
     clutter = splat(sheet((0.6, 0.0, 0.0), (1, 2), (0.05, 0.05), 0.02), 0.005)
     wall = one((0.01, 1.0, 1.0), np.array([1.0, 0, 0, 0]), (0.0, 1.5, 0.0))
     free = FreeSpace(together(clutter, wall))

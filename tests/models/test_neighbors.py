@@ -1,4 +1,4 @@
-"""Neighbourhoods and the convolution over them, against plain twins."""
+"""Neighborhoods and the convolution over them, against plain twins."""
 
 import itertools
 
@@ -47,7 +47,7 @@ def test_one_cell_has_itself_and_no_other() -> None:
     assert (table == 1).sum() == 26
 
 
-def test_no_cells_have_no_neighbours() -> None:
+def test_no_cells_have_no_neighbors() -> None:
     assert neighbor_table(torch.zeros(0, 3, dtype=torch.int64)).shape == (0, 27)
 
 

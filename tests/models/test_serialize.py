@@ -1,4 +1,4 @@
-"""Curves against their definitions: every cell once, neighbours in the order are neighbours in space, levels nest."""
+"""Curves against their definitions: every cell once, neighbors in the order are neighbors in space, levels nest."""
 
 import itertools
 
@@ -43,7 +43,7 @@ def test_a_curve_visits_every_cell_of_a_cube_once(order: str, bits: int) -> None
 
 @pytest.mark.parametrize("order", ["hilbert", "hilbert-trans"])
 @pytest.mark.parametrize("bits", [1, 2, 3, 4, 5])
-def test_hilbert_steps_to_a_face_neighbour_always(order: str, bits: int) -> None:
+def test_hilbert_steps_to_a_face_neighbor_always(order: str, bits: int) -> None:
     cells = cube(bits)
     path = cells[torch.argsort(encode_cells(cells, order, bits))]
     assert (path.diff(dim=0).abs().sum(dim=1) == 1).all()

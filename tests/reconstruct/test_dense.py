@@ -8,7 +8,7 @@ from walls import DEPTH, TILT, cameras, seen, wall_points, wall_views
 from gsencoder.core.errors import InputError
 from gsencoder.reconstruct.dense import DenseConfig, carve, coverage, densify, interpolate, splat_depths, thin
 from gsencoder.reconstruct.photographs import Photographs
-from gsencoder.reconstruct.stereo import DepthMap, agreeing, neighbours_of, sweep, world_points
+from gsencoder.reconstruct.stereo import DepthMap, agreeing, neighbors_of, sweep, world_points
 
 SMALL = DenseConfig(spacing=3.0, size=96, sources=3, samples=1)
 
@@ -51,12 +51,12 @@ def test_points_go_to_the_world_and_back() -> None:
     torch.testing.assert_close(splat_depths(points.reshape(-1, 3), shot, pose(2)), truth)
 
 
-def test_views_that_share_points_at_a_good_angle_are_neighbours() -> None:
+def test_views_that_share_points_at_a_good_angle_are_neighbors() -> None:
     made = cameras(6, step=0.2)
-    found = neighbours_of(made, wall_points(200), range(6), 2)
+    found = neighbors_of(made, wall_points(200), range(6), 2)
     assert all(len(others) == 2 and view not in others for view, others in found.items())
     assert 5 not in found[0]
-    alone = neighbours_of(made, wall_points(200) + np.float32([0, 0, -100]), range(6), 2)
+    alone = neighbors_of(made, wall_points(200) + np.float32([0, 0, -100]), range(6), 2)
     assert all(others == [] for others in alone.values())
 
 

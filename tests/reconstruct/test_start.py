@@ -65,11 +65,11 @@ def test_a_mesh_whose_triangles_have_no_corners_is_refused(tmp_path: Path) -> No
         begun(scene(), SeedConfig(source="mesh", mesh=str(path), voxel=0.1))
 
 
-def test_points_without_colours_are_grey_and_it_is_said_once() -> None:
+def test_points_without_colors_are_grey_and_it_is_said_once() -> None:
     points = wall_points()
     bare = scene(views=wall_views(), sfm_points=points)
     for dense in (NEVER, DenseConfig(size=96, sources=3, samples=1)):
-        with pytest.warns(SceneWarning, match="40 points without colours are made mid-grey") as warned:
+        with pytest.warns(SceneWarning, match="40 points without colors are made mid-grey") as warned:
             found = begun(bare, dense=dense)
         assert len(warned) == 1
         grey = np.abs(found.gaussians.sh[:, 0]).max(axis=1) < 0.02

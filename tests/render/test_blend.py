@@ -73,7 +73,7 @@ DTYPE = {"cpu": torch.float32, "reference": torch.float64}
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("log_scale", [-4.0, -2.5, -0.5])
-def test_weights_colours_and_depths_agree_with_the_definition(backend: str, seed: int, log_scale: float) -> None:
+def test_weights_colors_and_depths_agree_with_the_definition(backend: str, seed: int, log_scale: float) -> None:
     g, camera = random_gaussians(300, seed, log_scale=log_scale), front_camera()
     expected, depths, doubt = brute_force(g, camera)
     b = blend(g, camera, config=BlendConfig(backend=backend), dtype=DTYPE[backend])

@@ -45,7 +45,7 @@ def test_the_union_of_frusta_is_what_any_camera_sees() -> None:
 
 
 def test_almost_nothing_that_a_view_shows_lies_outside_its_frustum() -> None:
-    """Small Gaussians whose centre lies beside the picture reach into it at its edge alone."""
+    """Small Gaussians whose center lies beside the picture reach into it at its edge alone."""
     camera = front_camera()
     rng = np.random.default_rng(2)
     cloud = Gaussians(
@@ -101,7 +101,7 @@ def test_without_a_limit_a_sample_is_all_that_its_views_see() -> None:
     assert np.array_equal(rows, np.flatnonzero(in_frusta(points, row.select(views))))
 
 
-def test_the_views_of_a_crop_look_at_its_centre() -> None:
+def test_the_views_of_a_crop_look_at_its_center() -> None:
     points, row = cloud(1000, 4), cameras(4)
     for seed in range(8):
         config = SamplingConfig(views=2)
@@ -112,7 +112,7 @@ def test_the_views_of_a_crop_look_at_its_centre() -> None:
         assert (np.diff(rows) > 0).all()
 
 
-def test_a_crop_holds_the_gaussians_nearest_to_its_centre_that_the_views_see() -> None:
+def test_a_crop_holds_the_gaussians_nearest_to_its_center_that_the_views_see() -> None:
     points, camera = cloud(), front_camera()
     chances = np.zeros(1000, np.float32)
     visible = np.flatnonzero(in_frusta(points, camera))
@@ -123,7 +123,7 @@ def test_a_crop_holds_the_gaussians_nearest_to_its_centre_that_the_views_see() -
     assert set(rows) == set(visible[np.argsort(distances)[:20]])
 
 
-def test_a_rare_target_is_often_the_centre_of_a_crop() -> None:
+def test_a_rare_target_is_often_the_center_of_a_crop() -> None:
     points, camera = cloud(), front_camera()
     chances = np.full(1000, 1e-3, np.float32)
     visible = np.flatnonzero(in_frusta(points, camera))
@@ -133,7 +133,7 @@ def test_a_rare_target_is_often_the_centre_of_a_crop() -> None:
         assert visible[0] in choose_part(points, camera, chances, config, 5, RNG(seed))[1]
 
 
-def test_where_no_gaussian_has_a_target_any_may_be_the_centre() -> None:
+def test_where_no_gaussian_has_a_target_any_may_be_the_center() -> None:
     config = SamplingConfig(views=1)
     assert len(choose_part(cloud(), cameras(1), np.zeros(1000, np.float32), config, 5, RNG(0))[1])
 

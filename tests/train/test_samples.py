@@ -168,7 +168,7 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
     np.testing.assert_array_equal(found.loss_weights.numpy(), np.where(expected < 0, 0, rarity.each(power)[expected]))
 
 
-def test_all_kinds_are_equally_often_the_centre_of_a_sample(
+def test_all_kinds_are_equally_often_the_center_of_a_sample(
     dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe, drawn = samples(*dataset).recipe, list[np.ndarray]()

@@ -43,7 +43,7 @@ COMMANDS = {
         Command(name="localize", config="LocalizeCommandConfig", help="boxes, scores and pictures for words"),
         Command(name="views", config="ViewsCommandConfig", help="the views that show best what a word found"),
         Command(name="ask", config="AskCommandConfig", help="a vision-language model's answer from such views"),
-        Command(name="evaluate", config="EvaluateConfig", help="a paper's metric on labelled scenes"),
+        Command(name="evaluate", config="EvaluateConfig", help="a paper's metric on labeled scenes"),
         Command(name="tradeoff", config="TradeoffConfig", help="what each accuracy knob costs and gives, measured"),
         Command(name="inspect", config="InspectConfig", help="what is in a splat file, and what is wrong with it"),
         Command(name="repair", config="RepairConfig", help="mend a splat file, and say what was changed"),

@@ -59,7 +59,7 @@ def run(config: DemoConfig, summary: Summary) -> None:
             scene = replace(scene, gaussians=seed(scene, config.seeds))
         assert scene.gaussians is not None
         save_splat(folder / "splat.ply", scene.gaussians, origin=scene.origin)
-        screen.print(f"seeds: {len(scene.gaussians):,} Gaussians, no optimisation")
+        screen.print(f"seeds: {len(scene.gaussians):,} Gaussians, no optimization")
         named = [thing for thing in scene.objects if thing.placed and thing.name]
         names = room_words(scene)
         labels = LabelsTeacher(scene.objects, names.names, names.embeddings, text_encoder=names.space.text_encoder)

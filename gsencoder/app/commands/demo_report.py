@@ -28,8 +28,8 @@ TEXTS = {
         "Gaussians, a word finds them by cosine; DBSCAN makes boxes of what passes the threshold.",
     ),
     "colors": (
-        "Where is each colour?",
-        "The palette teacher looks at the photographs alone and names colours. A colour on a wall or on the "
+        "Where is each color?",
+        "The palette teacher looks at the photographs alone and names colors. A color on a wall or on the "
         "furniture is found too: the best box is not always the small object that was meant.",
     ),
 }
@@ -103,7 +103,7 @@ def write_report(path: Path, scene: Scene, asked: Sequence[Asked], summary: Summ
     report.timings(summary.timings)
     report.section("What was chosen, and what it cost")
     report.table(
-        ("features", "channels", "rank of the basis", "energy kept", "centred cosine error", "Gaussians seen"),
+        ("features", "channels", "rank of the basis", "energy kept", "centerd cosine error", "Gaussians seen"),
         [
             (
                 one.title,
@@ -134,7 +134,7 @@ def _views(report: HtmlReport, gaussians: Gaussians, views: Views, asked: Sequen
     if views.images is not None:
         report.section("What went in", "Pictures with known poses and depth, written to disk and read back.")
         report.pictures([views.images[view] for view in shown], captions, cell=SMALL)
-    report.section("Gaussians", "Seeds from the depth maps: flat along the surface, coloured by the pictures.")
+    report.section("Gaussians", "Seeds from the depth maps: flat along the surface, colored by the pictures.")
     report.pictures(rendered, [f"{caption}, rendered" for caption in captions], cell=SMALL)
     report.pictures(depths, [f"{caption}, depth, bright is near" for caption in captions], cell=SMALL)
     report.section(
@@ -165,4 +165,4 @@ def _answers(report: HtmlReport, scene: Scene, one: Asked) -> None:
         best = boxes[0] if boxes else None
         center = ", ".join(f"{value:.2f}" for value in best.center) if best is not None else "–"
         rows.append((word, len(boxes), center, best.score if best is not None else 0.0, iou))
-    report.table(("word", "boxes", "centre of the first, m", "score", "IoU with the truth"), rows)
+    report.table(("word", "boxes", "center of the first, m", "score", "IoU with the truth"), rows)

@@ -1,4 +1,4 @@
-"""`gsencoder evaluate SCENE… protocol=…`: a metric on labelled scenes, of fused features or of an encoder's."""
+"""`gsencoder evaluate SCENE… protocol=…`: a metric on labeled scenes, of fused features or of an encoder's."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -44,7 +44,7 @@ class EvaluateConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "labelled scenes, or folders of scenes", "metavar": "SCENE", "required": True},
+        metadata={"help": "labeled scenes, or folders of scenes", "metavar": "SCENE", "required": True},
     )
     weights: str = field(
         default="", metadata={"help": "encoder whose features are judged (see encode); empty = the teacher's, fused"}
@@ -158,7 +158,7 @@ def scores_line(results: dict) -> str:
     if results["protocol"] == "naming":
         return (
             f"{len(results['names'])} names in {len(results['scenes'])} scenes: accuracy {results['accuracy']:.3f} "
-            f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centred cosine "
+            f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centerd cosine "
             f"{results['cosine']:.3f}"
         )
     return (

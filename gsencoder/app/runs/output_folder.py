@@ -30,7 +30,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
 
     Args:
         path: the folder to make; its parents are made too. It may exist if it is empty.
-        overwrite: replace the output of an earlier run, recognised by its summary.json. Where the system can (Linux),
+        overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
             old and new change places in one step.
         summary: written into the folder at the end, as summary.json.
 

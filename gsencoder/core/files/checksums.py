@@ -1,7 +1,7 @@
 """Checksums of array files: a CRC-32 for each block of each array, and one SHA-256 over the header and all of these.
 
 Blocks let a reader that maps a file check only what it reads: a training step touches a small part of a scene. A CRC-32
-finds every error of up to 32 neighbouring bits in a block, and misses one in 2³² of all others; it is not meant to stop
+finds every error of up to 32 neighboring bits in a block, and misses one in 2³² of all others; it is not meant to stop
 anybody who changes a file on purpose.
 """
 

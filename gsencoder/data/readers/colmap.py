@@ -33,7 +33,7 @@ def read_colmap(model: Path, images: Path, root: Path, *, allow_outside: bool = 
         allow_outside: let them.
 
     Returns:
-        The registered pictures sorted by name, in the model's own world, and its points with their colours. The unit
+        The registered pictures sorted by name, in the model's own world, and its points with their colors. The unit
         of length and up are unknown.
 
     Raises:

@@ -6,10 +6,10 @@ Rules that hold for all of them:
 - Only PNG, JPEG, WebP, TIFF, BMP and PPM are opened, and .npy for depth. A file that cannot be decoded to its
   end is an InputError that names it.
 - The EXIF orientation is ignored, as COLMAP does: poses and intrinsics belong to the pixels as they are stored.
-- Grey becomes RGB by repetition, 16-bit grey keeps its upper 8 bits. An alpha channel composites the colour over
+- Grey becomes RGB by repetition, 16-bit grey keeps its upper 8 bits. An alpha channel composites the color over
   black, which is what a splat rendered without a background gives, and pixels of alpha below one half are masked.
-- Distorted pictures are resampled once (undistort.py): colour bilinearly, everything else by the nearest pixel.
-- A smaller scale averages colour over areas; depth and instances take the pixel at the new centre; a mask keeps a
+- Distorted pictures are resampled once (undistort.py): color bilinearly, everything else by the nearest pixel.
+- A smaller scale averages color over areas; depth and instances take the pixel at the new center; a mask keeps a
   pixel only if all that it covers is used.
 """
 
@@ -119,10 +119,10 @@ def picture_info(path: Path) -> tuple[tuple[int, int], bool]:
 
 
 def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
-    """Colour (composited over black) and alpha, None where the file has none.
+    """Color (composited over black) and alpha, None where the file has none.
 
     Raises:
-        InputError: unreadable, damaged, too large, or of a kind that is not colour.
+        InputError: unreadable, damaged, too large, or of a kind that is not color.
     """
     with _open(path) as opened:
         picture = _decode(path, opened)
@@ -142,8 +142,8 @@ def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray,
         except Exception as error:
             raise InputError(f"{path}: cannot be turned into RGB ({_brief(error)})") from error
     alpha = rgba[..., 3]
-    colour = (rgba[..., :3].astype(np.uint16) * alpha[..., None] + 127) // 255
-    return colour.astype(np.uint8), alpha.copy()
+    color = (rgba[..., :3].astype(np.uint16) * alpha[..., None] + 127) // 255
+    return color.astype(np.uint8), alpha.copy()
 
 
 def read_integers(path: Path, what: str, *, wide: bool) -> np.ndarray:
@@ -232,15 +232,15 @@ class ImageFiles(_Files[UInt8[np.ndarray, "H W 3"]]):
 
         path, grid = self._paths[view], self._grids[view]
         assert path is not None
-        colour = read_rgba(path)[0]
-        self._checked(view, colour.shape[:2])
+        color = read_rgba(path)[0]
+        self._checked(view, color.shape[:2])
         remap = self._remaps.get(grid.pinhole, grid.source)
         if remap is not None:
-            colour = remap.bilinear(colour)
-        if colour.shape[:2] != (grid.height, grid.width):
-            small = Image.fromarray(colour).resize((grid.width, grid.height), Image.Resampling.BOX)
-            colour = np.array(small)
-        return colour
+            color = remap.bilinear(color)
+        if color.shape[:2] != (grid.height, grid.width):
+            small = Image.fromarray(color).resize((grid.width, grid.height), Image.Resampling.BOX)
+            color = np.array(small)
+        return color
 
 
 class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):

@@ -1,4 +1,4 @@
-"""objects.json: labelled objects beside a transforms.json, for evaluation."""
+"""objects.json: labeled objects beside a transforms.json, for evaluation."""
 
 import math
 from pathlib import Path

@@ -2,7 +2,7 @@
 
 pose/N.txt is world_from_camera with OpenCV axes, metres, z up; frames that lost tracking hold -inf and are left out.
 Depth is in millimetres unless told otherwise. Where depth has its own size and intrinsics it is resampled onto the
-colour camera; both are taken to look from the same place, as ScanNet's own exports do.
+color camera; both are taken to look from the same place, as ScanNet's own exports do.
 """
 
 import warnings
@@ -35,16 +35,16 @@ def read_scannet(root: Path, *, allow_outside: bool = False, depth_scale: float 
     Raises:
         InputError: no usable frame, no intrinsics, intrinsics that do not belong to the pictures, a bad pose.
     """
-    colour = _by_stem(root / "color", (".jpg", ".jpeg", ".png", ".webp"))
-    if not colour:
+    color = _by_stem(root / "color", (".jpg", ".jpeg", ".png", ".webp"))
+    if not color:
         raise InputError(f"{root / 'color'}: no pictures (.jpg, .png); expected one a frame")
     depths = _by_stem(root / "depth", (".png", ".npy"))
     instances = _by_stem(root / "instance", (".png",)) or _by_stem(root / "instance-filt", (".png",))
-    colour_file, depth_file = _intrinsic_files(root)
+    color_file, depth_file = _intrinsic_files(root)
     images: list[PosedImage] = []
     unposed: list[str] = []
     lost = 0
-    for stem, path in colour.items():
+    for stem, path in color.items():
         pose_file = root / "pose" / f"{stem}.txt"
         if not pose_file.is_file():
             unposed.append(f"pose/{stem}.txt")
@@ -56,11 +56,11 @@ def read_scannet(root: Path, *, allow_outside: bool = False, depth_scale: float 
         if np.isneginf(pose).any():
             lost += 1
             continue
-        camera = _camera(colour_file, path)
+        camera = _camera(color_file, path)
         depth = depths.get(stem)
         depth_camera = None
         if depth is not None and picture_size(depth) != (camera.width, camera.height):
-            if depth_file == colour_file:
+            if depth_file == color_file:
                 w, h = picture_size(depth)
                 raise InputError(
                     f"{depth}: {w}×{h} pixels but {path} has {camera.width}×{camera.height}; "
@@ -81,12 +81,12 @@ def read_scannet(root: Path, *, allow_outside: bool = False, depth_scale: float 
         )
     if not images:
         raise InputError(
-            f"{root}: no view: of {len(colour)} pictures {len(unposed)} have no pose file, {lost} lost tracking"
+            f"{root}: no view: of {len(color)} pictures {len(unposed)} have no pose file, {lost} lost tracking"
         )
-    warn_left_out(unposed, len(colour), str(root), "pose files", "their pictures are left out")
+    warn_left_out(unposed, len(color), str(root), "pose files", "their pictures are left out")
     if lost:
         warnings.warn(
-            f"{root}: {lost} of {len(colour)} frames lost tracking (-inf) and are left out", SceneWarning, stacklevel=2
+            f"{root}: {lost} of {len(color)} frames lost tracking (-inf) and are left out", SceneWarning, stacklevel=2
         )
     if depths:
         without = [image.name for image in images if image.depth is None]
@@ -121,15 +121,15 @@ def _numbers(path: Path, *shapes: tuple[int, int]) -> Float64[np.ndarray, "rows 
 
 
 def _intrinsic_files(root: Path) -> tuple[Path, Path]:
-    """The files of the colour and the depth camera; one file serves both where there is no other."""
+    """The files of the color and the depth camera; one file serves both where there is no other."""
     folder = root / "intrinsic"
     common = [folder / "intrinsic.txt", folder / "intrinsics.txt", root / "intrinsics.txt", root / "intrinsic.txt"]
-    colour = next((path for path in (folder / "intrinsic_color.txt", *common) if path.is_file()), None)
+    color = next((path for path in (folder / "intrinsic_color.txt", *common) if path.is_file()), None)
     depth = next((path for path in (folder / "intrinsic_depth.txt", *common) if path.is_file()), None)
-    colour, depth = colour or depth, depth or colour
-    if colour is None or depth is None:
+    color, depth = color or depth, depth or color
+    if color is None or depth is None:
         raise InputError(f"{root}: no intrinsics; expected {folder / 'intrinsic_color.txt'} with a 3×3 or 4×4 matrix")
-    return colour, depth
+    return color, depth
 
 
 def _camera(path: Path, picture: Path) -> CameraModel:
@@ -140,7 +140,7 @@ def _camera(path: Path, picture: Path) -> CameraModel:
     check_camera(camera, str(path))
     if k[0, 1] or k[1, 0] or abs(k[2, :3] - (0, 0, 1)).max() > 1e-6:
         raise InputError(f"{path}: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {k[:3, :3].tolist()}")
-    # The pictures are often exported at another size than the intrinsics; the principal point then lies off centre.
+    # The pictures are often exported at another size than the intrinsics; the principal point then lies off center.
     if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
         raise InputError(
             f"{path}: principal point {cx:g}, {cy:g} does not belong to pictures of {width}×{height} ({picture.name}); "

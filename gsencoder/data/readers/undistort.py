@@ -1,13 +1,13 @@
 """Lens distortion: which pinhole camera replaces a distorted one, and where each of its pixels lies in the file.
 
-The centre of every pinhole pixel is turned into a ray and projected through the distorted model by pycolmap, so the
+The center of every pinhole pixel is turned into a ray and projected through the distorted model by pycolmap, so the
 map is exact; nothing is fitted. A pixel is used only if that ray lies within 85° of the axis, lands inside the
 picture, and is what the model gives back when it is inverted there: a polynomial that folds over itself puts several
 rays on one pixel, and only the innermost is real.
 
 The pinhole keeps the picture's size and principal point. Both focal lengths are multiplied by one zoom, the smallest
 between 0.7 and 1.3 at which the whole pinhole picture is covered by the distorted one. Where no such zoom exists it is
-1, and the pixels without content are masked. The optical centre and the axes stay, so poses and depths do too.
+1, and the pixels without content are masked. The optical center and the axes stay, so poses and depths do too.
 """
 
 import math
@@ -48,7 +48,7 @@ class CameraModel:
         model: one of COLMAP's camera model names.
         width: of the picture, pixels.
         height: of the picture, pixels.
-        params: COLMAP's parameters of that model: focal lengths, principal point (pixel centres at .5), distortion.
+        params: COLMAP's parameters of that model: focal lengths, principal point (pixel centers at .5), distortion.
     """
 
     model: str
@@ -71,7 +71,7 @@ class CameraModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pinhole:
-    """A camera without distortion, in pixels, pixel centres at .5."""
+    """A camera without distortion, in pixels, pixel centers at .5."""
 
     fx: float
     fy: float
@@ -208,7 +208,7 @@ class Remap:
     """For each pixel of a pinhole picture its place in the file's picture; NaN where it has none.
 
     Attributes:
-        x: columns in the file's picture, pixel centres at .5.
+        x: columns in the file's picture, pixel centers at .5.
         y: rows in the file's picture.
     """
 

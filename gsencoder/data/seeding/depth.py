@@ -21,9 +21,9 @@ RELATIVE_FLOOR = 1e-3
 SMOOTHING_RADIUS = 2
 """Half width in pixels of the window over which inverse depth is averaged."""
 BETWEEN = 0.3
-"""A pixel floats between two surfaces if the steps beyond its neighbours are below this share of those towards them."""
+"""A pixel floats between two surfaces if the steps beyond its neighbors are below this share of those towards them."""
 OCCLUSION = 0.01
-"""A pixel lies behind its neighbour's outline if that is nearer by this share of its depth, 15 mm at 1.5 m."""
+"""A pixel lies behind its neighbor's outline if that is nearer by this share of its depth, 15 mm at 1.5 m."""
 
 SMALLEST_DEPTH, LARGEST_DEPTH = 1e-9, 1e12
 """Depths outside are taken for a wrong scale, world units."""
@@ -49,7 +49,7 @@ def surface_pixels(
     """Smooths a depth image within its own noise, finds normals, and drops pixels that lie on no surface.
 
     Dropped are pixels without depth; pixels that lie between the two surfaces at a depth edge, since sensors mix both
-    there; pixels just behind an outline, whose colour is mixed with the nearer thing's; and surfaces seen at a slant
+    there; pixels just behind an outline, whose color is mixed with the nearer thing's; and surfaces seen at a slant
     beyond arccos(min_cos). The nearer side of an edge is kept: thin things consist of such pixels.
     """
     valid = depth > 0
@@ -83,7 +83,7 @@ def depth_samples(
     if views.depths is None:
         raise InputError("seeds: the scene has no depth images; use source=points or source=mesh")
     if views.images is None:
-        raise InputError("seeds: the scene has depth but no images, and seeds take their colour from the photographs")
+        raise InputError("seeds: the scene has depth but no images, and seeds take their color from the photographs")
     grid = SurfaceGrid(voxel, np.median(views.cameras.centers, axis=0))
     empty = []
     for view, name in enumerate(views.names):
@@ -140,7 +140,7 @@ def _second_difference_noise(inverse: np.ndarray, valid: np.ndarray) -> float:
 
 
 def _smooth(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> np.ndarray:
-    """Mean over a window, taken in pairs of opposite pixels whose line passes the centre within `step`.
+    """Mean over a window, taken in pairs of opposite pixels whose line passes the center within `step`.
 
     Pairs keep a plane a plane however steep it is: what one side adds, the other takes off.
     """
@@ -184,7 +184,7 @@ def _gradient(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> tuple
         np.maximum(np.hstack([none, size_before[:, :-1]]), np.hstack([size_after[:, 1:], none])) < BETWEEN * smaller
     )
     between = both & (before * after > 0) & (smaller > step) & flatter
-    # How much nearer the neighbour is, beyond what the pixel's own surface explains by its slope on the other side.
+    # How much nearer the neighbor is, beyond what the pixel's own surface explains by its slope on the other side.
     edge = np.maximum(step, np.float32(OCCLUSION) * inverse)
     behind = both & ((np.maximum(after, -before) > edge + 3 * smaller) | ((after > edge) & (-before > edge)))
     return gradient, between | behind

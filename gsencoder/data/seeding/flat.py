@@ -1,4 +1,4 @@
-"""Oriented points to flat Gaussians: rotation from the normal, size from the spacing of the neighbours."""
+"""Oriented points to flat Gaussians: rotation from the normal, size from the spacing of the neighbors."""
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -13,16 +13,16 @@ THICKNESS = 0.1
 """Standard deviation along the normal as a share of the in-plane one: about 1.2 mm at 2 cm."""
 OPACITY = 0.95
 """A measured surface is opaque; what lies behind it must not take its features. The last 5 % leave a later
-optimisation a gradient, which a logit of 7 (0.999) would not."""
-NEIGHBOURS = 12
+optimization a gradient, which a logit of 7 (0.999) would not."""
+NEIGHBORS = 12
 ENOUGH = 6
-"""So many neighbours of the same surface settle the spacing."""
+"""So many neighbors of the same surface settle the spacing."""
 SAME_FACING_COS = 0.5
 OVER_ANY = 1.5
 """… but it is at most so many times the spacing of all samples around, of whatever facing: two sheets make √2, and a
-scrap of surface with no like neighbour must not swell over the others."""
+scrap of surface with no like neighbor must not swell over the others."""
 STRETCH = 3.0
-"""A spacing may be so many times the median of the neighbours' own: a stray point must not become a great blob."""
+"""A spacing may be so many times the median of the neighbors' own: a stray point must not become a great blob."""
 """The constant spherical harmonic, 1 / (2√π)."""
 
 
@@ -40,7 +40,7 @@ def flat_gaussians(
         points: distinct positions in world units.
         normals: unit.
         colors: RGB in [0, 1].
-        largest: upper limit of the spacing, which also holds where there is no neighbour.
+        largest: upper limit of the spacing, which also holds where there is no neighbor.
         thickness: standard deviation along the normal as a share of the in-plane one.
     """
     size = (SIZE * surface_spacing(points, normals, largest)).astype(np.float32)
@@ -61,14 +61,14 @@ def surface_spacing(
 ) -> Float32[np.ndarray, " n"]:
     """Distance between samples of the same surface, √(area of a disc / samples in it), for each point.
 
-    The disc reaches to the ENOUGHth neighbour that faces the same way, so the sheet below a thin plate or the next
-    wall does not count. Limited to OVER_ANY times the spacing of all samples, STRETCH times the neighbours' median, and
+    The disc reaches to the ENOUGHth neighbor that faces the same way, so the sheet below a thin plate or the next
+    wall does not count. Limited to OVER_ANY times the spacing of all samples, STRETCH times the neighbors' median, and
     `largest`.
     """
     limit = np.broadcast_to(np.asarray(largest, np.float32), len(points))
     if len(points) < 2:
         return limit.copy()
-    distances, rows = nearest(points, points, NEIGHBOURS + 1)
+    distances, rows = nearest(points, points, NEIGHBORS + 1)
     distances, rows = distances[:, 1:], rows[:, 1:]
     alike = np.einsum("nkc,nc->nk", normals[rows], normals) > SAME_FACING_COS
     on_sheet, on_any = _disc_spacing(distances, alike), _disc_spacing(distances, np.ones_like(alike))
@@ -78,7 +78,7 @@ def surface_spacing(
 
 
 def _disc_spacing(distances: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Spacing by the disc that reaches to the ENOUGHth neighbour that counts, or the last one; infinite without any."""
+    """Spacing by the disc that reaches to the ENOUGHth neighbor that counts, or the last one; infinite without any."""
     count = np.minimum(counts.cumsum(axis=1), ENOUGH)
     last = count.argmax(axis=1)  # The first place where the largest count is reached.
     found = np.take_along_axis(count, last[:, None], 1)[:, 0]
@@ -101,7 +101,7 @@ def nearest(
 
 
 def quats_from_normals(normals: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
-    """The shortest rotation that takes the z axis to the normal, wxyz: (1 + n_z, −n_y, n_x, 0) normalised.
+    """The shortest rotation that takes the z axis to the normal, wxyz: (1 + n_z, −n_y, n_x, 0) normalized.
 
     The disc is round, so the turn about the normal is free. Normals of the lower half are negated first, which is the
     same disc and keeps away from the half turn, where the rotation is not defined.

@@ -27,7 +27,7 @@ def seed_from_mesh(path: str | Path, *, voxel: float, origin: Float64[np.ndarray
     """Flat Gaussians on a mesh file (.ply .obj .glb .stl .off …) or on a point cloud in one.
 
     Triangles are sampled on a lattice of half a voxel, corners included, then averaged on the grid: a fine mesh gives
-    its vertices' grid subsample, a coarse one has no holes. Colours come from the texture, the vertices or the faces,
+    its vertices' grid subsample, a coarse one has no holes. Colors come from the texture, the vertices or the faces,
     and are mid-grey where there are none. The parts of a scene graph are placed and joined.
 
     Args:
@@ -59,8 +59,8 @@ def seed_from_mesh(path: str | Path, *, voxel: float, origin: Float64[np.ndarray
     if not clouds or not sum(len(points) for points, _ in clouds):
         raise InputError(f"{path}: holds no triangles of any area and no points; give a mesh of the scene")
     points = np.concatenate([cloud for cloud, _ in clouds])
-    coloured = all(colors is not None and len(colors) == len(cloud) for cloud, colors in clouds)
-    tints = np.concatenate([np.asarray(colors)[:, :3] for _, colors in clouds]).astype(np.uint8) if coloured else None
+    colored = all(colors is not None and len(colors) == len(cloud) for cloud, colors in clouds)
+    tints = np.concatenate([np.asarray(colors)[:, :3] for _, colors in clouds]).astype(np.uint8) if colored else None
     return seed_from_points(points, tints, voxel=voxel)
 
 
@@ -121,7 +121,7 @@ def seed_from_tsdf(
         used += 1
         z = geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
         rgb = geometry.Image(core.Tensor(np.ascontiguousarray(image, np.float32) / np.float32(255)))
-        # open3d's pixel centres lie on whole numbers.
+        # open3d's pixel centers lie on whole numbers.
         K = views.cameras.Ks[view].astype(np.float64)
         K[:2, 2] -= 0.5
         intrinsic, pose = core.Tensor(K), core.Tensor(views.cameras.cam_from_world[view].astype(np.float64))
@@ -171,7 +171,7 @@ def _parts(path: Path) -> list[Any]:
 
 
 def _lattices(mesh: Any, vertices: np.ndarray, voxel: float, path: str | Path) -> Iterator[tuple[np.ndarray, ...]]:
-    """Samples of the triangles, some thousand triangles at a time: positions, normals, colours."""
+    """Samples of the triangles, some thousand triangles at a time: positions, normals, colors."""
     faces = np.asarray(mesh.faces, np.int64)
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
         raise InputError(

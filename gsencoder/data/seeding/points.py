@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.seeding.flat import NEIGHBOURS, THICKNESS, flat_gaussians, nearest
+from gsencoder.data.seeding.flat import NEIGHBORS, THICKNESS, flat_gaussians, nearest
 from gsencoder.types import Gaussians, Views
 
 LARGEST_ANGLE = 0.1
@@ -26,8 +26,8 @@ def seed_from_points(
 ) -> Gaussians:
     """Flat Gaussians on a point cloud, for example COLMAP's.
 
-    Points are averaged in voxels, get a normal from the principal axes of their 12 nearest neighbours, turned towards
-    the nearest camera, and a size from the spacing of those neighbours. Where the neighbours do not form a sheet
+    Points are averaged in voxels, get a normal from the principal axes of their 12 nearest neighbors, turned towards
+    the nearest camera, and a size from the spacing of those neighbors. Where the neighbors do not form a sheet
     the Gaussian is as thick as they are.
 
     Args:
@@ -38,7 +38,7 @@ def seed_from_points(
         largest_spacing: upper limit of a point's spacing, in median spacings of all points.
 
     Raises:
-        InputError: no points, values that are not finite, colours of another length, a voxel that is not positive.
+        InputError: no points, values that are not finite, colors of another length, a voxel that is not positive.
     """
     if not len(points):
         raise InputError("seeds: the scene has no points; seeds need points, depth images or a mesh")
@@ -46,7 +46,7 @@ def seed_from_points(
     if bad.size:
         raise InputError(f"seeds: {bad.size} of {len(points)} points are not finite (first: row {bad[0]}); remove them")
     if colors is not None and len(colors) != len(points):
-        raise InputError(f"seeds: expected {len(points)} colours, one a point, got {len(colors)}")
+        raise InputError(f"seeds: expected {len(points)} colors, one a point, got {len(colors)}")
     points, tints = average_in_voxels(points, colors_or_grey(points, colors), voxel)
     normals, flatness = sheet_normals(points)
     centers = None if views is None or not len(views) else views.cameras.centers
@@ -65,10 +65,10 @@ def seed_from_points(
 def colors_or_grey(
     points: Float32[np.ndarray, "P 3"], colors: UInt8[np.ndarray, "P 3"] | None
 ) -> UInt8[np.ndarray, "P 3"]:
-    """The points' colours; mid-grey, with a warning, where they have none."""
+    """The points' colors; mid-grey, with a warning, where they have none."""
     if colors is not None:
         return colors
-    warnings.warn(f"seeds: {len(points)} points without colours are made mid-grey", SceneWarning, stacklevel=3)
+    warnings.warn(f"seeds: {len(points)} points without colors are made mid-grey", SceneWarning, stacklevel=3)
     return np.full((len(points), 3), 128, np.uint8)
 
 
@@ -108,12 +108,12 @@ def typical_spacing(points: Float32[np.ndarray, "n 3"]) -> float:
 def sheet_normals(
     points: Float32[np.ndarray, "n 3"],
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
-    """Unit normals from the principal axes of each point's nearest neighbours, and how flat these lie.
+    """Unit normals from the principal axes of each point's nearest neighbors, and how flat these lie.
 
     Flatness is the ratio of the standard deviations along the normal and along the middle axis: 0 = a sheet, 1 = a
     ball. A lone pair or a line of points gives some perpendicular direction, and 1.
     """
-    _, rows = nearest(points, points, NEIGHBOURS + 1)
+    _, rows = nearest(points, points, NEIGHBORS + 1)
     normals = np.empty((len(points), 3), np.float32)
     flatness = np.empty(len(points), np.float32)
     for start in range(0, len(points), PCA_CHUNK):

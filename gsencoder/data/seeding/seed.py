@@ -1,6 +1,6 @@
-"""Initial Gaussians of a scene without optimisation (SplatDistill, section 3.1: surface samples on a 2 cm grid).
+"""Initial Gaussians of a scene without optimization (SplatDistill, section 3.1: surface samples on a 2 cm grid).
 
-One flat Gaussian stands on each piece of surface in each voxel, as wide as its neighbours are apart, in the colour
+One flat Gaussian stands on each piece of surface in each voxel, as wide as its neighbors are apart, in the color
 that the photographs show. Such a splat renders well enough for features to be lifted onto it at once.
 """
 
@@ -82,7 +82,7 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig()) -> Gaussians:
     """Initial Gaussians of a scene, relative to its origin; the scene's own Gaussians are not looked at.
 
     The voxel is `config.voxel` metres. Where the scene's unit is unknown it is, with a warning, for depth images one
-    hundredth of the median depth, for points their median nearest-neighbour distance, for a mesh one hundredth of the
+    hundredth of the median depth, for points their median nearest-neighbor distance, for a mesh one hundredth of the
     median distance from the cameras to its middle, or one 300th of its diagonal.
 
     Raises:
@@ -100,7 +100,7 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig()) -> Gaussians:
         points = scene.sfm_points
         if points is None:
             raise InputError(f"seeds: scene {scene.name!r} has no structure-from-motion points")
-        voxel = _voxel(scene, config, lambda: typical_spacing(points), "the points' median nearest-neighbour distance")
+        voxel = _voxel(scene, config, lambda: typical_spacing(points), "the points' median nearest-neighbor distance")
         return seed_from_points(points, scene.sfm_colors, views=views, voxel=voxel)
     if source == "mesh":
         mesh = config.mesh if scene.folder is None else file_of_scene("seeds.mesh", config.mesh, scene.folder)

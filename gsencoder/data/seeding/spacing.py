@@ -9,12 +9,12 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.types import Scene
 
 SPACING_SAMPLE = 100_000
-NEIGHBOUR = 4
-"""A point of a square grid has so many neighbours at one step."""
+NEIGHBOR = 4
+"""A point of a square grid has so many neighbors at one step."""
 
 
 def scene_spacing(means: Float32[np.ndarray, "N 3"]) -> float:
-    """Median distance from a point to its fourth nearest neighbour: the step of a grid laid on surfaces.
+    """Median distance from a point to its fourth nearest neighbor: the step of a grid laid on surfaces.
 
     The nearest one alone would not do: where two scans of one surface lie a little apart, points come in close pairs.
     Above 100,000 points, a sample of about that many asks (all answer); it is drawn by a hash of the coordinates, so
@@ -33,7 +33,7 @@ def scene_spacing(means: Float32[np.ndarray, "N 3"]) -> float:
         chosen = (mixed >> np.uint64(33)) % np.uint64(every) == 0
         asking = means[chosen] if chosen.any() else means
     # Column 0 is the point itself.
-    distances = np.asarray(cKDTree(means).query(asking, k=min(NEIGHBOUR, len(means) - 1) + 1)[0])
+    distances = np.asarray(cKDTree(means).query(asking, k=min(NEIGHBOR, len(means) - 1) + 1)[0])
     if (distances[:, 1] == 0).any():
         distinct = np.unique(means, axis=0)
         return scene_spacing(distinct) if len(distinct) < len(means) else 0.0

@@ -26,7 +26,7 @@ SAME_SURFACE_OFFSET = 0.1
 
 _LAYERS = 8
 _DIRECTIONS = 6
-_COLUMNS = 10  # position, normal, colour, count
+_COLUMNS = 10  # position, normal, color, count
 
 
 class SurfaceSamples(NamedTuple):
@@ -76,7 +76,7 @@ class SurfaceGrid:
                 f"seeds: a sample lies further than {reach:.6g} units ({1 << (AXIS_BITS - 1)} voxels) from the "
                 "cameras' middle; look at the pose, remove far samples (max_depth) or take a larger voxel"
             )
-        # The offset of the sample's own plane from the voxel's centre is at most √3/2 voxels: layers −3 … 3.
+        # The offset of the sample's own plane from the voxel's center is at most √3/2 voxels: layers −3 … 3.
         offset = np.einsum("ij,ij->i", points / np.float32(self.voxel) - cells - np.float32(0.5), normals)
         layer = np.clip(np.rint(offset / np.float32(LAYER)).astype(np.int64) + _LAYERS // 2, 0, _LAYERS - 1)
         axis = np.abs(normals).argmax(1)
@@ -89,7 +89,7 @@ class SurfaceGrid:
             self._join()
 
     def samples(self) -> SurfaceSamples:
-        """One sample for each surface in each voxel, ordered by voxel: mean position, normal and colour."""
+        """One sample for each surface in each voxel, ordered by voxel: mean position, normal and color."""
         self._join()
         if not self._rows:
             empty = np.zeros((0, 3), np.float32)

@@ -29,7 +29,7 @@ def is_compressed(header: PlyHeader) -> bool:
 
 
 def read_compressed(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> RawSplat:
-    """Unpacks 11-10-11 bits of position and scale, 2-10-10-10 of rotation, 8-8-8-8 of colour, 8 a SH coefficient."""
+    """Unpacks 11-10-11 bits of position and scale, 2-10-10-10 of rotation, 8-8-8-8 of color, 8 a SH coefficient."""
     chunk, vertex, rest = header.element("chunk"), header.element("vertex"), header.element("sh")
     if header.encoding == "ascii" or chunk is None or vertex is None:
         raise InputError(f"{path}: a packed .ply needs binary data with the elements 'chunk' and 'vertex'")
@@ -79,7 +79,7 @@ def read_compressed(path: Path, stream: BinaryIO, header: PlyHeader, size: int) 
     with np.errstate(over="ignore", invalid="ignore"):
         means = between(_BOUNDS, _shares(rows["packed_position"]))
         log_scales = between(_SCALE_BOUNDS, _shares(rows["packed_scale"])).astype(np.float32)
-        # Files before the colour bounds were introduced spread colours over 0 to 1.
+        # Files before the color bounds were introduced spread colors over 0 to 1.
         rgb = between(_COLOR_BOUNDS, rgba[:, :3]) if "min_r" in chunk_names else rgba[:, :3]
         sh = np.empty((count, coefficients + 1, 3), np.float32)
         sh[:, 0] = (rgb - 0.5) / SH_C0

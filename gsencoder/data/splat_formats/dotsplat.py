@@ -13,7 +13,7 @@ _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), (
 
 
 def read_dotsplat(path: Path, stream: BinaryIO, size: int) -> RawSplat:
-    """Colours are SH degree 0; scales are stored as standard deviations; quaternion bytes are 128 + 128·q."""
+    """Colors are SH degree 0; scales are stored as standard deviations; quaternion bytes are 128 + 128·q."""
     if size % _ROW.itemsize:
         raise InputError(
             f"{path}: {size:,} bytes is not a whole number of {_ROW.itemsize}-byte rows; the .splat is truncated"

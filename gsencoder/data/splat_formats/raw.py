@@ -29,11 +29,11 @@ class RawSplat:
     """One splat as its file stores it; nothing is checked but the structure.
 
     Attributes:
-        means: centres in the file's own coordinates.
-        quats: wxyz, of any length (INRIA files are not normalised).
+        means: centers in the file's own coordinates.
+        quats: wxyz, of any length (INRIA files are not normalized).
         log_scales: natural logarithms of the standard deviations; −inf where the file says 0 or less.
         logit_opacities: logits; formats that store 0 … 255 give ±20 at the two ends.
-        sh: colour coefficients, degree-major, K = 1, 4, 9 or 16.
+        sh: color coefficients, degree-major, K = 1, 4, 9 or 16.
         format: the file format in words.
     """
 

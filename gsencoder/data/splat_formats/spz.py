@@ -1,7 +1,7 @@
 """Niantic's .spz: 8-bit attributes and 24-bit fixed-point positions, in gzip (versions 2, 3) or zstd streams (4).
 
 Version 4 is not gzip: a 32-byte header in the clear, a table of compressed and unpacked sizes, one zstd frame an
-attribute. Sections lie in the order positions, alphas, colours, scales, rotations, SH in all versions.
+attribute. Sections lie in the order positions, alphas, colors, scales, rotations, SH in all versions.
 
 The format's convention is that y points up and z backwards. Numbers are read and written as they stand, as gsply and
 open3d do; a tool that turns the axes on export has to be turned back by the caller.

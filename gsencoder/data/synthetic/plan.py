@@ -1,4 +1,4 @@
-"""What stands where in a procedural room: furniture, and named objects in named colours that rest on it."""
+"""What stands where in a procedural room: furniture, and named objects in named colors that rest on it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ COLORS: dict[str, tuple[int, int, int]] = {
     "grey": (150, 150, 152),
     "brown": (122, 78, 42),
 }
-"""sRGB of the colour words that the rooms use."""
+"""sRGB of the color words that the rooms use."""
 OBJECT_COLORS = ("red", "blue", "yellow", "green", "purple", "pink", "orange", "black")
 HALF_ROOM = (1.7, 1.5)
 WALL_HEIGHT = 1.8
@@ -44,7 +44,7 @@ class PlannedObject:
         name: an English noun of the name table; None for floor and walls.
         color: its word in COLORS.
         parts: what it is made of, in world coordinates.
-        pattern: how its colour varies: plain, bands, or checks.
+        pattern: how its color varies: plain, bands, or checks.
         placed: False for the room and its furniture.
     """
 
@@ -64,7 +64,7 @@ class PlannedObject:
 def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
     """Floor, walls, table, shelf, then `objects` things with distinct names, from the seed alone.
 
-    Colours are distinct too for up to 8 objects.
+    Colors are distinct too for up to 8 objects.
 
     Raises:
         InputError: `objects` is below 0 or above the number of known things.
@@ -93,7 +93,7 @@ def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
 
 
 def _shuffled(rng: np.random.Generator, count: int) -> list[int]:
-    """`count` colour numbers, each colour once before any comes again."""
+    """`count` color numbers, each color once before any comes again."""
     rounds = -(-count // len(OBJECT_COLORS))
     return [int(row) for _ in range(rounds) for row in rng.permutation(len(OBJECT_COLORS))][:count]
 
@@ -141,7 +141,7 @@ def _radius(parts: tuple[Solid, ...]) -> float:
 
 
 def _box(x: float | int, y: float | int, z: float | int, at: tuple[float | int, ...]) -> Solid:
-    """A box of full sizes x y z whose lower face is centred at `at`."""
+    """A box of full sizes x y z whose lower face is centerd at `at`."""
     return Solid(shape="box", center=np.array([at[0], at[1], at[2] + z / 2]), half=np.array([x, y, z]) / 2)
 
 

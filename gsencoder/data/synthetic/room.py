@@ -37,15 +37,15 @@ def make_room(
 ) -> Scene:
     """A room of 3.4 × 3 m with a table, a shelf and named objects on them, in metres with z up.
 
-    Images are ray-cast without noise: flat colours with a pattern, one light, no shadows. Depth is exact z. Instance
+    Images are ray-cast without noise: flat colors with a pattern, one light, no shadows. Depth is exact z. Instance
     maps hold the objects' ids (floor 1, walls 2, table 3, shelf 4, the others from 5). Boxes are exact and full. The
-    Gaussians are flat discs on the visible surfaces with the colours of the images, `spacing` apart, closer on small
+    Gaussians are flat discs on the visible surfaces with the colors of the images, `spacing` apart, closer on small
     things, twice as far on the plain walls; what touches another surface is left out. The same arguments give the
     same bits on the same machine.
 
     Args:
         seed: decides what stands where.
-        objects: named things, with distinct names, and distinct colours up to 8.
+        objects: named things, with distinct names, and distinct colors up to 8.
         views: cameras on a ring around the table, looking at it.
         width: of the images, pixels.
         height: of the images.
@@ -80,7 +80,7 @@ def make_room(
 
 
 def color_words(seed: int = 0, *, objects: int = 8) -> dict[int, str]:
-    """The colour word of each object of `make_room(seed, objects=objects)`, by id."""
+    """The color word of each object of `make_room(seed, objects=objects)`, by id."""
     return {thing.id: thing.color for thing in plan_room(seed, objects=objects)}
 
 

@@ -116,13 +116,13 @@ def _round(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cells(half: float, spacing: float) -> np.ndarray:
-    """Centres in [−1, 1] of the fewest equal cells of at most `spacing`."""
+    """Centers in [−1, 1] of the fewest equal cells of at most `spacing`."""
     count = max(1, int(np.ceil(2 * half / spacing)))
     return (2 * np.arange(count) + 1) / count - 1
 
 
 def _face(half: np.ndarray, axis: int, spacing: float) -> np.ndarray:
-    """Cell centres on the two faces of the unit cube across `axis`."""
+    """Cell centers on the two faces of the unit cube across `axis`."""
     first, second = (other for other in range(3) if other != axis)
     u, v = (grid.ravel() for grid in np.meshgrid(_cells(half[first], spacing), _cells(half[second], spacing)))
     points = np.empty((2 * len(u), 3))

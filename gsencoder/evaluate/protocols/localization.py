@@ -1,4 +1,4 @@
-"""The localisation protocol: labelled scenes in, share of objects whose box was found out.
+"""The localization protocol: labeled scenes in, share of objects whose box was found out.
 
 For every scene: Gaussians (seeds where it has none), features (fused or encoded), and one box search for the names of
 its small objects that are seen well enough. Settings are the same for all scenes; a name's first box is held against
@@ -75,7 +75,7 @@ def evaluate_localization(
     """Runs the protocol scene by scene; one scene is in memory at a time.
 
     Args:
-        scenes: with labelled objects, as `opened` gives them.
+        scenes: with labeled objects, as `opened` gives them.
         source: what gives a scene its features.
         words: lead into their space.
         protocol: which objects are asked for.

@@ -1,6 +1,6 @@
-"""The naming protocol on labelled scenes: is the nearest word of a Gaussian's feature the one that it was fused from?
+"""The naming protocol on labeled scenes: is the nearest word of a Gaussian's feature the one that it was fused from?
 
-For every scene the choices are the names of its objects and "other", the normalised mean of the whole table. The truth
+For every scene the choices are the names of its objects and "other", the normalized mean of the whole table. The truth
 is the nearest of them to the feature that the labels teacher's maps are fused into. Only Gaussians that were seen
 count, and every name counts the same, however many Gaussians it has.
 """
@@ -67,7 +67,7 @@ def evaluate_naming(
     """Runs the protocol scene by scene; one scene is in memory at a time.
 
     Args:
-        scenes: labelled, with instance maps, as `opened` gives them.
+        scenes: labeled, with instance maps, as `opened` gives them.
         source: what gives a scene the features that are judged.
         words: of the labels teacher.
         seeds: how Gaussians are made for scenes without.
@@ -115,7 +115,7 @@ def compare_names(
         scene=name,
         total={teacher.names[code]: int(total[code]) for code in there},
         right={teacher.names[code]: int(right[code]) for code in there},
-        cosine=1 - field_error(features, truth).centred if features.space == truth.space else float("nan"),
+        cosine=1 - field_error(features, truth).centerd if features.space == truth.space else float("nan"),
         seconds=seconds,
     )
 

@@ -1,7 +1,7 @@
 """Features on disk: a folder that holds the Gaussians, the cameras and their features.
 
 Arrays are safetensors files, memory-mapped on load; features are float16 for seen rows only. The folder is all that
-localisation needs: no photographs, no teacher.
+localization needs: no photographs, no teacher.
 """
 
 from contextlib import AbstractContextManager

@@ -6,7 +6,7 @@ from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
-from gsencoder.fusion.teachers.palette import COLOUR_NAMES, PaletteConfig, PaletteTeacher
+from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.text.table import TextTable, load_text_table, make_text_table
 from gsencoder.types import Scene
@@ -21,8 +21,8 @@ def text_table_of(config: TeacherConfig) -> TextTable | None:
         InputError: the table cannot be found or read.
     """
     if isinstance(config, PaletteConfig):
-        names = np.eye(len(COLOUR_NAMES), dtype=np.float32)
-        return make_text_table(COLOUR_NAMES, names, PaletteTeacher(config).space.text_encoder)
+        names = np.eye(len(COLOR_NAMES), dtype=np.float32)
+        return make_text_table(COLOR_NAMES, names, PaletteTeacher(config).space.text_encoder)
     return load_text_table(find_file(config.words, "teacher.words")) if config.words else None
 
 

@@ -1,4 +1,4 @@
-"""The `labels` teacher: instance maps and a table of name embeddings. An exact oracle for labelled scenes."""
+"""The `labels` teacher: instance maps and a table of name embeddings. An exact oracle for labeled scenes."""
 
 import hashlib
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class LabelsConfig:
 
 
 class LabelsTeacher:
-    """Each pixel has the embedding of its object's name; pixels without a name the normalised mean of the table.
+    """Each pixel has the embedding of its object's name; pixels without a name the normalized mean of the table.
 
     The mean is a direction too, so "other" is something that a Gaussian can be, and not a hole. Maps are coded: an
     index for each pixel into the names of this scene. With `cell` above 1 they are dense: means over square cells,

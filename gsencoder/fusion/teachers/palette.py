@@ -1,4 +1,4 @@
-"""The `palette` teacher: photographs as shares of eleven colour names. Works offline on anything that has a picture."""
+"""The `palette` teacher: photographs as shares of eleven color names. Works offline on anything that has a picture."""
 
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -9,7 +9,7 @@ from jaxtyping import Float32, UInt8
 from gsencoder.core.errors import InputError
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
-# The eleven basic colour terms of English (Berlin & Kay 1969) and typical sRGB values, several where a name is wide.
+# The eleven basic color terms of English (Berlin & Kay 1969) and typical sRGB values, several where a name is wide.
 _PROTOTYPES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "black": ((12, 12, 12), (35, 35, 38)),
     "grey": ((80, 80, 80), (128, 128, 128), (170, 170, 172)),
@@ -24,7 +24,7 @@ _PROTOTYPES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "brown": ((120, 75, 40), (85, 50, 30), (160, 110, 70)),
 }
 
-COLOUR_NAMES = tuple(_PROTOTYPES)
+COLOR_NAMES = tuple(_PROTOTYPES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +56,7 @@ def lab_from_rgb(rgb: UInt8[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
 
 
 class PaletteTeacher:
-    """Soft assignment of each cell's mean colour to colour names, softmax(−distance² / 2·softness²) in L*a*b*.
+    """Soft assignment of each cell's mean color to color names, softmax(−distance² / 2·softness²) in L*a*b*.
 
     Its text side is one channel a word, so `query=red` is the first unit vector that a reader would expect.
     """
@@ -71,17 +71,17 @@ class PaletteTeacher:
         self.cell, self.softness = cell, softness = config.cell, config.softness
         self.space = FeatureSpace(
             name="palette-11",
-            channels=len(COLOUR_NAMES),
+            channels=len(COLOR_NAMES),
             teacher="palette",
             preprocessing=f"mean of {cell}×{cell} pixels, softness {softness:g} in L*a*b*",
             text_encoder="palette-11",
         )
-        lab = [lab_from_rgb(np.array(colours, np.uint8)) for colours in _PROTOTYPES.values()]
+        lab = [lab_from_rgb(np.array(colors, np.uint8)) for colors in _PROTOTYPES.values()]
         self._centers = np.concatenate(lab)
         self._owner = np.repeat(np.arange(len(lab)), [len(part) for part in lab])
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """Colour-name shares on a grid of cells; pixels over the last whole cell are left out.
+        """Color-name shares on a grid of cells; pixels over the last whole cell are left out.
 
         Raises:
             InputError: the scene has no pictures, or one smaller than a cell.
@@ -101,10 +101,10 @@ class PaletteTeacher:
         )
 
     def name_shares(self, rgb: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 11"]:
-        """Share of each colour name, summing to 1."""
+        """Share of each color name, summing to 1."""
         lab = lab_from_rgb(rgb)
         distance = ((lab[:, None] - self._centers) ** 2).sum(axis=-1)
-        nearest = np.stack([distance[:, self._owner == k].min(axis=1) for k in range(len(COLOUR_NAMES))], axis=1)
+        nearest = np.stack([distance[:, self._owner == k].min(axis=1) for k in range(len(COLOR_NAMES))], axis=1)
         score = -nearest / (2 * self.softness**2)
         score = np.exp(score - score.max(axis=1, keepdims=True))
         return (score / score.sum(axis=1, keepdims=True)).astype(np.float32)

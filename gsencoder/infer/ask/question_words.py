@@ -9,7 +9,7 @@ from gsencoder.text.table import TextTable
 PRONOUNS = frozenset({"i", "you", "we", "they", "he", "she", "one", "someone", "anyone"})
 """A name right after one of these is a verb (watch), and so is `can` right before one."""
 COLORS = frozenset({"orange", "peach", "plum", "lime", "olive", "rose", "lavender", "chocolate"})
-"""Such a name right before another one is a colour."""
+"""Such a name right before another one is a color."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ def words_in(text: str, table: TextTable) -> tuple[str, ...]:
             found.append((start, start + length, table.names[row]))
         start += length
     begins = {begin for begin, _, _ in found}
-    # A colour belongs to the name after it.
+    # A color belongs to the name after it.
     kept = [name for _, end, name in found if not (name.lower() in COLORS and end in begins and tokens[end].joined)]
     return tuple(dict.fromkeys(kept))
 

@@ -60,7 +60,7 @@ class Heard:
         choices = getattr(part, "choices", None)
         if choices is None:
             told = getattr(part, "model_extra", None) or {}
-            # Whole, as half a key could not be recognised; who reports it takes the key out and then cuts it.
+            # Whole, as half a key could not be recognized; who reports it takes the key out and then cuts it.
             raise ValueError(str(told.get("error") or told.get("message") or told.get("detail") or part))
         self.parts += 1
         self.model = str(getattr(part, "model", "") or self.model)

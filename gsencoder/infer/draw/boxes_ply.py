@@ -1,4 +1,4 @@
-"""Boxes as a coloured point cloud that MeshLab, CloudCompare and Open3D show."""
+"""Boxes as a colored point cloud that MeshLab, CloudCompare and Open3D show."""
 
 from pathlib import Path
 
@@ -16,11 +16,11 @@ _TEN = (
     (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189),
     (140, 86, 75), (227, 119, 194), (127, 127, 127), (188, 189, 34), (23, 190, 207),
 )  # fmt: skip
-"""Tableau's ten colours, which matplotlib calls tab10."""
+"""Tableau's ten colors, which matplotlib calls tab10."""
 
 
 def word_color(index: int) -> tuple[int, int, int]:
-    """The colour of a localisation's word, by its place; ten differ, then they repeat."""
+    """The color of a localization's word, by its place; ten differ, then they repeat."""
     return _TEN[index % len(_TEN)]
 
 
@@ -39,7 +39,7 @@ def write_boxes_ply(
     *,
     oriented: bool = False,
 ) -> None:
-    """Writes the Gaussians of all boxes as points in their word's colour, and the boxes' edges.
+    """Writes the Gaussians of all boxes as points in their word's color, and the boxes' edges.
 
     Edges are drawn as rows of points (every viewer shows those) and listed as `edge` elements between the corners (for
     those that draw lines). Boxes after a word's first are darker. Positions are doubles in world coordinates.

@@ -1,4 +1,4 @@
-"""Pictures of results: relevancy over views, boxes in views, features as colours, depth, sheets of all of them.
+"""Pictures of results: relevancy over views, boxes in views, features as colors, depth, sheets of all of them.
 
 Pictures are uint8 [H, W, 3], RGB. What is shown arrives as arrays that were rendered elsewhere.
 """
@@ -33,7 +33,7 @@ def label_font(size: int) -> ImageFont.FreeTypeFont:
 
 @lru_cache(maxsize=4)
 def _colormap(name: str) -> np.ndarray:
-    """A matplotlib colour map as 256 colours."""
+    """A matplotlib color map as 256 colors."""
     from matplotlib import colormaps
 
     return (np.asarray(colormaps[name](np.arange(256)))[:, :3] * 255).round().astype(np.uint8)
@@ -65,7 +65,7 @@ def relevancy_overlay(
     high: float = 1.0,
     opacity: float = 0.6,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Relevancy as colour (turbo: blue low, red high) over the grey view; NaN shows the grey view alone.
+    """Relevancy as color (turbo: blue low, red high) over the grey view; NaN shows the grey view alone.
 
     The ends are given, not found, so that pictures of different views and words can be compared.
 
@@ -108,7 +108,7 @@ def draw_boxes(
 ) -> UInt8[np.ndarray, "H2 W2 3"]:
     """Draws the 12 edges of boxes, and word and score of each; edges end at the near plane.
 
-    Small pictures are enlarged by a whole factor first (`legible_factor`). Words take colours in order of appearance.
+    Small pictures are enlarged by a whole factor first (`legible_factor`). Words take colors in order of appearance.
     Edges behind surfaces are drawn too.
 
     Args:
@@ -181,7 +181,7 @@ def _clip_to_picture(segment: Float64[np.ndarray, "2 2"], width: int, height: in
 
 
 def ink_on(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Black or white, whichever is legible on a colour."""
+    """Black or white, whichever is legible on a color."""
     bright = float(np.dot(color, [0.299, 0.587, 0.114])) > 140
     return (0, 0, 0) if bright else (255, 255, 255)
 
@@ -213,7 +213,7 @@ def _draw_labels(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PcaColors:
-    """One map from features to colours for all views of a scene.
+    """One map from features to colors for all views of a scene.
 
     Attributes:
         mean: of the features that it was fitted to.
@@ -228,7 +228,7 @@ class PcaColors:
 
 
 def fit_pca_colors(features: Float32[np.ndarray, "n R"], *, sample: int = 50_000) -> PcaColors:
-    """Fits colours to features or basis coordinates, such as those of all seen Gaussians.
+    """Fits colors to features or basis coordinates, such as those of all seen Gaussians.
 
     Signs are chosen so that the largest entry of each direction is positive; fewer than three directions leave a
     channel at its middle.
@@ -237,7 +237,7 @@ def fit_pca_colors(features: Float32[np.ndarray, "n R"], *, sample: int = 50_000
         InputError: no features.
     """
     if len(features) == 0:
-        raise InputError("fit_pca_colors: no features to fit colours to; were any Gaussians seen?")
+        raise InputError("fit_pca_colors: no features to fit colors to; were any Gaussians seen?")
     chosen = features[:: max(1, len(features) // sample)].astype(np.float64)
     mean = chosen.mean(axis=0)
     _, directions = np.linalg.eigh((chosen - mean).T @ (chosen - mean))
@@ -253,7 +253,7 @@ def fit_pca_colors(features: Float32[np.ndarray, "n R"], *, sample: int = 50_000
 def pca_picture(
     features: Float32[np.ndarray, "h w R"], colors: PcaColors, alpha: Float32[np.ndarray, "h w"] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A rendered feature map as colours that mean the same in every view.
+    """A rendered feature map as colors that mean the same in every view.
 
     With `alpha`, what was composited is divided by it first, and fades to white where nothing was hit.
     """
@@ -269,7 +269,7 @@ def pca_picture(
 def depth_picture(
     depth: Float32[np.ndarray, "H W"], *, low: float | None = None, high: float | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth as colour (viridis, near is bright); 0, NaN and Inf, which mean none, are dark grey.
+    """Depth as color (viridis, near is bright); 0, NaN and Inf, which mean none, are dark grey.
 
     Args:
         depth: z, in world units.

@@ -84,7 +84,7 @@ class HtmlReport:
             pictures: uint8 RGB.
             captions: one a picture.
             cell: smallest width of a picture on the page, in CSS pixels.
-            lossless: PNG, not JPEG: for plots and flat colours.
+            lossless: PNG, not JPEG: for plots and flat colors.
 
         Raises:
             InputError: another number of captions than pictures.

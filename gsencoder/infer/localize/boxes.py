@@ -20,7 +20,7 @@ FLAT = 1e-5
 def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) -> Int64[np.ndarray, " n"]:
     """DBSCAN labels (Ester et al. 1996), −1 = in no cluster.
 
-    scikit-learn keeps the neighbours of every point, which on a dense splat grows with the square of the density.
+    scikit-learn keeps the neighbors of every point, which on a dense splat grows with the square of the density.
     Above 50,000 points the clusters are therefore found between the occupied cells of a grid of eps / 4, each weighing
     as many points as it holds, and points take the label of their cell: distances are then off by up to 0.43 eps.
     """
@@ -67,7 +67,7 @@ def score_clusters(
 
     How well a cluster answers comes first (an object of the asked name has a mean near the best there is, its
     look-alikes do not), and how much of the answer it holds second: the fourth root lets one object in four keep 71 %
-    of its score, and leaves floaters of a thousandth with 18 %. On labelled scenes the mean alone does equally well,
+    of its score, and leaves floaters of a thousandth with 18 %. On labeled scenes the mean alone does equally well,
     a square root or the summed relevancy worse, as a large look-alike then outweighs a small object.
 
     Args:
@@ -126,7 +126,7 @@ def box_around(
     Args:
         gaussians: the splat.
         rows: at least one of its rows.
-        extent: "means" bounds the centres; "sigma" bounds the ellipsoids of `sigmas` standard deviations, whose
+        extent: "means" bounds the centers; "sigma" bounds the ellipsoids of `sigmas` standard deviations, whose
             half-width along a unit vector a is sigmas·√(aᵀΣa).
         sigmas: see there.
         margin: length added on every side.
@@ -158,34 +158,34 @@ def oriented_axes(
 ) -> Float64[np.ndarray, "3 3"]:
     """Axes (columns, right-handed) of the smallest box around points, or of the smallest that stands along `up`.
 
-    Points in a plane, on a line or in one place have no volume to minimise: the box then lies in the plane with the
+    Points in a plane, on a line or in one place have no volume to minimize: the box then lies in the plane with the
     smallest area, along the line, or along the world's axes.
     """
-    centred = points - points.mean(axis=0)
+    centerd = points - points.mean(axis=0)
     if up is not None:
         third = up / math.sqrt(float(up @ up))
-        return _about(third, _smallest_rectangle(centred @ _plane(third)))
+        return _about(third, _smallest_rectangle(centerd @ _plane(third)))
     # Eigenvectors of the 3×3 scatter suffice to tell which directions are empty; extents are measured along them.
-    _, axes = np.linalg.eigh(centred.T @ centred)
-    spans = np.ptp(centred @ axes, axis=0)[::-1]
+    _, axes = np.linalg.eigh(centerd.T @ centerd)
+    spans = np.ptp(centerd @ axes, axis=0)[::-1]
     axes = axes[:, ::-1]
     empty = spans <= FLAT * max(float(spans.max(initial=0)), 1e-300)
     if spans.max(initial=0) == 0:
         return np.eye(3)
     if not empty[2]:
-        return _smallest_box_axes(centred, axes)
+        return _smallest_box_axes(centerd, axes)
     if empty[1]:
         return _right_handed(axes)
-    return _about(axes[:, 2], _smallest_rectangle(centred @ _plane(axes[:, 2])))
+    return _about(axes[:, 2], _smallest_rectangle(centerd @ _plane(axes[:, 2])))
 
 
-def _smallest_box_axes(centred: Float64[np.ndarray, "n 3"], principal: np.ndarray) -> Float64[np.ndarray, "3 3"]:
+def _smallest_box_axes(centerd: Float64[np.ndarray, "n 3"], principal: np.ndarray) -> Float64[np.ndarray, "3 3"]:
     """The box of least volume with a side on a face of the convex hull (trimesh); principal axes without a hull."""
     from scipy.spatial import QhullError
     from trimesh.bounds import oriented_bounds
 
     try:
-        to_origin, _ = oriented_bounds(centred, ordered=False)
+        to_origin, _ = oriented_bounds(centerd, ordered=False)
     except (QhullError, ValueError):
         return _right_handed(principal)
     axes = to_origin[:3, :3].T
@@ -205,8 +205,8 @@ def _smallest_rectangle(flat: Float64[np.ndarray, "n 2"]) -> float:
     except QhullError:
         corners = None
     if corners is None:  # Two points, or all on a line.
-        centred = flat - flat.mean(axis=0)
-        longest = np.linalg.eigh(centred.T @ centred)[1][:, 1]
+        centerd = flat - flat.mean(axis=0)
+        longest = np.linalg.eigh(centerd.T @ centerd)[1][:, 1]
         return float(np.arctan2(longest[1], longest[0]))
     sides = np.roll(corners, -1, axis=0) - corners
     angles = np.unique(np.round(np.arctan2(sides[:, 1], sides[:, 0]) % (np.pi / 2), 12))

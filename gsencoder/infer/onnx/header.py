@@ -37,7 +37,7 @@ ARRAYS = ("mean", "components", "words", "words_mean", "words_scale")
 MOST_DEFLATED = 20
 """Bytes that a character of text may stand for, where an array is large."""
 WORD_STEPS = 63
-"""Largest integer of a word's embedding in an int8 file: seven bits leave centred cosines of 0.9995 or more."""
+"""Largest integer of a word's embedding in an int8 file: seven bits leave centerd cosines of 0.9995 or more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,7 +161,7 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
 
 
 def with_sum(model: bytes) -> bytes:
-    """A serialised model whose entry `SUM` is filled in."""
+    """A serialized model whose entry `SUM` is filled in."""
     place = _sum_place(model)
     if place is None:
         raise ValueError(f"the model has no entry {SUM}")

@@ -52,12 +52,12 @@ def search(keys: INT64, wanted: INT64, more: INT64) -> INT64:
 
 @script(OURS, default_opset=op)
 def in_blocks(neighbors: INT32) -> INT32:
-    """Neighbourhoods in blocks of some rows, [blocks, rows, 27], so that what a block takes stays in the cache."""
+    """Neighborhoods in blocks of some rows, [blocks, rows, 27], so that what a block takes stays in the cache."""
     first = op.Constant(value_ints=[0])
     rows = op.Gather(op.Shape(neighbors), first)
     blocks = (rows + (ROWS_AT_ONCE - 1)) / ROWS_AT_ONCE
     size = (rows + blocks - 1) / blocks
-    # Rows that fill up the last block have no neighbours: they read the row of zeros, as missing cells do.
+    # Rows that fill up the last block have no neighbors: they read the row of zeros, as missing cells do.
     missing = op.Concat(blocks * size - rows, op.Constant(value_ints=[27]), axis=0)
     filled = op.Concat(neighbors, op.Expand(op.CastLike(rows, neighbors), missing), axis=0)
     return op.Reshape(filled, op.Concat(blocks, size, op.Constant(value_ints=[27]), axis=0))
@@ -65,7 +65,7 @@ def in_blocks(neighbors: INT32) -> INT32:
 
 @script(OURS, default_opset=op)
 def out_of_blocks(found: FLOAT, neighbors: INT32) -> FLOAT:
-    """The rows of all blocks, [blocks, rows, channels], as many as there are neighbourhoods."""
+    """The rows of all blocks, [blocks, rows, channels], as many as there are neighborhoods."""
     first, last = op.Constant(value_ints=[0]), op.Constant(value_ints=[2])
     flat = op.Reshape(found, op.Concat(op.Constant(value_ints=[-1]), op.Gather(op.Shape(found), last), axis=0))
     return op.Slice(flat, first, op.Gather(op.Shape(neighbors), first), first)
@@ -173,7 +173,7 @@ for _name, _inputs, _type in (
 
 
 def simplified(graph: ir.Model) -> onnx.ModelProto:
-    """A graph without what is constant, unused or there twice. It takes seconds, where the exporter's own optimisation,
+    """A graph without what is constant, unused or there twice. It takes seconds, where the exporter's own optimization,
     which also tries hundreds of rules, takes most of a minute and gives no faster a graph."""
     optimizer.fold_constants(graph, input_size_limit=FOLDED, output_size_limit=FOLDED)
     for each in (

@@ -26,7 +26,7 @@ def frames_on(
     """The frames that show most of the targets as far as a few rays tell, ascending; at most so many.
 
     Targets take turns. Each takes its best frames for half of the places, and for the others some from all along the
-    recording, so that the frames of a film are not all neighbours.
+    recording, so that the frames of a film are not all neighbors.
 
     Args:
         cameras: the scene's.

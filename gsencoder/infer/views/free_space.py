@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Integer
 
 from gsencoder.core.even_indices import evenly
 from gsencoder.core.runtime.threads import parallel
-from gsencoder.data.seeding.spacing import NEIGHBOUR
+from gsencoder.data.seeding.spacing import NEIGHBOR
 from gsencoder.geometry import covariances, transform
 from gsencoder.infer.views.split_gaussians import SIGMAS, patches
 from gsencoder.render import BlendConfig, blend
@@ -49,7 +49,7 @@ class FreeSpace:
         self._gaussians, self._quats = gaussians, gaussians.quats[solid]
         means = gaussians.means[solid].astype(np.float64)
         asked = means[evenly(len(means), SPACING_SAMPLE)]
-        distances = cKDTree(means).query(asked, k=[min(NEIGHBOUR + 1, len(means))])[0]
+        distances = cKDTree(means).query(asked, k=[min(NEIGHBOR + 1, len(means))])[0]
         # Of a single Gaussian, and of many in one place, the size is known.
         self.cell = CELL * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))
         self._patches = patches(gaussians.select(solid), self.cell)
@@ -125,8 +125,8 @@ class FreeSpace:
     def clearance(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
         """World units from each point to the nearest surface, less than zero inside a Gaussian.
 
-        A surface lies two standard deviations from the centre of a patch. The plane that touches it there, across
-        the line from the centre to the point, is no farther away than the surface; of the nearest patches.
+        A surface lies two standard deviations from the center of a patch. The plane that touches it there, across
+        the line from the center to the point, is no farther away than the surface; of the nearest patches.
         """
         parts = self._patches
         count = min(NEAREST, len(parts.rows))

@@ -28,7 +28,7 @@ CLEARANCE = 0.2
 OUTLINE = 16
 """Cells along a target's radius in which its outline is counted."""
 BESIDE = 1.5
-"""Rays that tell what is behind a target pass so many radii beside its centre."""
+"""Rays that tell what is behind a target pass so many radii beside its center."""
 SAMPLE = 1000
 """Gaussians of a target that tell its outline."""
 

@@ -11,7 +11,7 @@ from gsencoder.geometry import rotmats_from_quats
 from gsencoder.types import Gaussians
 
 SIGMAS = 2.0
-"""A surface ends so many standard deviations from a Gaussian's centre."""
+"""A surface ends so many standard deviations from a Gaussian's center."""
 WHOLE = 2.0
 """What is no longer than so many edges stays whole."""
 MOST_OF_ONE = 4096

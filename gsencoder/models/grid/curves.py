@@ -27,7 +27,7 @@ def curves_of(
     """A scene along its curves; None where it has too many cells for one set of codes, and each part has its own.
 
     Args:
-        means: centres, world units; at least one.
+        means: centers, world units; at least one.
         voxel: edge of the finest grid, world units; each level below doubles it.
         levels: how many there are.
         orders: the curves that attention follows.

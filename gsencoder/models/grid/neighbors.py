@@ -7,10 +7,10 @@ from jaxtyping import Float, Int32, Int64, Integer
 from torch import Tensor, nn
 
 CELLS = 27
-"""Cells of a 3×3×3 neighbourhood; number 9·(dx+1) + 3·(dy+1) + (dz+1), so 13 is the cell itself, 26 − o faces o."""
+"""Cells of a 3×3×3 neighborhood; number 9·(dx+1) + 3·(dy+1) + (dz+1), so 13 is the cell itself, 26 − o faces o."""
 
 ROWS_AT_ONCE = 8192
-"""Rows whose neighbourhoods are gathered together on a CPU: what they take stays in the cache."""
+"""Rows whose neighborhoods are gathered together on a CPU: what they take stays in the cache."""
 
 
 AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))
@@ -63,10 +63,10 @@ def neighbor_table(cells: Int64[Tensor, "N 3"]) -> Int32[Tensor, "N 27"]:
 
 
 class NeighborConv(nn.Module):
-    """A convolution over occupied cells alone: out[i] = Σ_o W_o x[neighbour o of i] + bias, missing cells being zero.
+    """A convolution over occupied cells alone: out[i] = Σ_o W_o x[neighbor o of i] + bias, missing cells being zero.
 
-    It gathers neighbourhoods and multiplies once, which needs nothing but torch; the gradient is the same convolution
-    with facing weights, since the neighbourhood is symmetric, so that nothing is summed by atomics.
+    It gathers neighborhoods and multiplies once, which needs nothing but torch; the gradient is the same convolution
+    with facing weights, since the neighborhood is symmetric, so that nothing is summed by atomics.
     """
 
     def __init__(self, channels_in: int, channels_out: int) -> None:

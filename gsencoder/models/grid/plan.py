@@ -1,6 +1,6 @@
 """Plans: everything about a cloud of Gaussians that does not depend on features, worked out once and then reused.
 
-Gaussians are merged on a grid into tokens. Each level of the network has its tokens' neighbours, the order in which
+Gaussians are merged on a grid into tokens. Each level of the network has its tokens' neighbors, the order in which
 attention cuts them into patches, and the way down to the next level and back. Tokens are kept in Morton order, so that
 whatever lies close in space lies close in memory.
 """
@@ -118,7 +118,7 @@ def plan_cloud(
     """The plan of one cloud.
 
     Args:
-        means: centres in world units.
+        means: centers in world units.
         voxel: edge of the finest grid, world units; each level below doubles it.
         levels: how many there are.
         orders: the curves that attention follows, in turn.
@@ -223,7 +223,7 @@ def _join_levels(parts: Sequence[CloudLevel], patch: int, size: Callable[[int], 
     orders = _shifted([part.orders for part in parts], sizes, dim=1)
     places, slots, used = _patches(_lengths(parts, patch), size)
     scatters = torch.empty_like(orders).scatter_(1, orders, slots.expand_as(orders))
-    # Tokens that stand for nothing have no neighbours, are in no patch and no real token's children, and whatever is
+    # Tokens that stand for nothing have no neighbors, are in no patch and no real token's children, and whatever is
     # read for them is never used.
     return Level(
         neighbors=neighbors,

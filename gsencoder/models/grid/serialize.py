@@ -1,6 +1,6 @@
 """Space-filling orders of grid cells: Morton and Hilbert codes and their transposed forms (PTv3, Wu et al. 2024).
 
-A code is an int64 whose sorted order visits cells so that neighbours in the order are neighbours in space. Codes are
+A code is an int64 whose sorted order visits cells so that neighbors in the order are neighbors in space. Codes are
 hierarchical: `code >> 3` is the code of the cell twice as large, so one set of codes serves every level of pooling.
 
 Everything here is written in operators that numpy's arrays and torch's tensors share: plans are made of tensors, and a
@@ -91,7 +91,7 @@ def morton_codes(cells: Int64[Any, "N 3"]) -> Int64[Any, " N"]:
 
 
 def hilbert_from_morton(morton: Int64[Any, " N"], bits: int) -> Int64[Any, " N"]:
-    """Positions along Hilbert's curve, which only ever steps to a face neighbour.
+    """Positions along Hilbert's curve, which only ever steps to a face neighbor.
 
     Hamilton 2006, "Compact Hilbert indices": the curve within a cell is one of 24 orientations, and a table gives,
     for an orientation and the octants of the next two levels, their places on the curve and the orientation inside.
