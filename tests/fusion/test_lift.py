@@ -74,16 +74,6 @@ def test_a_center_is_lifted_from_the_cell_that_it_projects_into() -> None:
     assert (b.weight == 1).all()
 
 
-def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([10.0, 11.0, 20.0, 22.5, 30.0, 34.0])
-    monkeypatch.setattr("gsencoder.fusion.lift.time.perf_counter", lambda: next(times))
-    clock = Clock()
-    for step in ("blend", "lift", "blend"):
-        with clock(step):
-            pass
-    assert clock.seconds == {"blend": 5.0, "lift": 2.5}
-
-
 @pytest.mark.parametrize(
     ("across", "down", "rays", "most"),
     [(4, 4, 64, 16), (4, 4, 16, 16), (4, 4, 9, 9), (4, 9, 100, 36), (1, 1, 16, 1), (0.5, 0.5, 16, 1), (1, 1, 1, 1)],
