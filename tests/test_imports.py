@@ -1,8 +1,10 @@
-"""Imports go down only, and what a torch-free runtime needs does not import torch."""
+"""Imports go down only and never in a circle; what a torch-free runtime needs does not import torch."""
 
 import ast
 import subprocess
 import sys
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -70,33 +72,38 @@ def public_names() -> dict[str, str]:
     return {name: home.split(".")[1] for name, home in gsencoder._HOME.items()}
 
 
-def imports_of(source: str, module: str, lazy: dict[str, str]) -> list[tuple[int, str]]:
-    """Line and part of every import of the package in a file, wherever it stands, also by `import_module("…")`.
+def imported_names(source: str, module: str) -> list[tuple[int, str]]:
+    """Line and dotted name of every import of a file, wherever it stands, also by `import_module("…")`.
 
     Args:
         source: the text of the file.
         module: its dotted name, for relative imports; that of a package ends in `.__init__`.
-        lazy: the parts that names taken from `gsencoder` itself come from.
     """
-    found = []
+    names: list[tuple[int, str]] = []
     for node in ast.walk(ast.parse(source)):
-        names: list[str] = []
-        line = getattr(node, "lineno", 0)
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = ".".join(module.split(".")[: -node.level]) if node.level else ""
             base = ".".join(filter(None, [base, node.module]))
-            names = [f"{base}.{alias.name}" for alias in node.names]
+            names += [(node.lineno, f"{base}.{alias.name}") for alias in node.names]
         elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
-            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            if name in ("import_module", "__import__") and isinstance(node.args[0].value, str):
-                names = [node.args[0].value]
-        for name in names:
-            pieces = name.split(".")
-            if pieces[0] == "gsencoder" and len(pieces) > 1:
-                found.append((line, lazy.get(pieces[1], pieces[1])))
-    return found
+            function = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            if function in ("import_module", "__import__") and isinstance(node.args[0].value, str):
+                names.append((node.lineno, node.args[0].value))
+    return names
+
+
+def imports_of(source: str, module: str, lazy: dict[str, str]) -> list[tuple[int, str]]:
+    """Line and part of every import of the package in a file.
+
+    Args:
+        source: the text of the file.
+        module: its dotted name.
+        lazy: the parts that names taken from `gsencoder` itself come from.
+    """
+    pieces = [(line, name.split(".")) for line, name in imported_names(source, module)]
+    return [(line, lazy.get(each[1], each[1])) for line, each in pieces if each[0] == "gsencoder" and len(each) > 1]
 
 
 def upward(source: str, module: str, lazy: dict[str, str]) -> list[str]:
@@ -116,13 +123,61 @@ def files() -> list[Path]:
 
 
 def test_every_part_of_the_package_has_its_level() -> None:
-    assert {part_of(path) for path in files()} <= set(RANK)
+    assert {part_of(path) for path in files()} == set(RANK)
+
+
+def module_of(path: Path) -> str:
+    """The dotted name of a file; that of a package ends in `.__init__`."""
+    return ".".join(("gsencoder", *path.relative_to(PACKAGE).with_suffix("").parts))
+
+
+def circle(imports: dict[str, list[str]], folder: str) -> list[str]:
+    """Children of a folder, files or folders, that import each other around a circle; empty where there is none.
+
+    Args:
+        imports: imported dotted names by dotted name of the importing module.
+        folder: its dotted name.
+    """
+    graph: dict[str, set[str]] = {}
+    for module, names in imports.items():
+        if module.startswith(f"{folder}."):
+            child = module[len(folder) + 1 :].split(".")[0]
+            children = {name[len(folder) + 1 :].split(".")[0] for name in names if name.startswith(f"{folder}.")}
+            graph.setdefault(child, set()).update(children - {child})
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+@cache
+def imports_by_module() -> dict[str, list[str]]:
+    """The dotted names that each module of the package imports."""
+    sources = {module_of(path): path.read_text(encoding="utf-8") for path in files()}
+    return {module: [name for _, name in imported_names(text, module)] for module, text in sources.items()}
+
+
+FOLDERS = sorted({path.parent for path in files()})
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: str(folder.relative_to(PACKAGE.parent)))
+def test_the_children_of_a_folder_import_each_other_in_one_direction(folder: Path) -> None:
+    assert circle(imports_by_module(), ".".join(("gsencoder", *folder.relative_to(PACKAGE).parts))) == []
+
+
+def test_a_circle_is_seen_between_files_and_between_folders() -> None:
+    files_of_one = {"p.f.a": ["p.f.b.name"], "p.f.b": ["p.f.c"], "p.f.c": ["p.f.a.other"], "p.f.d": ["p.f.a"]}
+    assert set(circle(files_of_one, "p.f")) == {"a", "b", "c"}
+    assert circle(files_of_one, "p") == []
+    folders = {"p.f.a": ["p.g.b"], "p.g.c": ["p.f.d"]}
+    assert set(circle(folders, "p")) == {"f", "g"}
+    assert circle(folders, "p.f") == []
 
 
 @pytest.mark.parametrize("path", files(), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_go_down_only(path: Path) -> None:
-    module = ".".join(("gsencoder", *path.relative_to(PACKAGE).with_suffix("").parts))
-    assert upward(path.read_text(encoding="utf-8"), module, public_names()) == []
+    assert upward(path.read_text(encoding="utf-8"), module_of(path), public_names()) == []
 
 
 def test_the_package_itself_imports_nothing_at_load() -> None:

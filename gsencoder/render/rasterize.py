@@ -93,8 +93,12 @@ def rasterize(
     if backend == "gsplat":
         from gsencoder.render.raster_gsplat import rasterize_gsplat
 
+        splat = (means, quats, scales, opacities, colors)
+        stop = config.stop_transmittance
         return Raster(
-            *rasterize_gsplat(means, quats, scales, opacities, colors, cam_from_world, K, width, height, config)
+            *rasterize_gsplat(
+                *splat, cam_from_world, K, width, height, near=config.near, eps2d=config.eps2d, stop_transmittance=stop
+            )
         )
     knobs = {"eps2d": config.eps2d, "near": config.near}
     projected = geometry.project(means, quats, scales, opacities, cam_from_world, K, width, height, **knobs)

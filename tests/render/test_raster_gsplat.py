@@ -34,17 +34,18 @@ def stand_in(
     found = rasterize(means, quats, scales, opacities, colors, viewmats[0], Ks[0], width, height, config=config)
     rendered = torch.cat((found.rgb, found.depth.unsqueeze(-1)), dim=-1)
     radii = found.radii.ceil().int()
-    told = {"radii": torch.stack((radii, radii // 2), dim=-1)[None], "means2d": found.means2d[None]}
-    return rendered[None], found.alpha[None, ..., None], told
+    info = {"radii": torch.stack((radii, radii // 2), dim=-1)[None], "means2d": found.means2d[None]}
+    return rendered[None], found.alpha[None, ..., None], info
 
 
-def asked(config: RasterConfig) -> tuple[Raster, Raster]:
+def both(config: RasterConfig) -> tuple[Raster, Raster]:
     """A view through gsplat's stand-in, and the plain one."""
     g, camera = random_gaussians(80), front_camera()
     torch.manual_seed(0)
     inputs = [*map(torch.from_numpy, (g.means, g.quats, g.scales, g.opacities)), torch.rand(len(g), 3)]
     view = (torch.from_numpy(camera.cam_from_world[0]), torch.from_numpy(camera.Ks[0]), 61, 43)
-    return Raster(*rasterize_gsplat(*inputs, *view, config)), rasterize(*inputs, *view, config=config)
+    knobs = {"near": config.near, "eps2d": config.eps2d, "stop_transmittance": config.stop_transmittance}
+    return Raster(*rasterize_gsplat(*inputs, *view, **knobs)), rasterize(*inputs, *view, config=config)
 
 
 @pytest.fixture
@@ -57,19 +58,19 @@ def gsplat(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("gsplat")
 @pytest.mark.parametrize("eps2d", [0.1, 0.3])
 def test_the_knobs_reach_gsplat_and_its_answer_is_a_view(eps2d: float) -> None:
-    found, expected = asked(RasterConfig(eps2d=eps2d, near=0.3))
+    rendered, expected = both(RasterConfig(eps2d=eps2d, near=0.3))
     for name in ("rgb", "alpha", "depth", "means2d"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(found.radii, expected.radii.ceil())
+        torch.testing.assert_close(getattr(rendered, name), getattr(expected, name), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(rendered.radii, expected.radii.ceil())
 
 
 @pytest.mark.usefixtures("gsplat")
-def test_a_transmittance_that_gsplat_cannot_be_told_is_refused() -> None:
-    with pytest.raises(InputError, match="gsplat ends rays at 0.0001 and cannot be told otherwise, got 0.001"):
-        asked(RasterConfig(stop_transmittance=1e-3))
+def test_a_transmittance_that_gsplat_does_not_take_is_refused() -> None:
+    with pytest.raises(InputError, match="gsplat ends rays at 0.0001 and takes no other value, got 0.001"):
+        both(RasterConfig(stop_transmittance=1e-3))
 
 
 def test_without_gsplat_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(InputError, match=r"pip install 'gsencoder\[gpu\]'"):
-        asked(RasterConfig())
+        both(RasterConfig())
