@@ -2,7 +2,7 @@
 
     python bench/chunks.py SCENE… [--weights house_cpu] [--chunks 125000,80000,40000] [--halos 0,0.64,1.28]
 
-Cosine: centerd, with the features of the whole scene in float32. Names: `evaluate`'s protocol. Seconds are of `encode`
+Cosine: centered, with the features of the whole scene in float32. Names: `evaluate`'s protocol. Seconds are of `encode`
 alone, warm.
 """
 
@@ -54,7 +54,7 @@ def main() -> None:
             found = encode(scene.gaussians, encoder, outputs, config)
             spent = time.perf_counter() - start
             parts = len(cut(scene.gaussians.means, config.chunk, config.halo))
-            same = 1 - field_error(found, whole).centerd
+            same = 1 - field_error(found, whole).centered
             rows[name].append((*quality(scene, truth, found, teacher, words), same, spent, parts))
     print("| setting | chunks | cosine with the whole | names | Acc@0.25 | seconds |\n|---|---|---|---|---|---|")
     for name, each in rows.items():

@@ -220,12 +220,12 @@ def main() -> None:
         error = field_error(narrow, wide)
         print(
             f"{rule} in the basis against {way}, all channels: {median[high] / median[low]:.1f}× faster, "
-            f"{memory[high] / max(memory[low], 1e-9):.1f}× less memory, centerd cosine error {error.centerd:.4f} "
+            f"{memory[high] / max(memory[low], 1e-9):.1f}× less memory, centered cosine error {error.centered:.4f} "
             f"(raw {error.raw:.4f}; {error.covered:.1%} of the seen Gaussians)"
         )
         if way == rule:
             truth = field(replace(problem, maps=problem.clean), *high)
-            found = field_error(narrow, truth).centerd, field_error(wide, truth).centerd
+            found = field_error(narrow, truth).centered, field_error(wide, truth).centered
             print(f"    against maps without noise: in the basis {found[0]:.4f}, all channels {found[1]:.4f}")
         del narrow, wide
 

@@ -133,7 +133,7 @@ def main() -> None:
         found["encoded"] = (features, sum(spent.values()))
         for name, (features, seconds) in found.items():
             table.setdefault(name, []).append((*quality(scene, truth, features, teacher, words), seconds))
-    print("| features | names | centerd cosine | Acc@0.25 | Acc@0.5 | seconds a scene |\n|---|---|---|---|---|---|")
+    print("| features | names | centered cosine | Acc@0.25 | Acc@0.5 | seconds a scene |\n|---|---|---|---|---|---|")
     for name, rows in table.items():
         scores = naming_scores([names for names, _, _ in rows])
         hits = [hit for _, found_hits, _ in rows for hit in found_hits]

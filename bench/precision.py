@@ -2,7 +2,7 @@
 
     python bench/precision.py FLOAT32.onnx OTHER.onnx … --scenes SCENE …
 
-Features are compared by centerd cosine, Gaussian by Gaussian; 1 % of them are below the second figure. Seconds are the
+Features are compared by centered cosine, Gaussian by Gaussian; 1 % of them are below the second figure. Seconds are the
 best of three passes, in which the files take turns.
 """
 
@@ -23,7 +23,7 @@ PASSES = 3
 
 
 def cosines(ours: GaussianFeatures, theirs: GaussianFeatures) -> np.ndarray:
-    """Of coordinates, which are centerd as they are, or of vectors less the space's mean."""
+    """Of coordinates, which are centered as they are, or of vectors less the space's mean."""
     mean = ours.mean if ours.basis is None else np.float32(0)
     a, b = (each.features.astype(np.float64) - mean for each in (ours, theirs))
     return row_cosines(a, b)
@@ -55,7 +55,7 @@ def main() -> None:
     size = Path(chosen.models[0]).stat().st_size
     for name, encoder in encoders.items():
         print(
-            f"{encoder.header.precision}: bytes {Path(name).stat().st_size / size:.3f}; centerd cosine "
+            f"{encoder.header.precision}: bytes {Path(name).stat().st_size / size:.3f}; centered cosine "
             f"{np.mean(means[name]):.5f} (worst scene {min(means[name]):.5f}), 1 % below {np.mean(lows[name]):.4f}; "
             f"seconds {np.median(seconds[name]):.2f} ({min(seconds[name]):.2f} to {max(seconds[name]):.2f})"
         )

@@ -2,7 +2,7 @@
 
     python bench/prototypes.py dinov2_s14_dense_int8.onnx --learn SCENE… --ask SCENE…
 
-A name's vector is the mean of the centerd features of the Gaussians inside that name's boxes in the `--learn` scenes.
+A name's vector is the mean of the centered features of the Gaussians inside that name's boxes in the `--learn` scenes.
 The `--ask` scenes are then scored by the protocol of `gsencoder evaluate`, over the names that were learned.
 """
 

@@ -339,7 +339,7 @@ class GaussianFeatures:
     Attributes:
         features: vectors, or coordinates in `basis`; rows with weight 0 are zero and mean nothing.
         weights: how much each row was seen, in summed blending weight (pixels); 0 = never.
-        mean: the space's mean, which centerd cosines remove; it equals `basis.mean` where there is a basis.
+        mean: the space's mean, which centered cosines remove; it equals `basis.mean` where there is a basis.
         space: what the (decoded) vectors are.
         basis: what the coordinates stand for, or None where `features` holds the vectors themselves.
     """

@@ -43,4 +43,4 @@ def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, nu
     assert accuracies[0] >= 0.7
     assert accuracies[1] >= accuracies[0] - 0.01
     whole, parts = features
-    assert 0 < field_error(parts, whole).centerd <= 0.02
+    assert 0 < field_error(parts, whole).centered <= 0.02

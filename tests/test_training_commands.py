@@ -180,7 +180,7 @@ def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trai
     parts = next(iter(load_features(tmp_path / "many" / "room_2").features.values()))
     whole = next(iter(scene.features.values()))
     assert len(parts) == len(whole) > 2000
-    assert 0 < field_error(parts, whole).centerd < 0.1
+    assert 0 < field_error(parts, whole).centered < 0.1
 
 
 def test_an_encoder_is_judged_by_either_protocol(rooms: Path, trained: Path, tmp_path: Path) -> None:

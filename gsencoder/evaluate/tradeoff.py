@@ -60,7 +60,7 @@ class BudgetConfig:
     """What may be spent; the cheapest setting that keeps to all of it is named."""
 
     seconds: float | None = field(default=None, metadata={"help": "for fusing one scene, without the teacher"})
-    error: float | None = field(default=None, metadata={"help": "centerd cosine error against the reference"})
+    error: float | None = field(default=None, metadata={"help": "centered cosine error against the reference"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +73,7 @@ class Trade:
         seconds: a scene, median over rounds, mean over scenes.
         mib: growth of the process's peak memory, the largest over scenes.
         rank: columns of the features, mean over scenes.
-        error: 1 − centerd cosine to the reference over what it saw, mean over scenes; what was missed counts as 1.
+        error: 1 − centered cosine to the reference over what it saw, mean over scenes; what was missed counts as 1.
         raw_error: the same without centering, over what both saw.
         covered: share of what the reference saw that this saw too.
         hits: objects asked for; empty where the teacher has no words or the scenes no objects.

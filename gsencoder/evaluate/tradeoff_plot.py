@@ -46,7 +46,7 @@ def plot_trades(trades: Sequence[Trade]) -> bytes:
         axes.set_axisbelow(True)
         if place == 0:
             axes.set_yscale("log")
-            axes.set_ylabel("1 − centerd cosine to the reference")
+            axes.set_ylabel("1 − centered cosine to the reference")
             axes.set_title("error (ringed: on the Pareto front)")
             axes.legend(fontsize=8)
         else:

@@ -110,8 +110,8 @@ def table_basis(
     table: Float32[np.ndarray, "C D"], mean: Float32[np.ndarray, " D"], space: FeatureSpace, *, energy: float
 ) -> FeatureBasis:
     """A basis for coded maps. Every row of the table counts once: a name matters however few pixels it has."""
-    centerd = table.astype(np.float64) - mean
-    return fit_basis(mean.astype(np.float64), centerd.T @ centerd / len(table), space, energy=energy)
+    centered = table.astype(np.float64) - mean
+    return fit_basis(mean.astype(np.float64), centered.T @ centered / len(table), space, energy=energy)
 
 
 def encode(basis: FeatureBasis, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:

@@ -18,19 +18,19 @@ class FieldError:
     """One field held against a more accurate one; each seen Gaussian counts the same, however much it was seen.
 
     Attributes:
-        centerd: 1 − mean cosine after each field's own mean is taken off, over Gaussians that both saw.
+        centered: 1 − mean cosine after each field's own mean is taken off, over Gaussians that both saw.
         raw: the same without taking the mean off.
         covered: share of the reference's seen Gaussians that the other saw too.
     """
 
-    centerd: float
+    centered: float
     raw: float
     covered: float
 
     @property
     def total(self) -> float:
-        """1 − mean centerd cosine over all that the reference saw; a Gaussian that only it saw counts as 0."""
-        return 1 - self.covered * (1 - self.centerd)
+        """1 − mean centered cosine over all that the reference saw; a Gaussian that only it saw counts as 0."""
+        return 1 - self.covered * (1 - self.centered)
 
 
 def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, sample: int = SAMPLE) -> FieldError:
@@ -55,15 +55,15 @@ def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, samp
     if sample:
         rows = rows[evenly(len(rows), sample)]
     both = rows[features.seen[rows]]
-    centerd = raw = 0.0
+    centered = raw = 0.0
     for start in range(0, len(both), CHUNK):
         part = both[start : start + CHUNK]
         a, b = features.decode(part).astype(np.float64), reference.decode(part).astype(np.float64)
         raw += float(row_cosines(a, b).sum())
-        centerd += float(row_cosines(a - features.mean, b - reference.mean).sum())
+        centered += float(row_cosines(a - features.mean, b - reference.mean).sum())
     if not len(both):
-        return FieldError(centerd=1.0, raw=1.0, covered=0.0)
-    return FieldError(centerd=1 - centerd / len(both), raw=1 - raw / len(both), covered=len(both) / len(rows))
+        return FieldError(centered=1.0, raw=1.0, covered=0.0)
+    return FieldError(centered=1 - centered / len(both), raw=1 - raw / len(both), covered=len(both) / len(rows))
 
 
 def row_cosines(a: Float64[np.ndarray, "n D"], b: Float64[np.ndarray, "n D"]) -> Float64[np.ndarray, " n"]:

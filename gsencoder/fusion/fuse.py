@@ -64,7 +64,7 @@ class Fusion:
         views: row numbers of the views that were used.
         tested: the depth maps that visibility was tested against.
         seconds: by step.
-        truncation: 1 − centerd cosine between teacher vectors and their projections on the basis, averaged over the
+        truncation: 1 − centered cosine between teacher vectors and their projections on the basis, averaged over the
             cells of all views with each cell weighted by its distance from the mean; 0 without a basis.
     """
 
@@ -220,6 +220,6 @@ def _add_rows(moments: Moments, feature_map: FeatureMap, clock: Clock) -> None:
 
 
 def _truncation(basis: FeatureBasis, table: Float32[np.ndarray, "C D"]) -> float:
-    centerd = table - basis.mean
-    inside = (centerd @ basis.components.T) @ basis.components
-    return 1 - float(np.sqrt((inside**2).sum() / max((centerd**2).sum(), 1e-30)))
+    centered = table - basis.mean
+    inside = (centered @ basis.components.T) @ basis.components
+    return 1 - float(np.sqrt((inside**2).sum() / max((centered**2).sum(), 1e-30)))

@@ -55,8 +55,8 @@ class OutputSpace:
 
     def standardize(self, features: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
         """Coordinates in the basis, or vectors of the space, as an encoder should give them."""
-        centerd = features if self.basis is not None else features - self.mean
-        return np.asarray(centerd / np.float32(self.unit), dtype=np.float32)
+        centered = features if self.basis is not None else features - self.mean
+        return np.asarray(centered / np.float32(self.unit), dtype=np.float32)
 
     def restore(self, outputs: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
         """The inverse of `standardize`."""

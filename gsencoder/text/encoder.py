@@ -16,7 +16,7 @@ class TextEncoder(Protocol):
 
     Attributes:
         space: the space, whose `text_encoder` names what encodes.
-        mean: the mean of the text side, which centerd cosines remove from words.
+        mean: the mean of the text side, which centered cosines remove from words.
     """
 
     @property

@@ -57,7 +57,7 @@ class TextTable:
         embeddings: one unit vector a name.
         space: what the vectors are; `text_encoder` names the encoder that made them.
         mean: the mean of the embeddings. Text and image features of a joint model have different means, so each side
-            is centerd by its own.
+            is centered by its own.
     """
 
     names: tuple[str, ...]

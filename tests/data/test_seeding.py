@@ -404,12 +404,12 @@ class TestMesh:
         mesh.visual.vertex_colors = np.where(mesh.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
         mesh.export(tmp_path / "ball.ply")
         g = seed_from_mesh(tmp_path / "ball.ply", voxel=0.05, origin=np.array([10.0, 0, 0]))
-        centerd = g.means + np.float32([10, 0, 0])
-        assert np.abs(np.linalg.norm(centerd, axis=1) - 0.5).max() < 0.005
-        assert np.abs((normals_of(g) * centerd).sum(1) / 0.5).min() > 0.98
+        centered = g.means + np.float32([10, 0, 0])
+        assert np.abs(np.linalg.norm(centered, axis=1) - 0.5).max() < 0.005
+        assert np.abs((normals_of(g) * centered).sum(1) / 0.5).min() > 0.98
         red = colors_of(g)[:, 0] > 0.5
-        away = np.abs(centerd[:, 2]) > 0.05
-        assert np.array_equal(red[away], centerd[away, 2] > 0)
+        away = np.abs(centered[:, 2]) > 0.05
+        assert np.array_equal(red[away], centered[away, 2] > 0)
 
     def test_slivers_take_few_samples_and_leave_no_hole(self, tmp_path):
         sliver = self.trimesh.Trimesh([[0, 0, 0], [10, 0, 0], [10, 0.001, 0]], [[0, 1, 2]], process=False)

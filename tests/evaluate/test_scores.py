@@ -100,12 +100,12 @@ def test_a_field_has_no_error_against_itself_whatever_the_basis(rng: np.random.G
     basis = FeatureBasis(mean=mean, components=axes, energy_kept=1.0, space=SPACE)
     coded = field((values - mean) @ axes.T, np.ones(50), basis)
     error = field_error(coded, whole)
-    assert error.centerd == pytest.approx(0, abs=1e-5)
+    assert error.centered == pytest.approx(0, abs=1e-5)
     assert error.raw == pytest.approx(0, abs=1e-5)
     assert error.covered == 1
 
 
-def test_centerd_error_sees_what_raw_cosine_hides() -> None:
+def test_centered_error_sees_what_raw_cosine_hides() -> None:
     values = np.array([[100.0, 1, 0, 0]])
     turned = np.array([[100.0, -1, 0, 0]])
     space_mean = {"mean": np.array([100.0, 0, 0, 0], np.float32), "space": SPACE, "basis": None}
@@ -114,7 +114,7 @@ def test_centerd_error_sees_what_raw_cosine_hides() -> None:
         for v in (values, turned)
     )
     error = field_error(other, one)
-    assert error.centerd == pytest.approx(2)
+    assert error.centered == pytest.approx(2)
     assert error.raw < 1e-3
 
 
@@ -122,7 +122,7 @@ def test_what_only_the_reference_saw_counts_as_missed(rng: np.random.Generator) 
     values = rng.normal(size=(4, 4))
     error = field_error(field(values, np.array([1, 0, 1, 1])), field(values, np.array([1, 1, 0, 1])))
     assert error.covered == pytest.approx(2 / 3)
-    assert error.centerd == pytest.approx(0, abs=1e-6)
+    assert error.centered == pytest.approx(0, abs=1e-6)
     assert error.total == pytest.approx(1 / 3, abs=1e-6)
     with pytest.raises(InputError, match="saw no Gaussian"):
         field_error(field(values, np.ones(4)), field(values, np.zeros(4)))

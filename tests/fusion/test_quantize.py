@@ -19,7 +19,7 @@ def test_the_budget_is_met_and_the_error_told_is_the_error_made(error: float, ba
     features = make_features(basis=basis)
     made = compact(features, error=error)
     assert made.error <= error
-    over_rows = field_error(made.features(), features, sample=0).centerd
+    over_rows = field_error(made.features(), features, sample=0).centered
     assert over_rows <= made.error + 1e-5
     assert over_rows >= made.error / 20
     found = made.features()
@@ -67,11 +67,11 @@ def test_a_rare_kind_is_kept_as_well_as_a_common_one() -> None:
     mixed = replace(features, features=values)
     made = compact(mixed, error=0.02)
     found = made.features()
-    common = field_error(found, mixed, sample=0).centerd
+    common = field_error(found, mixed, sample=0).centered
     kept = np.setdiff1d(np.arange(10_000), rare)
     alone = replace(mixed, weights=np.where(np.isin(np.arange(10_000), kept), 0, 1).astype(np.float32))
     assert common <= 0.02
-    assert field_error(found, alone, sample=0).centerd <= 0.06
+    assert field_error(found, alone, sample=0).centered <= 0.06
 
 
 def test_a_kind_that_the_sample_misses_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,7 +84,7 @@ def test_a_kind_that_the_sample_misses_is_found(monkeypatch: pytest.MonkeyPatch)
     mixed = replace(features, features=values)
     made = compact(mixed, error=0.01)
     alone = replace(mixed, weights=np.where(np.isin(np.arange(10_000), hidden), 1, 0).astype(np.float32))
-    assert field_error(made.features(), alone, sample=0).centerd <= 0.05
+    assert field_error(made.features(), alone, sample=0).centered <= 0.05
     assert made.lowest > 0.9
 
 

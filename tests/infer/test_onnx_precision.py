@@ -115,7 +115,7 @@ def test_a_static_file_is_right_for_what_it_was_calibrated_on(
     wide = export_onnx(encoder, lowered, "int8_static", scenes=[few, CLOUD])
     full = OnnxEncoder(exact, device="cpu").encode(CLOUD.gaussians, ANY)
     lost = [
-        field_error(OnnxEncoder(model, device="cpu").encode(CLOUD.gaussians, ANY), full).centerd
+        field_error(OnnxEncoder(model, device="cpu").encode(CLOUD.gaussians, ANY), full).centered
         for model in (narrow, wide, build("int8_static"))
     ]
     assert lost[1] < lost[0]
@@ -207,7 +207,7 @@ def test_the_command_judges_what_it_writes(
     words = [str(tmp_path / "room.ply"), f"weights={exported}", f"out={out}", "sizes=[1]", "precision=int8_static"]
     monkeypatch.setattr("gsencoder.app.commands.export.lower", lambda _: lowered)
     assert cli.main(["export", *words, "cosine=0.999999"]) == 2
-    assert "on room int8_static gives features whose mean centerd cosine" in capsys.readouterr().err
+    assert "on room int8_static gives features whose mean centered cosine" in capsys.readouterr().err
     assert not out.exists()
     assert cli.main(["export", *words]) == 0
     results = json.loads(Path(f"{out}.summary.json").read_text())["results"]

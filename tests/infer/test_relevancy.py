@@ -45,10 +45,10 @@ def test_relevancy_in_coordinates_is_the_cosine_of_decoded_vectors(rng: np.rando
     scores = relevancy(features, text, text_mean, mode=mode)
     seen = features.seen
     vectors = features.features.astype(np.float64) @ features.basis.components + features.basis.mean
-    centerd = mode == "centred"
-    expected = plain_cosine(vectors - (features.mean if centerd else 0), text - (text_mean if centerd else 0))
+    centered = mode == "centred"
+    expected = plain_cosine(vectors - (features.mean if centered else 0), text - (text_mean if centered else 0))
     # A feature's length below a thousandth of the mean's fades: here that is a millionth of the square.
-    np.testing.assert_allclose(scores[:, seen], expected[:, seen], atol=1e-4 if centerd else 1e-6)
+    np.testing.assert_allclose(scores[:, seen], expected[:, seen], atol=1e-4 if centered else 1e-6)
     assert np.isnan(scores[:, ~seen]).all()
 
 

@@ -44,8 +44,8 @@ def test_tokens_are_the_mean_plus_what_is_composited_about_it() -> None:
     blends = token_blends(gaussians, cameras, (4, 5))
     tokens = feature_tokens(blends, features)
     assert tokens.shape == (1, 20, 12)
-    centerd = (features.decode() - features.mean) * features.seen[:, None]
-    expected = blends[0].render(torch.from_numpy(centerd)) + torch.from_numpy(features.mean)
+    centered = (features.decode() - features.mean) * features.seen[:, None]
+    expected = blends[0].render(torch.from_numpy(centered)) + torch.from_numpy(features.mean)
     torch.testing.assert_close(tokens[0], expected, atol=1e-5, rtol=1e-4)
 
 

@@ -270,10 +270,10 @@ def test_the_real_table_knows_what_its_names_say(shared: Path) -> None:
         table.encode(["coffee mug"])
     # Names of such a space all look alike until their mean is removed.
     raw = table.embeddings[:200] @ table.embeddings[:200].T
-    centerd = table.embeddings[:200] - table.mean
-    centerd /= np.linalg.norm(centerd, axis=1, keepdims=True)
+    centered = table.embeddings[:200] - table.mean
+    centered /= np.linalg.norm(centered, axis=1, keepdims=True)
     assert np.median(raw) > 0.65
-    assert abs(np.median(centerd @ centerd.T)) < 0.1
+    assert abs(np.median(centered @ centered.T)) < 0.1
 
 
 def test_a_header_nested_without_end_is_refused(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def write_report(path: Path, scene: Scene, asked: Sequence[Asked], summary: Summ
     report.timings(summary.timings)
     report.section("What was chosen, and what it cost")
     report.table(
-        ("features", "channels", "rank of the basis", "energy kept", "centerd cosine error", "Gaussians seen"),
+        ("features", "channels", "rank of the basis", "energy kept", "centered cosine error", "Gaussians seen"),
         [
             (
                 one.title,

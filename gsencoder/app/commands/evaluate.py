@@ -158,7 +158,7 @@ def scores_line(results: dict) -> str:
     if results["protocol"] == "naming":
         return (
             f"{len(results['names'])} names in {len(results['scenes'])} scenes: accuracy {results['accuracy']:.3f} "
-            f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centerd cosine "
+            f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centered cosine "
             f"{results['cosine']:.3f}"
         )
     return (

@@ -69,7 +69,7 @@ class ExportConfig(CommonConfig):
     cosine: float = field(
         default=COSINE,
         metadata={
-            "help": "smallest mean centerd cosine of another precision's features to float32's, on each SPLAT, or on "
+            "help": "smallest mean centered cosine of another precision's features to float32's, on each SPLAT, or on "
             "each random cloud where there is none"
         },
     )
@@ -116,7 +116,7 @@ def run(config: ExportConfig, summary: Summary) -> None:
         with summary.step("judge"):
             cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=track)
         told = (
-            f"{config.precision}, {len(model) / len(exact):.2f} of float32's size, mean centerd cosine to it "
+            f"{config.precision}, {len(model) / len(exact):.2f} of float32's size, mean centered cosine to it "
             f"{min(cosines.values()):.4f} or more"
         )
     with summary.step("write"), atomic_file(config.out) as stream:

@@ -33,7 +33,7 @@ class PackConfig(CommonConfig):
     error: float = field(
         default=0.01,
         metadata={
-            "help": "of form=compact: the mean loss of centerd cosine that is allowed, over Gaussians and over kinds"
+            "help": "of form=compact: the mean loss of centered cosine that is allowed, over Gaussians and over kinds"
         },
     )
     decoded: bool = field(
@@ -93,7 +93,7 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
     )
     return (
         f"features of {seen:,} of {len(features):,} Gaussians in {size / 1e6:.3g} MB, {_ratio(share)} of float16 "
-        f"vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centerd cosines lose "
+        f"vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centered cosines lose "
         f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
     )
 

@@ -141,7 +141,7 @@ def _radius(parts: tuple[Solid, ...]) -> float:
 
 
 def _box(x: float | int, y: float | int, z: float | int, at: tuple[float | int, ...]) -> Solid:
-    """A box of full sizes x y z whose lower face is centerd at `at`."""
+    """A box of full sizes x y z whose lower face is centered at `at`."""
     return Solid(shape="box", center=np.array([at[0], at[1], at[2] + z / 2]), half=np.array([x, y, z]) / 2)
 
 

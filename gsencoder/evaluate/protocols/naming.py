@@ -115,7 +115,7 @@ def compare_names(
         scene=name,
         total={teacher.names[code]: int(total[code]) for code in there},
         right={teacher.names[code]: int(right[code]) for code in there},
-        cosine=1 - field_error(features, truth).centerd if features.space == truth.space else float("nan"),
+        cosine=1 - field_error(features, truth).centered if features.space == truth.space else float("nan"),
         seconds=seconds,
     )
 

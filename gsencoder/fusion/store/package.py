@@ -34,7 +34,7 @@ def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, erro
         folder: where.
         scene: of the features.
         features: fused or encoded.
-        error: budget of 1 − mean centerd cosine.
+        error: budget of 1 − mean centered cosine.
 
     Raises:
         InputError: no Gaussians, or a budget that cannot be met.

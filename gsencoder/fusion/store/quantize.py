@@ -22,7 +22,7 @@ MOST_BITS = 8
 SAMPLE = 10_000
 """Gaussians that levels are fitted to."""
 ALIKE = 0.9
-"""Rows whose centerd cosine is above are of one kind."""
+"""Rows whose centered cosine is above are of one kind."""
 RETRIES = 3
 """Times that a sample is completed by rows that it missed."""
 ROUNDS = 10
@@ -48,9 +48,9 @@ class CompactFeatures:
         rows: which Gaussians were seen, ascending.
         total: Gaussians.
         basis: what the coordinates stand for.
-        error: 1 − mean centerd cosine to what was compacted: over the seen rows, or over their kinds (a sample in which
+        error: 1 − mean centered cosine to what was compacted: over the seen rows, or over their kinds (a sample in which
             each row counts by how few are like it), whichever is larger. Features at the space's mean have no cosine.
-        lowest: the centerd cosine that one row in a thousand is below.
+        lowest: the centered cosine that one row in a thousand is below.
     """
 
     codes: UInt8[np.ndarray, "n row_bytes"]
@@ -158,17 +158,17 @@ def _within(
     features: GaussianFeatures, rows: Int64[np.ndarray, " n"], sample: Int64[np.ndarray, " k"], error: float
 ) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
     """The fewest bytes a row that a sample asks for, and what they leave of the cosine of each row."""
-    centerd = _centerd(features, sample)
-    norms = np.sqrt((centerd * centerd).sum(axis=1))
-    centerd, norms = centerd[norms > 0], norms[norms > 0]
+    centered = _centered(features, sample)
+    norms = np.sqrt((centered * centered).sum(axis=1))
+    centered, norms = centered[norms > 0], norms[norms > 0]
     if not len(norms):
         raise InputError("compact: all features are the space's mean, which no direction tells from one another")
-    rarity = _rarity(centerd, norms)
+    rarity = _rarity(centered, norms)
     # A cosine weighs an error by what it is an error of.
     heft = rarity / np.maximum(norms, 1e-6 * float(norms.max())) ** 2
-    _, vectors = np.linalg.eigh((centerd * heft[:, None]).T @ centerd)
+    _, vectors = np.linalg.eigh((centered * heft[:, None]).T @ centered)
     turned = vectors[:, ::-1]
-    choice = _Choice(centerd @ turned, heft, rarity)
+    choice = _Choice(centered @ turned, heft, rarity)
     while True:
         choice.add_bits(8)
         if max(choice.errors()) > error and choice.can_grow:
@@ -183,14 +183,14 @@ def _within(
             )
 
 
-def _centerd(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray, "n R"]:
+def _centered(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray, "n R"]:
     values = features.features[rows].astype(np.float64)
     return values if features.basis is not None else values - features.mean
 
 
-def _rarity(centerd: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+def _rarity(centered: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """1 over the number of rows that point the same way, which adds up to one for each kind of feature."""
-    units = (centerd / norms[:, None]).astype(np.float32)
+    units = (centered / norms[:, None]).astype(np.float32)
     alike = [(units[start : start + 1024] @ units.T > ALIKE).sum(axis=1) for start in range(0, len(units), 1024)]
     return 1 / np.maximum(np.concatenate(alike), 1)
 
@@ -280,15 +280,15 @@ def _encode(
     codes = np.empty((len(rows), -(-int(bits.sum()) // 8)), np.uint8)
     cosines = np.ones(len(rows))
     for start in range(0, len(rows), BLOCK):
-        centerd = _centerd(features, rows[start : start + BLOCK])
-        values = centerd @ turned[:, used]
+        centered = _centered(features, rows[start : start + BLOCK])
+        values = centered @ turned[:, used]
         ones, rounded = [], np.empty_like(values)
         for number, (each, width) in enumerate(zip(levels, bits, strict=True)):
             code = _nearest(each, values[:, number])
             rounded[:, number] = each[code]
             ones.append(code[:, None] >> np.arange(width - 1, -1, -1) & 1)
         codes[start : start + BLOCK] = np.packbits(np.concatenate(ones, axis=1).astype(np.uint8), axis=1)
-        squares = (centerd**2).sum(axis=1)
+        squares = (centered**2).sum(axis=1)
         cosines[start : start + BLOCK] = np.where(squares > 0, _cosines(values, rounded, squares), np.nan)
     axes = turned[:, used].T
     basis = features.basis

@@ -161,31 +161,31 @@ def oriented_axes(
     Points in a plane, on a line or in one place have no volume to minimize: the box then lies in the plane with the
     smallest area, along the line, or along the world's axes.
     """
-    centerd = points - points.mean(axis=0)
+    centered = points - points.mean(axis=0)
     if up is not None:
         third = up / math.sqrt(float(up @ up))
-        return _about(third, _smallest_rectangle(centerd @ _plane(third)))
+        return _about(third, _smallest_rectangle(centered @ _plane(third)))
     # Eigenvectors of the 3×3 scatter suffice to tell which directions are empty; extents are measured along them.
-    _, axes = np.linalg.eigh(centerd.T @ centerd)
-    spans = np.ptp(centerd @ axes, axis=0)[::-1]
+    _, axes = np.linalg.eigh(centered.T @ centered)
+    spans = np.ptp(centered @ axes, axis=0)[::-1]
     axes = axes[:, ::-1]
     empty = spans <= FLAT * max(float(spans.max(initial=0)), 1e-300)
     if spans.max(initial=0) == 0:
         return np.eye(3)
     if not empty[2]:
-        return _smallest_box_axes(centerd, axes)
+        return _smallest_box_axes(centered, axes)
     if empty[1]:
         return _right_handed(axes)
-    return _about(axes[:, 2], _smallest_rectangle(centerd @ _plane(axes[:, 2])))
+    return _about(axes[:, 2], _smallest_rectangle(centered @ _plane(axes[:, 2])))
 
 
-def _smallest_box_axes(centerd: Float64[np.ndarray, "n 3"], principal: np.ndarray) -> Float64[np.ndarray, "3 3"]:
+def _smallest_box_axes(centered: Float64[np.ndarray, "n 3"], principal: np.ndarray) -> Float64[np.ndarray, "3 3"]:
     """The box of least volume with a side on a face of the convex hull (trimesh); principal axes without a hull."""
     from scipy.spatial import QhullError
     from trimesh.bounds import oriented_bounds
 
     try:
-        to_origin, _ = oriented_bounds(centerd, ordered=False)
+        to_origin, _ = oriented_bounds(centered, ordered=False)
     except (QhullError, ValueError):
         return _right_handed(principal)
     axes = to_origin[:3, :3].T
@@ -205,8 +205,8 @@ def _smallest_rectangle(flat: Float64[np.ndarray, "n 2"]) -> float:
     except QhullError:
         corners = None
     if corners is None:  # Two points, or all on a line.
-        centerd = flat - flat.mean(axis=0)
-        longest = np.linalg.eigh(centerd.T @ centerd)[1][:, 1]
+        centered = flat - flat.mean(axis=0)
+        longest = np.linalg.eigh(centered.T @ centered)[1][:, 1]
         return float(np.arctan2(longest[1], longest[0]))
     sides = np.roll(corners, -1, axis=0) - corners
     angles = np.unique(np.round(np.arctan2(sides[:, 1], sides[:, 0]) % (np.pi / 2), 12))

@@ -16,7 +16,7 @@ from gsencoder.types import GaussianFeatures
 Mode = Literal["centred", "raw"]
 CHUNK_BYTES = 1 << 25
 RESOLUTION = 1e-3
-"""Share of the mean's norm below which a centerd feature is rounding, not direction (float16 files keep 5e-4)."""
+"""Share of the mean's norm below which a centered feature is rounding, not direction (float16 files keep 5e-4)."""
 TINY = 1e-60
 """Keeps the root of a squared norm above zero; float64 holds the squares of norms down to 1e-150."""
 
@@ -57,8 +57,8 @@ def relevancy(
 
     The cosine is computed in the coordinates that are stored: with the stacked rows M = [components; basis mean −
     removed mean] = L·Q (Q orthonormal), the feature of z is [z, 1]·L in the axes Q, so norms and products need R + 1
-    numbers and no decoding. Rows stream in chunks. In the centerd mode the features lose `features.mean` and the words
-    `text_mean`; a centerd feature shorter than 1e-3 of the mean counts as having no direction, and its cosine fades
+    numbers and no decoding. Rows stream in chunks. In the centered mode the features lose `features.mean` and the words
+    `text_mean`; a centered feature shorter than 1e-3 of the mean counts as having no direction, and its cosine fades
     to 0.
 
     With `negatives`, the score is LERF's (Kerr et al. 2023, https://arxiv.org/abs/2303.09553, section 3.4): the
@@ -71,7 +71,7 @@ def relevancy(
         text_mean: mean of the text side.
         negatives: vectors of negative words (there may be none of them), or None for plain cosines.
         temperature: t above; LERF's factor of 10 is 0.1.
-        mode: "centerd" or "raw" cosines.
+        mode: "centered" or "raw" cosines.
 
     Returns:
         Relevancy, in [−1, 1] for cosines; NaN for Gaussians never seen.
@@ -89,7 +89,7 @@ def relevancy(
     if not (np.isfinite(words).all() and np.isfinite(text_mean).all()):
         raise InputError("relevancy: expected finite word vectors and text mean, got NaN or Inf")
     if mode not in ("centred", "raw") or not 0 < temperature < math.inf:
-        raise InputError(f"relevancy: expected mode centerd or raw, temperature > 0, got {mode!r} and {temperature}")
+        raise InputError(f"relevancy: expected mode centered or raw, temperature > 0, got {mode!r} and {temperature}")
     directions = words.astype(np.float64) - (text_mean if mode == "centred" else 0.0)
     directions /= np.sqrt((directions**2).sum(axis=1, keepdims=True) + TINY)
     removed = features.mean.astype(np.float64) if mode == "centred" else np.zeros(channels)
@@ -112,7 +112,7 @@ def relevancy(
 def _fold(
     features: GaussianFeatures, removed: Float64[np.ndarray, " D"], directions: Float64[np.ndarray, "Q D"]
 ) -> tuple[Float64[np.ndarray, "R S"] | None, Float64[np.ndarray, " S"], Float64[np.ndarray, "Q S"]]:
-    """Matrix and offset from stored rows to S axes in which norms and products are those of the centerd vectors.
+    """Matrix and offset from stored rows to S axes in which norms and products are those of the centered vectors.
 
     The words in those axes come third. No matrix where the rows are the vectors themselves.
     """

@@ -25,7 +25,7 @@ from gsencoder.types import Gaussians
 TOLERANCE = 1e-4
 """Largest difference from torch, as a share of the largest output."""
 COSINE = 0.99
-"""Smallest mean centerd cosine of a cheaper precision's features to float32's."""
+"""Smallest mean centered cosine of a cheaper precision's features to float32's."""
 
 ON_CPU = EncodeConfig(precision="float32", device="cpu")
 
@@ -237,7 +237,7 @@ def check_cosines(
         track: wraps the loop over clouds to show progress.
 
     Returns:
-        The mean centerd cosine of the two's features on each cloud.
+        The mean centered cosine of the two's features on each cloud.
 
     Raises:
         InputError: they are further apart.
@@ -248,10 +248,10 @@ def check_cosines(
         ours, theirs = (
             each.encode(cloud, replace(ON_CPU, precision="auto"), metres_per_unit=unit) for each in (cheap, full)
         )
-        found[name] = 1 - field_error(ours, theirs).centerd
+        found[name] = 1 - field_error(ours, theirs).centered
         if not found[name] >= cosine:
             raise InputError(
-                f"export: on {name} {cheap.header.precision} gives features whose mean centerd cosine to float32's is "
+                f"export: on {name} {cheap.header.precision} gives features whose mean centered cosine to float32's is "
                 f"{found[name]:.4f}, below cosine={cosine}; no file was written. Take another precision"
             )
     return found

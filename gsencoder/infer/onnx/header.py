@@ -37,7 +37,7 @@ ARRAYS = ("mean", "components", "words", "words_mean", "words_scale")
 MOST_DEFLATED = 20
 """Bytes that a character of text may stand for, where an array is large."""
 WORD_STEPS = 63
-"""Largest integer of a word's embedding in an int8 file: seven bits leave centerd cosines of 0.9995 or more."""
+"""Largest integer of a word's embedding in an int8 file: seven bits leave centered cosines of 0.9995 or more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
