@@ -19,7 +19,7 @@ from splats import front_camera, random_gaussians
 from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.checkpoint import SUMS_FILE, PartialFusion
+from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint
 from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, load_settings, save_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_package
 from gsencoder.fusion.teacher_maps import read_map, write_map
@@ -134,8 +134,8 @@ def reconstruction(folder: Path) -> Made:
 
 def sums(folder: Path) -> Made:
     values = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
-    PartialFusion(folder, {}).save_sums(2, values, np.abs(values[:, 0]))
-    return folder / SUMS_FILE, lambda: PartialFusion(folder, {}).load_sums(50, 3)
+    FusionCheckpoint(folder, {}).save_sums(2, values, np.abs(values[:, 0]))
+    return folder / SUMS_FILE, lambda: FusionCheckpoint(folder, {}).load_sums(50, 3)
 
 
 def teacher_map(folder: Path) -> Made:

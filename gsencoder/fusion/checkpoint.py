@@ -1,4 +1,4 @@
-"""A fusion under way on disk: the teacher's maps and the sums so far, which a later run takes up."""
+"""The checkpoint of a fusion: the teacher's maps and the sums so far, from which an interrupted run continues."""
 
 import json
 import time
@@ -17,34 +17,34 @@ from gsencoder.fusion.teachers import Teacher
 SETTINGS_FILE, SUMS_FILE = "settings.json", "sums.safetensors"
 
 
-class PartialFusion:
-    """A fusion under way: the teacher's maps and the sums so far, in a folder that a later run takes up."""
+class FusionCheckpoint:
+    """The folder of a fusion that is not finished: the teacher's maps, and the sums over the views so far."""
 
     def __init__(self, folder: Path, settings: dict[str, Any], every_seconds: float = 20.0) -> None:
-        """Looks for what an earlier run left; the folder is made when there is something to keep.
+        """Opens the checkpoint of an earlier run. The folder is made when the first map or sum is written.
 
         Args:
-            folder: where maps and sums are kept.
-            settings: all that maps and sums depend on, the scene included.
-            every_seconds: how often sums are worth saving.
+            folder: of the maps and the sums.
+            settings: all that maps and sums depend on, the scene included, as JSON values.
+            every_seconds: time between two checkpoints of the sums.
 
         Raises:
-            InputError: the folder holds maps or sums made with other settings (both are named), or cannot be used.
+            InputError: the folder holds a checkpoint of other settings (the difference is named), or cannot be used.
         """
-        self.folder, self._every = folder, every_seconds
-        self._last = time.monotonic()
+        self.folder, self._every_seconds = folder, every_seconds
+        self._saved_at = time.monotonic()
         self._settings = json.loads(json.dumps(settings))
-        self._made = (folder / SETTINGS_FILE).is_file()
-        if self._made:
-            found = _read_settings(folder / SETTINGS_FILE)
-            if found != self._settings:
-                difference = first_difference(found, self._settings)
+        self._exists = (folder / SETTINGS_FILE).is_file()
+        if self._exists:
+            earlier = _read_settings(folder / SETTINGS_FILE)
+            if earlier != self._settings:
+                difference = first_difference(earlier, self._settings)
                 raise InputError(f"{folder}: holds a fusion begun with {difference}; delete it to start anew")
 
-    def _make(self) -> None:
-        """The folder with its settings. A run that ends before its first map, as its settings are wrong, leaves none
-        behind that would refuse the next run."""
-        if self._made:
+    def _make_folder(self) -> None:
+        """Makes the folder and writes its settings. Not done before the first map: a run that ends earlier, because its
+        settings are wrong, must not leave a folder that refuses the next run."""
+        if self._exists:
             return
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -52,21 +52,21 @@ class PartialFusion:
             raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
         with atomic_file(self.folder / SETTINGS_FILE) as stream:
             stream.write(json.dumps(self._settings).encode())
-        self._made = True
+        self._exists = True
 
     def due(self) -> bool:
-        """Whether the sums are old enough to be worth saving again."""
-        return time.monotonic() - self._last >= self._every
+        """Whether the sums should be saved again."""
+        return time.monotonic() - self._saved_at >= self._every_seconds
 
     def cached(self, teacher: Teacher) -> CachedTeacher:
-        """The teacher, its maps kept here."""
-        return CachedTeacher(teacher, self.folder, before_write=self._make, advice=self._advice)
+        """The teacher with its maps cached in this folder."""
+        return CachedTeacher(teacher, self.folder, before_write=self._make_folder, advice=self._advice)
 
     def save_sums(self, done: int, sums: Float32[np.ndarray, "N columns"], weights: Float32[np.ndarray, " N"]) -> None:
-        """Keeps the sums over the first `done` views."""
-        self._make()
+        """Writes the sums over the first `done` views."""
+        self._make_folder()
         write_archive(self.folder / SUMS_FILE, {"sums": sums, "weights": weights}, {"done": done})
-        self._last = time.monotonic()
+        self._saved_at = time.monotonic()
 
     def load_sums(
         self, gaussians: int, columns: int
@@ -89,9 +89,9 @@ class PartialFusion:
 
 def _read_settings(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        settings = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read ({error}); delete {path.parent} to start anew") from error
-    if not isinstance(found, dict):
+    if not isinstance(settings, dict):
         raise InputError(f"{path}: expected an object; delete {path.parent} to start anew")
-    return found
+    return settings

@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
@@ -21,8 +21,8 @@ from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
-from gsencoder.fusion.checkpoint import PartialFusion
-from gsencoder.fusion.lift import Sums, map_rows, view_matrix
+from gsencoder.fusion.checkpoint import FusionCheckpoint
+from gsencoder.fusion.lift import FeatureSums, map_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import BlendConfig
@@ -86,23 +86,79 @@ def fuse(
 ) -> Fusion:
     """Lifts a teacher's maps onto the scene's Gaussians.
 
-    A dense teacher is passed over twice, once to find the basis and once to lift; its maps are kept as float16 files
-    in `work` between the passes, because making them again costs far more than reading them (without `work`, or for
-    teachers that say they are cheap, they are made twice). Where no basis is sought, one pass does.
+    A dense teacher is passed over twice, once to fit the basis and once to lift; its maps are cached as float16 files
+    in `work` between the passes, because computing them again costs far more than reading them (without `work`, or for
+    cheap teachers, they are computed twice). Where no basis is needed, one pass is enough.
 
     Args:
         scene: with Gaussians and views.
-        teacher: what to lift.
-        config: knobs.
-        basis: fuse in the coordinates of this basis, as scenes that are trained on together are; without it the scene
-            gets one of its own where `config` asks for one.
-        work: folder for maps and running sums; a run that finds its own there goes on where it stopped.
-        track: wraps the loop over views to show progress.
+        teacher: whose maps are lifted.
+        config: see there.
+        basis: fuse in the coordinates of this basis, which scenes that are trained on together share; None = one of the
+            scene's own, where `config` asks for one.
+        work: folder for maps and running sums; an interrupted run is continued from it.
+        track: wraps the loops over views to show progress.
 
     Raises:
         InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, or `work` holds
             another run.
     """
+    gaussians, views = _checked(scene, teacher, basis)
+    config = replace(config, visibility=resolve(config.visibility, views, config.lift))
+    rows = tuple(int(view) for view in evenly(len(views), config.views or len(views)))
+    checkpoint = _checkpoint(work, gaussians, views, teacher, config, rows, basis)
+    clock = Clock()
+    maps = _timed_maps(teacher if checkpoint is None else checkpoint.cached(teacher), views, clock)
+
+    if basis is not None:
+        subspace = Subspace.of_basis(basis)
+    else:
+        subspace = find_subspace(teacher, maps, rows, config, clock, track, one_pass=checkpoint is None)
+    columns = subspace.basis.rank if subspace.basis is not None else teacher.space.channels
+    sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table)
+    if checkpoint is not None:
+        sums.restore(checkpoint)
+    # Where the mean alone is unknown, it is computed along the way; never in a run that may start in the middle.
+    moments = Moments(teacher.space.channels, second=False) if subspace.mean is None else None
+
+    for view in track(rows[sums.views :], "lifting views"):
+        feature_map = maps(view)
+        matrix = view_matrix(
+            gaussians,
+            views,
+            view,
+            feature_map,
+            clock,
+            lift=config.lift,
+            visibility=config.visibility,
+            config=config.blend,
+        )
+        with clock("lift"):
+            sums.add(matrix, feature_map, views.masks[view] if views.masks is not None else None)
+        if moments is not None:
+            _add_cells(moments, feature_map, clock)
+        if checkpoint is not None and checkpoint.due():
+            checkpoint.save_sums(sums.views, sums.sums, sums.weights)
+    with clock("lift"):
+        features, weights = sums.finish()
+    if not (weights > 0).any():
+        raise InputError(f"fuse: none of {len(rows)} views of {scene.name} sees any Gaussian; check poses and units")
+
+    mean = subspace.mean if moments is None else moments.mean.astype(np.float32)
+    assert mean is not None
+    return Fusion(
+        features=GaussianFeatures(
+            features=features, weights=weights, mean=mean, space=teacher.space, basis=subspace.basis
+        ),
+        views=rows,
+        tested=config.visibility.against,
+        seconds=clock.seconds,
+        truncation=subspace.truncation,
+    )
+
+
+def _checked(scene: Scene, teacher: Teacher, basis: FeatureBasis | None) -> tuple[Gaussians, Views]:
+    """The Gaussians and views of a scene that can be fused."""
     if basis is not None and basis.space != teacher.space:
         raise InputError(f"fuse: the basis is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
     if scene.gaussians is None or len(scene.gaussians) == 0:
@@ -111,115 +167,114 @@ def fuse(
         raise InputError(f"fuse: scene {scene.name} has no views to fuse from")
     if len(scene.views) == 0:
         raise InputError(f"fuse: scene {scene.name} has no views left")
-    config = replace(config, visibility=resolve(config.visibility, scene.views, config.lift))
-    chosen = _choose(len(scene.views), config.views)
-    clock = Clock()
-    kept = None
-    if work is not None:
-        settings = {"fuse": asdict(config), "teacher": teacher.settings(), "views": list(chosen)}
-        if basis is not None:
-            settings["basis"] = hashlib.sha256(basis.mean.tobytes() + basis.components.tobytes()).hexdigest()[:16]
-        kept = PartialFusion(work, settings | {"scene": _identity(scene.gaussians, scene.views)})
-    views, cached = scene.views, teacher if kept is None else kept.cached(teacher)
+    return scene.gaussians, scene.views
 
-    def map_of(view: int) -> FeatureMap:
-        with clock("teacher"):
-            return cached.feature_map(views, view)
 
+def _checkpoint(
+    work: Path | None,
+    gaussians: Gaussians,
+    views: Views,
+    teacher: Teacher,
+    config: FuseConfig,
+    rows: tuple[int, ...],
+    basis: FeatureBasis | None,
+) -> FusionCheckpoint | None:
+    """The checkpoint in `work`, which belongs to this scene, these settings and this basis alone."""
+    if work is None:
+        return None
+    settings: dict[str, Any] = {"fuse": asdict(config), "teacher": teacher.settings(), "views": list(rows)}
     if basis is not None:
-        mean: np.ndarray | None = basis.mean
-        truncation = 1 - float(np.sqrt(basis.energy_kept))
-    else:
-        basis, mean, truncation = _find_basis(teacher, map_of, chosen, config, clock, track, resumable=kept is not None)
-    # Where the mean alone is missing, it is found on the way; not so in a run that may start in the middle.
-    moments = Moments(teacher.space.channels, second=False) if mean is None else None
-    with clock("lift"):
-        columns = basis.rank if basis is not None else teacher.space.channels
-        sums = Sums(len(scene.gaussians), columns, basis, teacher.table)
-        done = sums.restore(kept)
-    for position in track(range(done, len(chosen)), "lifting views"):
-        feature_map = map_of(chosen[position])
-        if moments is not None:
-            _add_rows(moments, feature_map, clock)
-        b = view_matrix(
-            scene.gaussians,
-            scene.views,
-            chosen[position],
-            feature_map,
-            clock,
-            lift=config.lift,
-            visibility=config.visibility,
-            config=config.blend,
-        )
-        with clock("lift"):
-            sums.add(b, feature_map, scene.views.masks[chosen[position]] if scene.views.masks is not None else None)
-        if kept is not None and kept.due():
-            kept.save_sums(position + 1, sums.sums, sums.weights)
-    with clock("lift"):
-        features, weights = sums.finish()
-    if not (weights > 0).any():
-        raise InputError(f"fuse: none of {len(chosen)} views of {scene.name} sees any Gaussian; check poses and units")
-    if mean is None:
-        assert moments is not None
-        mean = moments.mean.astype(np.float32)
-    fused = GaussianFeatures(features=features, weights=weights, mean=mean, space=teacher.space, basis=basis)
-    return Fusion(
-        features=fused, views=chosen, tested=config.visibility.against, seconds=clock.seconds, truncation=truncation
-    )
+        settings["basis"] = hashlib.sha256(basis.mean.tobytes() + basis.components.tobytes()).hexdigest()[:16]
+    return FusionCheckpoint(work, settings | {"scene": _scene_digests(gaussians, views)})
 
 
-def _choose(available: int, wanted: int) -> tuple[int, ...]:
-    return tuple(int(view) for view in evenly(available, wanted or available))
-
-
-def _identity(gaussians: Gaussians, views: Views) -> dict[str, str]:
-    """What maps and sums of one scene are told from another's by; pictures count by their names alone."""
+def _scene_digests(gaussians: Gaussians, views: Views) -> dict[str, str]:
+    """Digests of the Gaussians and of the cameras; photographs count by their names alone."""
     digest = hashlib.sha256(repr(views.names).encode("utf-8", "backslashreplace"))
     for name in ("cam_from_world", "Ks", "widths", "heights"):
         digest.update(np.ascontiguousarray(getattr(views.cameras, name)).tobytes())
     return {"gaussians": fingerprint(gaussians)[:16], "views": digest.hexdigest()[:16]}
 
 
-def _find_basis(
+def _timed_maps(teacher: Teacher, views: Views, clock: Clock) -> Callable[[int], FeatureMap]:
+    def maps(view: int) -> FeatureMap:
+        with clock("teacher"):
+            return teacher.feature_map(views, view)
+
+    return maps
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Subspace:
+    """Where features are summed.
+
+    Attributes:
+        basis: whose coordinates are summed; None = all channels.
+        mean: of the teacher's vectors; None where only a pass over all views tells.
+        truncation: see `Fusion`.
+    """
+
+    basis: FeatureBasis | None = None
+    mean: Float32[np.ndarray, " D"] | None = None
+    truncation: float = 0.0
+
+    @classmethod
+    def of_basis(cls, basis: FeatureBasis) -> "Subspace":
+        # For cells weighted by squared distance from the mean, the mean squared cosine is exactly the energy kept.
+        return cls(basis=basis, mean=basis.mean, truncation=1 - float(np.sqrt(basis.energy_kept)))
+
+
+def find_subspace(
     teacher: Teacher,
-    map_of: Callable[[int], FeatureMap],
-    chosen: tuple[int, ...],
+    maps: Callable[[int], FeatureMap],
+    rows: tuple[int, ...],
     config: FuseConfig,
     clock: Clock,
     track: Track,
     *,
-    resumable: bool,
-) -> tuple[FeatureBasis | None, Float32[np.ndarray, " D"] | None, float]:
-    """The basis, the space's mean (None: not known without a pass of its own), and what the basis costs."""
+    one_pass: bool,
+) -> Subspace:
+    """Fits a basis to a teacher's vectors, where `config` asks for one.
+
+    Args:
+        teacher: whose table, if it has one, makes a pass over the maps unnecessary.
+        maps: the map of a view.
+        rows: of the views.
+        config: see there.
+        clock: counts the seconds of the step "basis".
+        track: progress.
+        one_pass: whether the mean may be left to the pass that lifts, where nothing else is missing.
+    """
     space = teacher.space
-    wanted = config.basis and space.channels > config.narrow
+    needs_basis = config.basis and space.channels > config.narrow
     if teacher.table is not None:
         mean = teacher.mean if teacher.mean is not None else teacher.table.mean(axis=0)
-        if not wanted:
-            return None, mean, 0.0
+        if not needs_basis:
+            return Subspace(mean=mean)
         basis = table_basis(teacher.table, mean, space, energy=config.table_energy)
-        return basis, mean, _truncation(basis, teacher.table)
-    if not wanted and (teacher.mean is not None or not resumable):
-        return None, teacher.mean, 0.0
-    moments = Moments(space.channels, second=wanted)
-    for view in track(chosen, "finding the basis"):
-        _add_rows(moments, map_of(view), clock)
-    mean = teacher.mean if teacher.mean is not None else moments.mean.astype(np.float32)
-    if not wanted:
-        return None, mean, 0.0
+        return Subspace(basis=basis, mean=mean, truncation=_truncation(basis, teacher.table))
+    if not needs_basis and (teacher.mean is not None or one_pass):
+        return Subspace(mean=teacher.mean)
+    moments = Moments(space.channels, second=needs_basis)
+    for view in track(rows, "finding the basis"):
+        _add_cells(moments, maps(view), clock)
+    if not needs_basis:
+        return Subspace(mean=moments.mean.astype(np.float32))
     with clock("basis"):
         basis = fit_basis(moments.mean, moments.covariance(), space, energy=config.energy, max_rank=config.max_rank)
-    # For cells weighted by squared distance from the mean, the mean squared cosine is exactly the energy kept.
-    return basis, mean, 1 - float(np.sqrt(basis.energy_kept))
+    subspace = Subspace.of_basis(basis)
+    return subspace if teacher.mean is None else replace(subspace, mean=teacher.mean)
 
 
-def _add_rows(moments: Moments, feature_map: FeatureMap, clock: Clock) -> None:
+def _add_cells(moments: Moments, feature_map: FeatureMap, clock: Clock) -> None:
+    """Adds the cells of a map that have features."""
     rows = map_rows(feature_map)
     with clock("basis"):
         moments.add(rows[np.isfinite(rows[:, 0])])
 
 
 def _truncation(basis: FeatureBasis, table: Float32[np.ndarray, "C D"]) -> float:
+    """1 − the root mean square cosine of a table's centered rows and their projections."""
     centered = table - basis.mean
-    inside = (centered @ basis.components.T) @ basis.components
-    return 1 - float(np.sqrt((inside**2).sum() / max((centered**2).sum(), 1e-30)))
+    projected = (centered @ basis.components.T) @ basis.components
+    return 1 - float(np.sqrt((projected**2).sum() / max((centered**2).sum(), 1e-30)))

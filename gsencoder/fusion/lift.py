@@ -1,4 +1,4 @@
-"""One view's part in fusion: the matrix that its map is lifted with, and the sums that all views add to."""
+"""Lifting one view: the matrix that carries its map to the Gaussians, and the sums over all views."""
 
 from typing import Literal
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32
 
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.fusion.basis import encode
-from gsencoder.fusion.checkpoint import PartialFusion
+from gsencoder.fusion.checkpoint import FusionCheckpoint
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
 from gsencoder.geometry import transform
 from gsencoder.render import Blend, BlendConfig, blend
@@ -27,28 +27,43 @@ def map_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "P D"]:
     return np.where((codes >= 0)[:, None], feature_map.table[codes], np.float32(np.nan))
 
 
-class Sums:
-    """Running sums over views: coordinates (or channels), or for coded maps the weight of each code."""
+class FeatureSums:
+    """Sums over views of weighted features and of weights; for coded maps, of the weight of each code.
+
+    Attributes:
+        sums: Σ Bᵀ @ maps in coordinates of the basis (or channels); of coded maps Σ Bᵀ @ one_hot(codes).
+        weights: Σ Bᵀ @ 1; zero where maps are coded, whose weights are the row sums.
+        views: how many views were added.
+    """
 
     def __init__(
         self, gaussians: int, columns: int, basis: FeatureBasis | None, table: Float32[np.ndarray, "C D"] | None
     ) -> None:
-        self.basis, self.table = basis, table
+        """Args:
+        gaussians: number of rows.
+        columns: coordinates or channels of a row.
+        basis: whose coordinates are summed; None = channels.
+        table: the vectors of coded maps; None = dense maps.
+        """
+        self.basis, self.table, self.views = basis, table, 0
         # numpy, not torch, allocates what is large: its arrays lie in huge pages, which fill many times faster.
         width = columns if table is None else len(table)
         self.sums: Float32[np.ndarray, "N columns"] = np.zeros((gaussians, width), np.float32)
         self.weights: Float32[np.ndarray, " N"] = np.zeros(gaussians, np.float32)
 
-    def restore(self, kept: PartialFusion | None) -> int:
-        """Takes up the sums of an earlier run; returns how many views they hold."""
-        found = kept.load_sums(*self.sums.shape) if kept is not None else None
-        if found is None:
-            return 0
-        done, self.sums, self.weights = found
-        return done
+    def restore(self, checkpoint: FusionCheckpoint) -> None:
+        """Continues from the sums of an interrupted run, where the checkpoint holds any.
+
+        Raises:
+            InputError: the checkpoint is damaged.
+        """
+        earlier = checkpoint.load_sums(*self.sums.shape)
+        if earlier is not None:
+            self.views, self.sums, self.weights = earlier
 
     def add(self, b: Blend, feature_map: FeatureMap, mask: Bool[np.ndarray, "H W"] | None) -> None:
-        """One view's share: sums += Bᵀ @ (share · maps), weights += Bᵀ @ share, the share of a row in the mask."""
+        """Adds a view: sums += Bᵀ @ (share · maps), weights += Bᵀ @ share, with the share of each row in the mask."""
+        self.views += 1
         share = row_mask(mask, b.lattice) if mask is not None else None
         if self.table is not None:
             assert feature_map.codes is not None
@@ -70,7 +85,7 @@ class Sums:
         b.lift_into(torch.from_numpy(scale[:, None]), torch.from_numpy(self.weights[:, None]))
 
     def finish(self) -> tuple[Float32[np.ndarray, "N columns"], Float32[np.ndarray, " N"]]:
-        """Divides once: (features, weights); rows without weight are zero."""
+        """Divides, once: (features, weights); rows without weight are zero."""
         if self.table is None:
             weights, sums = self.weights, self.sums
         else:

@@ -8,7 +8,7 @@ import pytest
 from training_scenes import DenseSideTeacher, scene
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.checkpoint import SETTINGS_FILE, SUMS_FILE, PartialFusion
+from gsencoder.fusion.checkpoint import SETTINGS_FILE, SUMS_FILE, FusionCheckpoint
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.types import FeatureMap, Views
 
@@ -29,14 +29,14 @@ class CountingTeacher(DenseSideTeacher):
 def a_map(folder: Path, settings: dict[str, Any], teacher: Teacher | None = None, view: int = 0) -> FeatureMap:
     views = scene(0).views
     assert views is not None
-    return PartialFusion(folder, settings).cached(teacher or CountingTeacher()).feature_map(views, view)
+    return FusionCheckpoint(folder, settings).cached(teacher or CountingTeacher()).feature_map(views, view)
 
 
 def test_maps_and_sums_come_back(tmp_path: Path) -> None:
     teacher = CountingTeacher()
     first = a_map(tmp_path / "work", {"a": 1}, teacher)
-    PartialFusion(tmp_path / "work", {"a": 1}).save_sums(2, np.ones((5, 3), np.float32), np.full(5, 2, np.float32))
-    again = PartialFusion(tmp_path / "work", {"a": 1})
+    FusionCheckpoint(tmp_path / "work", {"a": 1}).save_sums(2, np.ones((5, 3), np.float32), np.full(5, 2, np.float32))
+    again = FusionCheckpoint(tmp_path / "work", {"a": 1})
     np.testing.assert_array_equal(a_map(tmp_path / "work", {"a": 1}, teacher).features, first.features)
     assert teacher.calls == 1
     a_map(tmp_path / "work", {"a": 1}, teacher, view=1)
@@ -48,23 +48,23 @@ def test_maps_and_sums_come_back(tmp_path: Path) -> None:
 
 
 def test_a_run_that_kept_nothing_leaves_no_folder_to_refuse_the_next(tmp_path: Path) -> None:
-    PartialFusion(tmp_path / "work", {"patch": 13})
+    FusionCheckpoint(tmp_path / "work", {"patch": 13})
     assert not (tmp_path / "work").exists()
     a_map(tmp_path / "work", {"patch": 14})
     with pytest.raises(InputError, match="begun with patch=14, and this run asks patch=13; delete it"):
-        PartialFusion(tmp_path / "work", {"patch": 13})
+        FusionCheckpoint(tmp_path / "work", {"patch": 13})
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff", b"[" * 100_000])
 def test_settings_that_cannot_be_read_say_what_to_delete(tmp_path: Path, content: bytes) -> None:
     (tmp_path / SETTINGS_FILE).write_bytes(content)
     with pytest.raises(InputError, match=f"delete {tmp_path} to start anew"):
-        PartialFusion(tmp_path, {})
+        FusionCheckpoint(tmp_path, {})
 
 
 @pytest.mark.parametrize("kept_bytes", [0, 7, 100, 200])
 def test_damaged_maps_and_sums_are_named(tmp_path: Path, kept_bytes: int) -> None:
-    kept = PartialFusion(tmp_path, {})
+    kept = FusionCheckpoint(tmp_path, {})
     a_map(tmp_path, {})
     kept.save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
     for file in ("map_00000.safetensors", SUMS_FILE):
@@ -76,6 +76,6 @@ def test_damaged_maps_and_sums_are_named(tmp_path: Path, kept_bytes: int) -> Non
 
 
 def test_sums_of_another_size_are_refused(tmp_path: Path) -> None:
-    PartialFusion(tmp_path, {}).save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
+    FusionCheckpoint(tmp_path, {}).save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
     with pytest.raises(InputError, match=r"expected sums float32\[6, 3\], got float32\[5, 3\]"):
-        PartialFusion(tmp_path, {}).load_sums(6, 3)
+        FusionCheckpoint(tmp_path, {}).load_sums(6, 3)

@@ -257,7 +257,7 @@ def test_sums_of_an_interrupted_lift_are_taken_up(
 
     scene, maps = make_scene(), random_maps(rng)
     module = sys.modules["gsencoder.fusion.fuse"]
-    monkeypatch.setattr("gsencoder.fusion.checkpoint.PartialFusion.due", lambda _: True)
+    monkeypatch.setattr("gsencoder.fusion.checkpoint.FusionCheckpoint.due", lambda _: True)
     whole = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "whole")
     lifted: list[int] = []
 
@@ -288,7 +288,7 @@ def test_a_resumed_run_of_a_cheap_narrow_teacher_keeps_the_mean_of_all_views(
     scene, teacher = make_scene(), FixedTeacher(random_maps(rng))
     teacher.cheap = True
     config = replace(EXACT, narrow=SPACE.channels)
-    monkeypatch.setattr("gsencoder.fusion.checkpoint.PartialFusion.due", lambda _: True)
+    monkeypatch.setattr("gsencoder.fusion.checkpoint.FusionCheckpoint.due", lambda _: True)
     whole = fuse(scene, teacher, config, work=tmp_path)
     # The sums of all views are there now: nothing is left to lift, and the mean must not be that of nothing.
     again = fuse(scene, teacher, config, work=tmp_path)

@@ -6,7 +6,7 @@ import torch
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.runtime.clock import Clock
-from gsencoder.fusion.lift import Sums, capped, center_matrix, map_rows, view_matrix
+from gsencoder.fusion.lift import FeatureSums, capped, center_matrix, map_rows, view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import depth_image
@@ -31,7 +31,7 @@ def test_cells_without_a_vector_give_neither_features_nor_weight(rng: np.random.
     mask = rng.random((HEIGHT, WIDTH)) < 0.8
     # Every pixel has equally many of a cell's rays.
     share = mask.reshape(HEIGHT // STRIDE, STRIDE, WIDTH // STRIDE, STRIDE).mean(axis=(1, 3)).ravel()
-    sums = Sums(100, channels, None, None)
+    sums = FeatureSums(100, channels, None, None)
     sums.add(b, map_of(cells), mask)
     dense = b.render(torch.eye(100)).numpy().astype(np.float64)
     vectors = cells.reshape(-1, channels)
@@ -101,7 +101,7 @@ def test_sums_are_divided_by_their_weights_and_rows_of_hardly_any_weight_are_zer
 ) -> None:
     table = rng.normal(size=(3, 2)).astype(np.float32)
     shares = np.array([[1, 2, 3], [0, 0, 0], [0, 1e-39, 0], [0.5, 0, 0.25]], np.float32)
-    sums = Sums(4, 2, None, table if coded else None)
+    sums = FeatureSums(4, 2, None, table if coded else None)
     if coded:
         sums.sums[:] = shares
     else:

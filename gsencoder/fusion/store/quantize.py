@@ -48,7 +48,7 @@ class CompactFeatures:
         rows: which Gaussians were seen, ascending.
         total: Gaussians.
         basis: what the coordinates stand for.
-        error: 1 − mean centered cosine to what was compacted: over the seen rows, or over their kinds (a sample in which
+        error: 1 − mean centered cosine to what was compacted: over the seen rows, or over their kinds (a sample where
             each row counts by how few are like it), whichever is larger. Features at the space's mean have no cosine.
         lowest: the centered cosine that one row in a thousand is below.
     """
