@@ -31,14 +31,14 @@ class Encoder(Protocol):
         metres_per_unit: float = 1.0,
         track: Track = untracked,
     ) -> GaussianFeatures:
-        """Features of every Gaussian, all with weight 1; see `infer.encode.encode`."""
+        """Features of every Gaussian, all with weight 1; see `gsencoder.infer.encode.encode.encode`."""
 
 
 def load_encoder(given: str, device: Device = "auto") -> Encoder:
     """The encoder that a user means.
 
     Args:
-        given: a file of `gsencoder export`, else what `models.weights.find_weights` finds.
+        given: a file of `gsencoder export`, else what `gsencoder.models.weights.find_weights` finds.
         device: where an exported graph is to run; torch's weights move to where `EncodeConfig` says.
 
     Raises:

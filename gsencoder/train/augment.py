@@ -57,7 +57,7 @@ def augment(
     Args:
         gaussians: world units.
         rng: everything random comes from it.
-        config: how much may change; `drop` is not done here, since rows would go (see `data.batch`).
+        config: how much may change; `drop` is not done here, since rows would go (see `gsencoder.train.crops`).
         voxel: the unit of `jitter`, world units.
         up: the axis of `turn`; the world's z where it is not known.
     """

@@ -44,7 +44,7 @@ class ViewRows:
     """B of one view in rows of cells, and what the teacher saw there.
 
     Attributes:
-        crow, col, weight: compressed rows, as in `render.Blend`.
+        crow, col, weight: compressed rows, as in `gsencoder.render.Blend`.
         targets: the teacher's vectors, standard units.
         valid: cells in which the teacher has one.
     """

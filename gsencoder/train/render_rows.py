@@ -23,7 +23,7 @@ class Rows(NamedTuple):
     """Rows of B that are compared with a teacher's cells, over the Gaussians of a sample or a batch.
 
     Attributes:
-        crow, col, weight: compressed rows, as in `render.Blend`.
+        crow, col, weight: compressed rows, as in `gsencoder.render.Blend`.
         targets: the teacher's vectors in the cells, standard units.
         row_weights: of each row in the loss.
     """

@@ -17,7 +17,7 @@ from gsencoder.types import GaussianFeatures, Gaussians, check_unit
 
 
 class TorchEncoder:
-    """Weights with what is needed to use them; see `infer.encoders.Encoder`."""
+    """Weights with what is needed to use them; see `gsencoder.infer.load_encoder.Encoder`."""
 
     def __init__(self, given: str) -> None:
         """Reads a file, a folder of `train`, or weights that come with the package; see `find_weights`."""

@@ -19,7 +19,7 @@ from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scen
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizeConfig:
-    """How words become boxes. Lengths in units of the scene's spacing (`data.spacing.scene_spacing`)."""
+    """How words become boxes. Lengths in units of the scene's spacing (`gsencoder.data.seeding.spacing.scene_spacing`)."""
 
     mode: Literal["centred", "raw"] = field(
         default="centred", metadata={"help": "cosines after removing each side's mean, or as they are"}
@@ -54,7 +54,7 @@ class LocalizeConfig:
 
     def __post_init__(self) -> None:
         if self.mode not in ("centred", "raw"):
-            raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
+            raise InputError(f"mode: expected centred or raw, got {self.mode!r}")
         if self.extent not in ("means", "sigma"):
             raise InputError(f"extent: expected means or sigma, got {self.extent!r}")
         for name in ("temperature", "eps_spacings", *(("eps",) if self.eps is not None else ())):
@@ -84,7 +84,7 @@ def localize(
     """Finds words in a scene.
 
     Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
-    score that `infer.boxes.score_clusters` defines. Axis-aligned and oriented boxes are drawn around Gaussian means,
+    score that `gsencoder.infer.localize.boxes.score_clusters` defines. Axis-aligned and oriented boxes are drawn around Gaussian means,
     with `config.margin` spacings on every side, unless `config.extent` says "sigma", and have the scene's origin
     added back in float64. A word's boxes do not depend on the other words asked, unless `config.contrast` is on.
 

@@ -81,7 +81,7 @@ def with_row(x: FLOAT, value: FLOAT) -> FLOAT:
 
 @script(OURS, default_opset=op)
 def convolve(x: FLOAT, neighbors: INT32, weight: FLOAT) -> FLOAT:
-    """As `models.neighbors.NeighborConv`."""
+    """As `gsencoder.models.grid.neighbors.NeighborConv`."""
     table = in_blocks(neighbors)
     padded = with_row(x, op.CastLike(0.0, x))
     columns = op.Gather(op.Shape(weight), op.Constant(value_ints=[2]))
@@ -129,7 +129,7 @@ _STARTS = onnx.numpy_helper.from_array(
 
 @script(OURS, default_opset=op)
 def hilbert(morton: INT64) -> INT64:
-    """As `models.serialize.hilbert_from_morton`, looking no further than the largest code has digits to the base 64."""
+    """As `gsencoder.models.grid.serialize.hilbert_from_morton`, looking no further than the largest code has digits to the base 64."""
     table = op.Constant(value=_TABLE)
     largest = op.ReduceMax(morton, keepdims=0)
     further = op.ReduceSum(op.Cast(op.GreaterOrEqual(largest, op.Constant(value=_POWERS)), to=7), keepdims=0)

@@ -97,7 +97,7 @@ def convolve_reference(
 
 @torch.library.custom_op("gsencoder::convolve", mutates_args=())
 def convolve(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
-    """The convolution as one operator, which an exported graph has in ONNX's own (`infer.onnx_operators`)."""
+    """The convolution as one operator, which an exported graph has in ONNX's own (`gsencoder.infer.onnx.operators`)."""
     return _multiply(x, neighbors, weight.flatten(0, 1))
 
 
