@@ -1,4 +1,4 @@
-"""An encoder from whatever file holds it: torch's weights, or an exported graph, which needs no torch."""
+"""Loading an encoder: trained weights, which need torch, or an exported ONNX graph, which does not."""
 
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -13,7 +13,7 @@ from gsencoder.types import GaussianFeatures, Gaussians
 
 @runtime_checkable
 class Encoder(Protocol):
-    """What gives every Gaussian of a splat a feature."""
+    """Computes a feature for every Gaussian of a splat."""
 
     @property
     def voxel(self) -> float:
@@ -21,7 +21,7 @@ class Encoder(Protocol):
 
     @property
     def words(self) -> TextTable | None:
-        """What turns words into the features' space, where it comes with the encoder."""
+        """Text table of the features' space; None where none lies beside the encoder."""
 
     def encode(
         self,
@@ -34,18 +34,18 @@ class Encoder(Protocol):
         """Features of every Gaussian, all with weight 1; see `gsencoder.infer.encode.encode.encode`."""
 
 
-def load_encoder(given: str, device: Device = "auto") -> Encoder:
-    """The encoder that a user means.
+def load_encoder(weights: str, device: Device = "auto") -> Encoder:
+    """Loads the encoder of a file, a folder or a name.
 
     Args:
-        given: a file of `gsencoder export`, else what `gsencoder.models.weights.find_weights` finds.
-        device: where an exported graph is to run; torch's weights move to where `EncodeConfig` says.
+        weights: a file that `gsencoder export` wrote, else what `gsencoder.models.weights.find_weights` takes.
+        device: where an exported graph runs; trained weights follow `EncodeConfig.device`.
 
     Raises:
-        InputError: there is none, or it cannot be read.
+        InputError: no such encoder, or it cannot be read.
     """
-    if Path(given).suffix.lower() == SUFFIX:
-        return OnnxEncoder(given, device=device)
+    if Path(weights).suffix.lower() == SUFFIX:
+        return OnnxEncoder(weights, device=device)
     from gsencoder.infer.encode.encode import TorchEncoder
 
-    return TorchEncoder(given)
+    return TorchEncoder(weights)

@@ -36,17 +36,17 @@ def test_every_gaussian_is_some_chunks_own_once_and_no_chunk_is_too_large(
     means = rng.normal(size=(count, 3)).astype(np.float32)
     means[: count // 3] = 0.5  # Coincident ones cannot be cut apart by a plane.
     chunks = cut(means, chunk, halo)
-    assert sorted(np.concatenate([one.own for one in chunks]).tolist()) == list(range(count))
+    assert sorted(np.concatenate([one.core_rows for one in chunks]).tolist()) == list(range(count))
     for one in chunks:
         assert len(one.rows) <= chunk
-        assert np.array_equal(one.rows[: len(one.own)], one.own)
+        assert np.array_equal(one.rows[: len(one.core_rows)], one.core_rows)
         assert len(np.unique(one.rows)) == len(one.rows)
 
 
 def test_the_halo_is_what_lies_around_a_box() -> None:
     means = np.random.default_rng(0).uniform(0, 10, (2000, 3)).astype(np.float32)
     for one in cut(means, 1500, 0.5):
-        own, rows = means[one.own], means[one.rows]
+        own, rows = means[one.core_rows], means[one.rows]
         low, high = own.min(axis=0), own.max(axis=0)
         near = ((means >= low - 0.45) & (means <= high + 0.45)).all(axis=1)
         assert np.isin(np.flatnonzero(near), one.rows).all()

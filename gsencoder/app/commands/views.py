@@ -13,7 +13,7 @@ from gsencoder.core.files.archive import write_archive
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.fusion.store.folder import load_features
-from gsencoder.infer.localize.localize import LocalizeConfig, asked_features, box_to_json, localize
+from gsencoder.infer.localize.localize import LocalizeConfig, box_to_json, localize, select_features
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.pictures import told, view_pictures
@@ -110,7 +110,7 @@ def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
 def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:
     """Rendered features as tokens [V, lines · columns, D] float32, under the name "tokens"."""
     assert scene.gaussians is not None
-    _, features = asked_features(scene, config.space or None)
+    _, features = select_features(scene, config.space or None)
     grid = (config.grid[0], config.grid[1])
     blends = token_blends(scene.gaussians, views.cameras, grid, fit=config.fit, config=BlendConfig(near=views.near))
     tokens = feature_tokens(blends, features).numpy()

@@ -1,4 +1,4 @@
-"""A scene of any size in parts: what an encoder sees at a time, each part with its surroundings."""
+"""Scenes of any size in chunks: boxes of Gaussians with a halo of their surroundings, which an encoder sees at once."""
 
 import math
 from collections.abc import Callable
@@ -16,17 +16,22 @@ from gsencoder.types import Gaussians
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncodeConfig:
-    """How much at a time, and in what precision."""
+    """The size of chunks and their halo, and where and in what precision the encoder computes."""
 
     chunk: int = field(
-        default=250_000, metadata={"help": "most Gaussians that the network sees at once, halo included; 0 = all"}
+        default=250_000,
+        metadata={"help": "largest number of Gaussians that the network sees at once, halo included; 0 = no chunks"},
     )
-    halo: float = field(default=0.64, metadata={"help": "metres of surroundings that a chunk sees beyond its own part"})
+    halo: float = field(
+        default=0.64, metadata={"help": "width in metres of the surroundings that the network sees around a chunk"}
+    )
     precision: Precision = field(
         default="auto",
-        metadata={"help": "what the encoder computes in; auto = bfloat16 where the device multiplies it"},
+        metadata={
+            "help": "type that the encoder computes in; auto = bfloat16 where the hardware multiplies it, else float32"
+        },
     )
-    device: Device = field(default="auto", metadata={"help": "where it computes"})
+    device: Device = field(default="auto", metadata={"help": "where the encoder computes"})
 
     def __post_init__(self) -> None:
         if self.chunk < 0:
@@ -41,10 +46,10 @@ class Chunk:
 
     Attributes:
         own: rows whose features come from this chunk.
-        rows: what the network sees, `own` first.
+        rows: what the network sees, `core_rows` first.
     """
 
-    own: Int64[np.ndarray, " n"]
+    core_rows: Int64[np.ndarray, " n"]
     rows: Int64[np.ndarray, " m"]
 
 
@@ -58,14 +63,14 @@ def encode_by_chunks(
     channels: int,
     track: Track = untracked,
 ) -> Float32[np.ndarray, "N channels"]:
-    """What an encoder finds for every Gaussian, seen part by part.
+    """Features of every Gaussian, computed chunk by chunk.
 
     Args:
         gaussians: the splat.
-        run: what the encoder finds for a part, given the curves of the whole where it is not all.
-        curves: makes these, where there are several parts.
-        config: of the parts.
-        metres_per_unit: of the splat's world.
+        run: the encoder: features of a subset, given the curves of the complete scene where there are several chunks.
+        curves: computes these curves.
+        config: see there.
+        metres_per_unit: unit of length of the splat.
         channels: columns of the result.
         track: wraps the loop over chunks to show progress.
 
@@ -77,57 +82,57 @@ def encode_by_chunks(
     result = np.zeros((len(gaussians), channels), np.float32)
     bad = 0
     chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
-    whole = curves() if len(chunks) > 1 else None
+    scene_curves = curves() if len(chunks) > 1 else None
     for chunk in track(chunks, "encoding"):
-        part = gaussians if len(chunks) == 1 else gaussians.select(chunk.rows)
-        found = run(part, whole)[: len(chunk.own)]
-        bad += int((~np.isfinite(found).all(axis=1)).sum())
-        result[chunk.own] = found
+        subset = gaussians if len(chunks) == 1 else gaussians.select(chunk.rows)
+        features = run(subset, scene_curves)[: len(chunk.core_rows)]
+        bad += int((~np.isfinite(features).all(axis=1)).sum())
+        result[chunk.core_rows] = features
     if bad:
         raise InputError(f"encode: {bad} of {len(result)} features are not finite; try precision=float32")
     return result
 
 
 def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chunk]:
-    """Cuts a scene into boxes, halved along their longest side until each, with its halo, fits into a chunk.
+    """Cuts a scene into boxes, halved along their longest side until each fits into a chunk with its halo.
 
-    Every row is some chunk's own, once. Where a box has become small beside its halo, the halo is what is cut: the
-    nearest surroundings that fit are kept.
+    Every row is in the core of exactly one chunk. Where a box has become small beside its halo, the halo is cut
+    instead: the nearest rows that fit remain in it.
 
     Args:
-        means: world units.
-        chunk: most rows of a chunk; 0 = one chunk.
-        halo: world units.
+        means: centers in world units.
+        chunk: largest number of rows of a chunk; 0 = one chunk.
+        halo: width of the halo in world units.
     """
-    everything = np.arange(len(means))
+    all_rows = np.arange(len(means))
     if chunk == 0 or len(means) <= chunk:
-        return [Chunk(own=everything, rows=everything)]
-    found: list[Chunk] = []
-    waiting = [(everything, np.full(3, -np.inf), np.full(3, np.inf))]
-    while waiting:
-        own, low, high = waiting.pop()
-        around = _around(means, own, low, high, halo)
-        if len(own) + len(around) <= chunk or len(own) <= max(1, chunk // 4):
-            if len(own) + len(around) > chunk:
-                inside = means[around].clip(low, high)
-                far = np.square(means[around] - inside).sum(axis=1)
-                around = around[np.sort(np.argsort(far, kind="stable")[: chunk - len(own)])]
-            found.append(Chunk(own=own, rows=np.concatenate((own, around))))
+        return [Chunk(core_rows=all_rows, rows=all_rows)]
+    chunks: list[Chunk] = []
+    pending = [(all_rows, np.full(3, -np.inf), np.full(3, np.inf))]
+    while pending:
+        core_rows, low, high = pending.pop()
+        halo_rows = _halo_rows(means, core_rows, low, high, halo)
+        if len(core_rows) + len(halo_rows) <= chunk or len(core_rows) <= max(1, chunk // 4):
+            if len(core_rows) + len(halo_rows) > chunk:
+                inside = means[halo_rows].clip(low, high)
+                far = np.square(means[halo_rows] - inside).sum(axis=1)
+                halo_rows = halo_rows[np.sort(np.argsort(far, kind="stable")[: chunk - len(core_rows)])]
+            chunks.append(Chunk(core_rows=core_rows, rows=np.concatenate((core_rows, halo_rows))))
             continue
-        points = means[own]
+        points = means[core_rows]
         axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))
         order = np.argsort(points[:, axis], kind="stable")
-        half = len(own) // 2
+        half = len(core_rows) // 2
         middle = float(points[order[half], axis])
-        first, second = np.sort(own[order[:half]]), np.sort(own[order[half:]])
+        first, second = np.sort(core_rows[order[:half]]), np.sort(core_rows[order[half:]])
         upper, lower = high.copy(), low.copy()
         upper[axis] = lower[axis] = middle
-        waiting += [(second, lower, high), (first, low, upper)]
-    return found
+        pending += [(second, lower, high), (first, low, upper)]
+    return chunks
 
 
-def _around(means: np.ndarray, own: np.ndarray, low: np.ndarray, high: np.ndarray, halo: float) -> np.ndarray:
-    """Rows within `halo` of a box that are not its own."""
+def _halo_rows(means: np.ndarray, core_rows: np.ndarray, low: np.ndarray, high: np.ndarray, halo: float) -> np.ndarray:
+    """Rows within `halo` of a box that are not in its core."""
     near = np.asarray(((means >= low - halo) & (means <= high + halo)).all(axis=1))
-    near[own] = False
+    near[core_rows] = False
     return np.flatnonzero(near)

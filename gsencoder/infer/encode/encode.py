@@ -1,4 +1,4 @@
-"""Features of a splat in one pass: no photographs, no teacher (SplatDistill sec. 3.4), for scenes of any size."""
+"""Feed-forward inference: features of a splat in one pass, without photographs or teacher (SplatDistill, sec. 3.4)."""
 
 import numpy as np
 import torch
@@ -17,11 +17,11 @@ from gsencoder.types import GaussianFeatures, Gaussians, check_unit
 
 
 class TorchEncoder:
-    """Weights with what is needed to use them; see `gsencoder.infer.load_encoder.Encoder`."""
+    """A trained network with its output space and its words; see `gsencoder.infer.load_encoder.Encoder`."""
 
-    def __init__(self, given: str) -> None:
+    def __init__(self, weights: str) -> None:
         """Reads a file, a folder of `train`, or weights that come with the package; see `find_weights`."""
-        file = find_weights(given)
+        file = find_weights(weights)
         self.network, self.outputs, self.made_by = load_weights(file)
         words = file.with_name(WORDS_FILE)
         self.words = load_text_table(words) if words.is_file() else None
@@ -56,10 +56,10 @@ def encode(
 
     Args:
         gaussians: the splat.
-        encoder: from `load_weights`, in evaluation mode.
-        outputs: what its numbers mean.
+        encoder: from `load_weights`; put into evaluation mode here.
+        outputs: what its output channels mean.
         config: see there.
-        metres_per_unit: of the splat's world; the encoder's grid is in metres.
+        metres_per_unit: unit of length of the splat; the encoder's grid is in metres.
         track: wraps the loop over chunks to show progress.
 
     Raises:
@@ -72,9 +72,9 @@ def encode(
     encoder = encoder.to(device).eval()
     shape, voxel = encoder.config.transformer, encoder.config.voxel / metres_per_unit
 
-    def run(part: Gaussians, whole: Curves | None) -> Float32[np.ndarray, "n channels"]:
+    def run(subset: Gaussians, scene_curves: Curves | None) -> Float32[np.ndarray, "n channels"]:
         with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype is not None):
-            attributes, opacities, plan = encoder_inputs(part, encoder.config, voxel, device, whole=whole)
+            attributes, opacities, plan = encoder_inputs(subset, encoder.config, voxel, device, whole=scene_curves)
             return outputs.restore(encoder(attributes, opacities, encoder.join([plan])).cpu().numpy())
 
     features = encode_by_chunks(

@@ -11,25 +11,26 @@ from jaxtyping import Float, Float32, Float64, Int64, Integer
 from gsencoder.types import Gaussians
 
 Extent = Literal["means", "sigma"]
-GRID_ABOVE = 50_000
-"""Points above which clusters are found on a grid of eps / 4."""
-FLAT = 1e-5
-"""Share of the largest extent below which a direction has no extent (float32 coordinates are good to 1e-7)."""
+MAX_EXACT_POINTS = 50_000
+"""Above this number of points, clusters are computed on a grid of eps / 4."""
+EMPTY_EXTENT = 1e-5
+"""Share of the largest extent below which a direction counts as empty (float32 coordinates are good to 1e-7)."""
 
 
 def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) -> Int64[np.ndarray, " n"]:
-    """DBSCAN labels (Ester et al. 1996), −1 = in no cluster.
+    """DBSCAN labels (Ester et al. 1996), −1 = noise.
 
     scikit-learn keeps the neighbors of every point, which on a dense splat grows with the square of the density.
-    Above 50,000 points the clusters are therefore found between the occupied cells of a grid of eps / 4, each weighing
-    as many points as it holds, and points take the label of their cell: distances are then off by up to 0.43 eps.
+    Above 50,000 points the occupied cells of a grid of eps / 4 are therefore clustered instead, each weighted by its
+    number
+    of points, and points take the label of their cell: distances are then off by up to 0.43 eps.
     """
     from sklearn.cluster import DBSCAN
 
     if len(points) == 0:
         return np.zeros(0, np.int64)
     local = points.astype(np.float64) - points.min(axis=0)
-    if len(points) <= GRID_ABOVE:
+    if len(points) <= MAX_EXACT_POINTS:
         return DBSCAN(eps=eps, min_samples=min_samples).fit_predict(local).astype(np.int64)
     cells = np.floor(local * (4 / eps))
     _, cell_of, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
@@ -41,7 +42,7 @@ def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) ->
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Cluster:
-    """One candidate.
+    """A cluster of the Gaussians that were selected for a word.
 
     Attributes:
         rows: its Gaussians, ascending.
@@ -65,38 +66,38 @@ def score_clusters(
 ) -> list[Cluster]:
     """The clusters of one word, best first; equal scores go by the first row.
 
-    How well a cluster answers comes first (an object of the asked name has a mean near the best there is, its
-    look-alikes do not), and how much of the answer it holds second: the fourth root lets one object in four keep 71 %
+    The mean relevancy counts first (an object of the queried name has a mean near the maximum, its look-alikes do not),
+    and the share of the selected weight second: the fourth root lets one object in four keep 71 %
     of its score, and leaves floaters of a thousandth with 18 %. On labeled scenes the mean alone does equally well,
     a square root or the summed relevancy worse, as a large look-alike then outweighs a small object.
 
     Args:
         labels: cluster of each selected Gaussian, −1 = none.
-        rows: which Gaussians these are.
+        rows: row numbers of the selected Gaussians.
         relevancy: their relevancy for the word.
-        weights: how much each was seen.
+        weights: their summed blending weights.
         min_share: clusters with less than this share of the best one's weight are floaters and are left out.
     """
     total = float(weights.sum(dtype=np.float64))
-    found = []
+    clusters = []
     order = np.argsort(labels, kind="stable")
     starts = np.searchsorted(labels[order], np.arange(int(labels.max(initial=-1)) + 2))
     for start, stop in pairwise(starts.tolist()):
         members = np.sort(order[start:stop])
-        part = weights[members].astype(np.float64)
-        weight = float(part.sum())
-        mean = float(relevancy[members].astype(np.float64) @ part) / weight
+        member_weights = weights[members].astype(np.float64)
+        weight = float(member_weights.sum())
+        mean = float(relevancy[members].astype(np.float64) @ member_weights) / weight
         # A negative mean is made worse by a small share, not better.
         share = (weight / total) ** 0.25
         score = mean * share if mean >= 0 else mean / share
-        found.append(Cluster(rows=np.sort(rows[members]).astype(np.int64), score=score, weight=weight))
-    found.sort(key=lambda one: (-one.score, int(one.rows[0])))
-    return [one for one in found if one.weight >= min_share * found[0].weight]
+        clusters.append(Cluster(rows=np.sort(rows[members]).astype(np.int64), score=score, weight=weight))
+    clusters.sort(key=lambda each: (-each.score, int(each.rows[0])))
+    return [each for each in clusters if each.weight >= min_share * clusters[0].weight]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Extents:
-    """Axis-aligned and oriented box, relative to whatever the points were relative to; float64.
+    """Axis-aligned and oriented box, in the frame of the points; float64.
 
     Attributes:
         aabb_min, aabb_max: axis-aligned corners.
@@ -121,7 +122,7 @@ def box_around(
     margin: float = 0.0,
     up: Float64[np.ndarray, "3"] | None = None,
 ) -> Extents:
-    """Both boxes of some Gaussians.
+    """The axis-aligned and the oriented box of some Gaussians.
 
     Args:
         gaussians: the splat.
@@ -130,23 +131,26 @@ def box_around(
             half-width along a unit vector a is sigmas·√(aᵀΣa).
         sigmas: see there.
         margin: length added on every side.
-        up: keeps one axis of the oriented box along it (the last one); None looks for the smallest box of all.
+        up: direction of the last axis of the oriented box; None = the smallest box of any orientation.
     """
     points = gaussians.means[rows].astype(np.float64)
     rotation = oriented_axes(points, up)
-    reach = np.zeros_like(points)
-    reach_turned = reach
+    half_widths = np.zeros_like(points)
+    half_widths_rotated = half_widths
     if extent == "sigma":
         stretched = _rotations(gaussians.quats[rows]) * gaussians.scales[rows].astype(np.float64)[:, None, :]
-        reach = sigmas * np.sqrt((stretched**2).sum(axis=2))
-        reach_turned = sigmas * np.sqrt((np.einsum("ka,nkj->naj", rotation, stretched) ** 2).sum(axis=2))
+        half_widths = sigmas * np.sqrt((stretched**2).sum(axis=2))
+        half_widths_rotated = sigmas * np.sqrt((np.einsum("ka,nkj->naj", rotation, stretched) ** 2).sum(axis=2))
     # Coordinates about the middle: rotating those of a far-away scene would round.
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    turned = (points - middle) @ rotation
-    low, high = (turned - reach_turned).min(axis=0) - margin, (turned + reach_turned).max(axis=0) + margin
+    rotated = (points - middle) @ rotation
+    low, high = (
+        (rotated - half_widths_rotated).min(axis=0) - margin,
+        (rotated + half_widths_rotated).max(axis=0) + margin,
+    )
     return Extents(
-        aabb_min=(points - reach).min(axis=0) - margin,
-        aabb_max=(points + reach).max(axis=0) + margin,
+        aabb_min=(points - half_widths).min(axis=0) - margin,
+        aabb_max=(points + half_widths).max(axis=0) + margin,
         center=middle + rotation @ ((low + high) / 2),
         rotation=rotation,
         size=high - low,
@@ -156,27 +160,27 @@ def box_around(
 def oriented_axes(
     points: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, "3"] | None = None
 ) -> Float64[np.ndarray, "3 3"]:
-    """Axes (columns, right-handed) of the smallest box around points, or of the smallest that stands along `up`.
+    """Axes (columns, right-handed) of the smallest box around points, or of the smallest with an axis along `up`.
 
     Points in a plane, on a line or in one place have no volume to minimize: the box then lies in the plane with the
     smallest area, along the line, or along the world's axes.
     """
     centered = points - points.mean(axis=0)
     if up is not None:
-        third = up / math.sqrt(float(up @ up))
-        return _about(third, _smallest_rectangle(centered @ _plane(third)))
+        normal = up / math.sqrt(float(up @ up))
+        return _axes_about(normal, _smallest_rectangle(centered @ _plane_axes(normal)))
     # Eigenvectors of the 3×3 scatter suffice to tell which directions are empty; extents are measured along them.
     _, axes = np.linalg.eigh(centered.T @ centered)
     spans = np.ptp(centered @ axes, axis=0)[::-1]
     axes = axes[:, ::-1]
-    empty = spans <= FLAT * max(float(spans.max(initial=0)), 1e-300)
+    empty = spans <= EMPTY_EXTENT * max(float(spans.max(initial=0)), 1e-300)
     if spans.max(initial=0) == 0:
         return np.eye(3)
     if not empty[2]:
         return _smallest_box_axes(centered, axes)
     if empty[1]:
         return _right_handed(axes)
-    return _about(axes[:, 2], _smallest_rectangle(centered @ _plane(axes[:, 2])))
+    return _axes_about(axes[:, 2], _smallest_rectangle(centered @ _plane_axes(axes[:, 2])))
 
 
 def _smallest_box_axes(centered: Float64[np.ndarray, "n 3"], principal: np.ndarray) -> Float64[np.ndarray, "3 3"]:
@@ -194,18 +198,18 @@ def _smallest_box_axes(centered: Float64[np.ndarray, "n 3"], principal: np.ndarr
     return _right_handed(u @ vt)
 
 
-def _smallest_rectangle(flat: Float64[np.ndarray, "n 2"]) -> float:
+def _smallest_rectangle(plane_points: Float64[np.ndarray, "n 2"]) -> float:
     """Angle of the rectangle of least area around points: one of its sides lies on a side of their convex hull."""
     from scipy.spatial import ConvexHull, QhullError
 
-    if not np.ptp(flat, axis=0).any():
+    if not np.ptp(plane_points, axis=0).any():
         return 0.0
     try:
-        corners = flat[ConvexHull(flat).vertices] if len(flat) > 2 else None
+        corners = plane_points[ConvexHull(plane_points).vertices] if len(plane_points) > 2 else None
     except QhullError:
         corners = None
     if corners is None:  # Two points, or all on a line.
-        centered = flat - flat.mean(axis=0)
+        centered = plane_points - plane_points.mean(axis=0)
         longest = np.linalg.eigh(centered.T @ centered)[1][:, 1]
         return float(np.arctan2(longest[1], longest[0]))
     sides = np.roll(corners, -1, axis=0) - corners
@@ -218,7 +222,7 @@ def _smallest_rectangle(flat: Float64[np.ndarray, "n 2"]) -> float:
     return float(angles[np.flatnonzero(areas <= areas.min() * (1 + 1e-9))[0]])
 
 
-def _plane(normal: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 2"]:
+def _plane_axes(normal: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 2"]:
     """Two axes beside a unit vector, so that (first, second, normal) is right-handed; x and y for normal = z."""
     helper = np.eye(3)[0 if abs(normal[0]) < 0.9 else 1]
     first = helper - normal * normal[int(helper.argmax())]
@@ -226,10 +230,10 @@ def _plane(normal: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 2"]:
     return np.stack([first, np.cross(normal, first)], axis=1)
 
 
-def _about(third: Float64[np.ndarray, "3"], angle: float) -> Float64[np.ndarray, "3 3"]:
-    first, second = _plane(third).T
+def _axes_about(normal: Float64[np.ndarray, "3"], angle: float) -> Float64[np.ndarray, "3 3"]:
+    first, second = _plane_axes(normal).T
     c, s = math.cos(angle), math.sin(angle)
-    return np.stack([c * first + s * second, c * second - s * first, third], axis=1)
+    return np.stack([c * first + s * second, c * second - s * first, normal], axis=1)
 
 
 def _right_handed(axes: np.ndarray) -> Float64[np.ndarray, "3 3"]:

@@ -1,4 +1,4 @@
-"""Words to boxes: relevancy, threshold, clusters, boxes, scores."""
+"""Open-vocabulary localization: words to 3D boxes by relevancy, threshold and DBSCAN (SplatDistill, sec. 3.4)."""
 
 import math
 import warnings
@@ -19,7 +19,8 @@ from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scen
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizeConfig:
-    """How words become boxes. Lengths in units of the scene's spacing (`gsencoder.data.seeding.spacing.scene_spacing`)."""
+    """How words become boxes. Relative lengths are in units of the scene's spacing
+    (`gsencoder.data.seeding.spacing.scene_spacing`)."""
 
     mode: Literal["centred", "raw"] = field(
         default="centred", metadata={"help": "cosines after removing each side's mean, or as they are"}
@@ -27,30 +28,41 @@ class LocalizeConfig:
     contrast: bool = field(
         default=False,
         metadata={
-            "help": "score against negative and other asked words (LERF), not by cosine; set threshold.fixed=0.9"
+            "help": "score by contrast with negative words and the other queries (LERF), not by cosine; use "
+            "threshold.fixed=0.9"
         },
     )
     negatives: tuple[str, ...] = field(
         default=("object", "things", "stuff", "texture"), metadata={"help": "negative words for contrast"}
     )
     temperature: float = field(default=0.1, metadata={"help": "temperature of the contrast's softmax"})
-    threshold: ThresholdConfig = field(default_factory=ThresholdConfig, metadata={"help": "which Gaussians are taken"})
-    min_weight: float = field(default=0.0, metadata={"help": "Gaussians seen no more than this (pixels) are left out"})
+    threshold: ThresholdConfig = field(
+        default_factory=ThresholdConfig, metadata={"help": "relevancy from which Gaussians are selected"}
+    )
+    min_weight: float = field(
+        default=0.0,
+        metadata={"help": "Gaussians whose weight (summed blending weight, in pixels) is not above this are left out"},
+    )
     eps: float | None = field(
-        default=None, metadata={"help": "DBSCAN radius in world units; left out: eps_spacings times the spacing"}
+        default=None, metadata={"help": "DBSCAN radius in world units; empty = eps_spacings times the spacing"}
     )
     eps_spacings: float = field(default=1.5, metadata={"help": "DBSCAN radius in spacings, where eps is not given"})
-    min_samples: int = field(default=3, metadata={"help": "Gaussians within the radius that make a core of a cluster"})
-    min_share: float = field(default=0.05, metadata={"help": "clusters with less of the best one's weight are dropped"})
+    min_samples: int = field(
+        default=3, metadata={"help": "Gaussians within the radius that make a core point of a cluster"}
+    )
+    min_share: float = field(
+        default=0.05, metadata={"help": "clusters with less than this share of the best cluster's weight are dropped"}
+    )
     extent: Literal["means", "sigma"] = field(
         default="means", metadata={"help": "boxes around Gaussian means, or around their ellipsoids"}
     )
     sigmas: float = field(default=1.0, metadata={"help": "size of the ellipsoids for extent=sigma"})
     margin: float = field(default=0.0, metadata={"help": "added on every side of a box, in spacings"})
     upright: bool = field(
-        default=True, metadata={"help": "oriented boxes stand along the scene's up, where it is known"}
+        default=True,
+        metadata={"help": "one axis of oriented boxes follows the scene's up direction, where it is known"},
     )
-    max_boxes: int = field(default=10, metadata={"help": "boxes kept for each word"})
+    max_boxes: int = field(default=10, metadata={"help": "largest number of boxes for each word"})
 
     def __post_init__(self) -> None:
         if self.mode not in ("centred", "raw"):
@@ -84,16 +96,17 @@ def localize(
     """Finds words in a scene.
 
     Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
-    score that `gsencoder.infer.localize.boxes.score_clusters` defines. Axis-aligned and oriented boxes are drawn around Gaussian means,
-    with `config.margin` spacings on every side, unless `config.extent` says "sigma", and have the scene's origin
-    added back in float64. A word's boxes do not depend on the other words asked, unless `config.contrast` is on.
+    score that `gsencoder.infer.localize.boxes.score_clusters` defines. Axis-aligned and oriented boxes are drawn
+    around Gaussian means, with `config.margin` spacings on every side, unless `config.extent` says "sigma", and have
+    the scene's origin added back in float64. A word's boxes do not depend on the other queries, unless
+    `config.contrast` is on.
 
     Args:
         scene: Gaussians with features.
         queries: words that `text` knows.
         text: turns words into the features' space.
         config: see there.
-        space: which of the scene's feature sets to ask; may be left out where there is one.
+        space: name of the feature set; None where the scene has only one.
 
     Returns:
         Relevancy, thresholds, and the boxes best first within each word.
@@ -104,7 +117,7 @@ def localize(
     Raises:
         InputError: no Gaussians or features, no or unknown words, words of another space.
     """
-    gaussians, features = asked_features(scene, space)
+    gaussians, features = select_features(scene, space)
     if isinstance(queries, str) or not queries or any(not word.strip() for word in queries):
         raise InputError(f"localize: expected a list of one or more words, got {queries!r}")
     check_space(features.space, text.space)
@@ -119,17 +132,17 @@ def localize(
     spacing = scene_spacing(gaussians.means)
     if spacing == 0:
         spacing = float(np.median(gaussians.scales)) if len(gaussians) else 1.0
-    found, thresholds = [], []
+    boxes_by_word, thresholds = [], []
     for word, row in zip(queries, scores, strict=True):
-        level = threshold(row, config.threshold)
-        thresholds.append(level)
-        found.append(_boxes_of(word, row, level, gaussians, features, spacing, scene, config))
-    empty = [word for word, boxes in zip(queries, found, strict=True) if not boxes]
-    if empty:
-        named = ", ".join(map(repr, empty[:5])) + (", …" if len(empty) > 5 else "")
+        cutoff = threshold(row, config.threshold)
+        thresholds.append(cutoff)
+        boxes_by_word.append(_boxes_for_word(word, row, cutoff, gaussians, features, spacing, scene, config))
+    without_box = [word for word, boxes in zip(queries, boxes_by_word, strict=True) if not boxes]
+    if without_box:
+        listing = ", ".join(map(repr, without_box[:5])) + (", …" if len(without_box) > 5 else "")
         warnings.warn(
-            f"scene {scene.name}: {len(empty)} of {len(queries)} words have no box ({named}): no cluster of Gaussians "
-            "reaches the threshold",
+            f"scene {scene.name}: {len(without_box)} of {len(queries)} words have no box ({listing}): no cluster of "
+            "Gaussians reaches the threshold",
             SceneWarning,
             stacklevel=2,
         )
@@ -137,19 +150,19 @@ def localize(
         queries=tuple(queries),
         relevancy=scores,
         thresholds=np.array(thresholds, np.float32),
-        boxes=tuple(box for boxes in found for box in boxes),
+        boxes=tuple(box for boxes in boxes_by_word for box in boxes),
     )
 
 
-def asked_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:
-    """A scene's Gaussians and the features that are meant.
+def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:
+    """A scene's Gaussians and one of its feature sets.
 
     Args:
         scene: with both.
-        space: the name of the features; may be left out where there is one.
+        space: name of the feature set; None where the scene has only one.
 
     Raises:
-        InputError: there are none of that name, or several and no name.
+        InputError: no feature set of that name, or several and no name.
     """
     if scene.gaussians is None or not scene.features:
         missing = "Gaussians" if scene.gaussians is None else "features"
@@ -159,7 +172,7 @@ def asked_features(scene: Scene, space: str | None) -> tuple[Gaussians, Gaussian
     if space not in scene.features:
         raise InputError(
             f"localize: scene {scene.name} has features of {', '.join(sorted(scene.features))}; "
-            + ("say which with space=" if space is None else f"none of {space!r}")
+            + ("name one with space=" if space is None else f"none of {space!r}")
         )
     return scene.gaussians, scene.features[space]
 
@@ -185,10 +198,10 @@ def _negatives(text: TextEncoder, words: Sequence[str]) -> Float32[np.ndarray, "
     return np.concatenate(known) if known else np.zeros((0, text.space.channels), np.float32)
 
 
-def _boxes_of(
+def _boxes_for_word(
     word: str,
     scores: Float32[np.ndarray, " N"],
-    level: float,
+    cutoff: float,
     gaussians: Gaussians,
     features: GaussianFeatures,
     spacing: float,
@@ -197,15 +210,15 @@ def _boxes_of(
 ) -> list[Box]:
     """The boxes of one word, best first."""
     # Comparisons with NaN are false: Gaussians never seen are never taken.
-    rows = np.flatnonzero((scores >= level) & (features.weights > config.min_weight))
+    rows = np.flatnonzero((scores >= cutoff) & (features.weights > config.min_weight))
     eps = config.eps if config.eps is not None else config.eps_spacings * spacing
     labels = cluster(gaussians.means[rows], eps, config.min_samples)
     ranked = score_clusters(labels, rows, scores[rows], features.weights[rows], min_share=config.min_share)
     boxes = []
-    for rank, one in enumerate(ranked[: config.max_boxes]):
+    for rank, candidate in enumerate(ranked[: config.max_boxes]):
         extents = box_around(
             gaussians,
-            one.rows,
+            candidate.rows,
             extent=config.extent,
             sigmas=config.sigmas,
             margin=config.margin * spacing,
@@ -215,13 +228,13 @@ def _boxes_of(
             Box(
                 query=word,
                 rank=rank,
-                score=one.score,
+                score=candidate.score,
                 aabb_min=extents.aabb_min + scene.origin,
                 aabb_max=extents.aabb_max + scene.origin,
                 obb_center=extents.center + scene.origin,
                 obb_rotation=extents.rotation,
                 obb_size=extents.size,
-                rows=one.rows,
+                rows=candidate.rows,
             )
         )
     return boxes

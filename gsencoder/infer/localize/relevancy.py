@@ -1,6 +1,6 @@
 """How well each Gaussian's feature answers a word: cosines in basis coordinates, contrast, thresholds.
 
-Q asked words, M negative words, N Gaussians, R basis rank, D channels.
+Q queries, M negative words, N Gaussians, R basis rank, D channels.
 """
 
 import math
@@ -15,9 +15,9 @@ from gsencoder.types import GaussianFeatures
 
 Mode = Literal["centred", "raw"]
 CHUNK_BYTES = 1 << 25
-RESOLUTION = 1e-3
+MIN_RELATIVE_NORM = 1e-3
 """Share of the mean's norm below which a centered feature is rounding, not direction (float16 files keep 5e-4)."""
-TINY = 1e-60
+EPS = 1e-60
 """Keeps the root of a squared norm above zero; float64 holds the squares of norms down to 1e-150."""
 
 
@@ -57,17 +57,18 @@ def relevancy(
 
     The cosine is computed in the coordinates that are stored: with the stacked rows M = [components; basis mean −
     removed mean] = L·Q (Q orthonormal), the feature of z is [z, 1]·L in the axes Q, so norms and products need R + 1
-    numbers and no decoding. Rows stream in chunks. In the mode "centred" the features lose `features.mean` and the words
-    `text_mean`; a centered feature shorter than 1e-3 of the mean counts as having no direction, and its cosine fades
-    to 0.
+    numbers and no decoding. Rows stream in chunks. In the mode "centred" the features lose `features.mean` and the
+    words `text_mean`; a centered feature shorter than 1e-3 of the mean counts as having no direction, and its cosine
+    fades to 0.
 
     With `negatives`, the score is LERF's (Kerr et al. 2023, https://arxiv.org/abs/2303.09553, section 3.4): the
-    smallest, over the negatives and the other asked words, of exp(c/t) / (exp(c/t) + exp(c_negative/t)), which lies in
-    [0, 1] and is 0.5 where the word and its strongest rival are even. Words equal to the asked one are no rivals.
+    smallest, over the negatives and the other queries, of exp(c/t) / (exp(c/t) + exp(c_negative/t)), which lies in
+    [0, 1] and is 0.5 where the word and its strongest rival are even. Words with the same vector as the query are no
+    rivals.
 
     Args:
         features: what the Gaussians have, in a basis or not.
-        text: vectors of the asked words; their length does not matter.
+        text: vectors of the queries; their length does not matter.
         text_mean: mean of the text side.
         negatives: vectors of negative words (there may be none of them), or None for plain cosines.
         temperature: t above; LERF's factor of 10 is 0.1.
@@ -91,19 +92,19 @@ def relevancy(
     if mode not in ("centred", "raw") or not 0 < temperature < math.inf:
         raise InputError(f"relevancy: expected mode centred or raw, temperature > 0, got {mode!r} and {temperature}")
     directions = words.astype(np.float64) - (text_mean if mode == "centred" else 0.0)
-    directions /= np.sqrt((directions**2).sum(axis=1, keepdims=True) + TINY)
+    directions /= np.sqrt((directions**2).sum(axis=1, keepdims=True) + EPS)
     removed = features.mean.astype(np.float64) if mode == "centred" else np.zeros(channels)
     scores = np.full((len(words), len(features)), np.nan, np.float32)
     rows = np.flatnonzero(features.seen)
     matrix, offset, targets = _fold(features, removed, directions)
-    floor = TINY + RESOLUTION**2 * float(removed @ removed)
+    floor = EPS + MIN_RELATIVE_NORM**2 * float(removed @ removed)
     step = max(1, CHUNK_BYTES // (8 * (len(offset) + len(words))))
     for start in range(0, len(rows), step):
-        part = rows[start : start + step]
-        local = features.features[part].astype(np.float64)
+        chunk = rows[start : start + step]
+        local = features.features[chunk].astype(np.float64)
         local = (local if matrix is None else local @ matrix) + offset
         norms = np.sqrt((local**2).sum(axis=1, keepdims=True) + floor)
-        scores[:, part] = np.clip((local / norms) @ targets.T, -1, 1).T
+        scores[:, chunk] = np.clip((local / norms) @ targets.T, -1, 1).T
     if negatives is None:
         return scores
     return _contrast(scores, directions, len(text), temperature)
@@ -125,12 +126,15 @@ def _fold(
 
 
 def _contrast(
-    cosines: Float32[np.ndarray, "words N"], directions: Float64[np.ndarray, "words D"], asked: int, temperature: float
+    cosines: Float32[np.ndarray, "words N"],
+    directions: Float64[np.ndarray, "words D"],
+    num_queries: int,
+    temperature: float,
 ) -> Float32[np.ndarray, "Q N"]:
     """The pairwise softmax falls as its rival grows, so the smallest is against the strongest rival."""
     same = directions @ directions.T > 1 - 1e-6
-    scores = np.full((asked, cosines.shape[1]), np.nan, np.float32)
-    for row in range(asked):
+    scores = np.full((num_queries, cosines.shape[1]), np.nan, np.float32)
+    for row in range(num_queries):
         rivals = np.flatnonzero(~same[row])
         if rivals.size == 0:
             raise InputError("relevancy: contrast needs a negative word, or two different asked words")

@@ -129,7 +129,8 @@ _STARTS = onnx.numpy_helper.from_array(
 
 @script(OURS, default_opset=op)
 def hilbert(morton: INT64) -> INT64:
-    """As `gsencoder.models.grid.serialize.hilbert_from_morton`, looking no further than the largest code has digits to the base 64."""
+    """As `gsencoder.models.grid.serialize.hilbert_from_morton`, looking no further than the largest code has digits to
+    the base 64."""
     table = op.Constant(value=_TABLE)
     largest = op.ReduceMax(morton, keepdims=0)
     further = op.ReduceSum(op.Cast(op.GreaterOrEqual(largest, op.Constant(value=_POWERS)), to=7), keepdims=0)

@@ -88,7 +88,8 @@ class OnnxEncoder:
         metres_per_unit: float = 1.0,
         track: Track = untracked,
     ) -> GaussianFeatures:
-        """Features of every Gaussian, all with weight 1; see `gsencoder.infer.encode.encode.encode`, which this equals within rounding.
+        """Features of every Gaussian, all with weight 1; see `gsencoder.infer.encode.encode.encode`, which this equals
+        within rounding.
 
         Args:
             gaussians: the splat.
