@@ -17,10 +17,21 @@ _HOME = {
     "load_splat": "gsencoder.data.splats",
     "save_splat": "gsencoder.data.splats",
     "load_scene": "gsencoder.data.scenes",
+    "seed": "gsencoder.data.seeding.seed",
+    "PaletteConfig": "gsencoder.fusion.teachers.palette",
+    "PaletteTeacher": "gsencoder.fusion.teachers.palette",
+    "text_table_of": "gsencoder.fusion.teachers.build",
+    "load_text_table": "gsencoder.text.table",
     "fuse": "gsencoder.fusion.fuse",
+    "load_features": "gsencoder.fusion.store.folder",
+    "save_features": "gsencoder.fusion.store.folder",
     "encode": "gsencoder.infer.encode.encode",
+    "load_encoder": "gsencoder.infer.load_encoder",
     "load_weights": "gsencoder.models.weights",
     "localize": "gsencoder.infer.localize.localize",
+    "targets_of": "gsencoder.infer.views.targets",
+    "choose_views": "gsencoder.infer.views.choose",
+    "render_image": "gsencoder.render.images",
 }
 
 __all__ = [*_HOME]

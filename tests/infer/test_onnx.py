@@ -339,7 +339,7 @@ def test_the_example_answers_a_word_for_a_splat_without_torch(folder: Path, tmp_
     # Half of the sheet is white and the other black, so that even an untrained encoder tells them apart.
     left = cloud.means[:, :1] < 0
     save_splat(tmp_path / "room.ply", replace(cloud, sh=np.where(left, 1.5, -1.5).repeat(3, 1)[:, None].astype("f4")))
-    example = Path(__file__).parents[2] / "examples" / "find_word.py"
+    example = Path(__file__).parents[2] / "examples" / "05_onnx_without_torch.py"
     text = example.read_text()
     assert len(text.splitlines()) <= 30
     (tmp_path / "torch.py").write_text("raise ModuleNotFoundError('no torch here')")

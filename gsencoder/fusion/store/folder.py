@@ -4,6 +4,7 @@ Arrays are safetensors files, memory-mapped on load; features are float16 for se
 localization needs: no photographs, no teacher.
 """
 
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -25,28 +26,41 @@ WORDS_FILE = "words.safetensors"
 """The text table whose words lead into the features, beside them where there is one."""
 
 
-def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settings: dict[str, Any]) -> None:
-    """Writes scene and features into an existing, empty folder (which the caller makes appear whole or not at all).
+def save_features(
+    folder: str | Path, scene: Scene, features: GaussianFeatures, settings: Mapping[str, Any] = {}
+) -> None:
+    """Writes a scene and its features, as every command that takes features reads them.
 
     float16 holds values up to 65,504, so each channel is stored divided by its largest magnitude.
 
+    Args:
+        folder: made if it does not exist. Each file appears completely or not at all; that the folder does is up to the
+            caller.
+        scene: the Gaussians, cameras and names are written; photographs are not.
+        features: of the scene's Gaussians.
+        settings: what made the features, as JSON values.
+
     Raises:
-        InputError: features of another splat, or not finite.
+        InputError: features of another number of Gaussians, or not finite, or a folder that cannot be written.
     """
-    gaussians = scene.gaussians
+    folder, gaussians = Path(folder), scene.gaussians
     if gaussians is None or len(gaussians) != len(features):
         raise InputError(f"save_features: {len(features)} features need as many Gaussians in scene {scene.name}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
     around, header = scene_parts(scene)
-    own = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
-    write_archive(folder / SCENE_FILE, own | around, header)
+    arrays = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+    write_archive(folder / SCENE_FILE, arrays | around, header)
     rows = np.flatnonzero(features.weights > 0)
     # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
     blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
     largest, bad = np.zeros(features.features.shape[1], np.float32), 0
     for block in blocks:
-        kept = features.features[block]
-        bad += int((~np.isfinite(kept).all(axis=1)).sum())
-        largest = np.maximum(largest, np.abs(kept).max(axis=0))
+        vectors = features.features[block]
+        bad += int((~np.isfinite(vectors).all(axis=1)).sum())
+        largest = np.maximum(largest, np.abs(vectors).max(axis=0))
     if bad:
         raise InputError(f"save_features: {bad} of {len(rows)} rows are not finite")
     channel_scale = np.where(largest > 0, largest, 1).astype(np.float32)
@@ -60,16 +74,17 @@ def save_features(folder: Path, scene: Scene, features: GaussianFeatures, settin
         "channel_scale": channel_scale,
         "weights": features.weights[rows],
     }
-    header |= {"settings": settings, "fingerprint": fingerprint(gaussians)}
+    header |= {"settings": dict(settings), "fingerprint": fingerprint(gaussians)}
     write_archive(folder / FEATURES_FILE, arrays, header)
 
 
-def load_features(folder: Path) -> Scene:
-    """The scene and its features from a folder that `save_features` or `packages.save_package` wrote.
+def load_features(folder: str | Path) -> Scene:
+    """The scene and its features from a folder that `save_features` or `save_package` wrote.
 
     Raises:
         InputError: not such a folder, damaged, of another version, or features of another splat.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of features made by `gsencoder fuse`, `encode` or `pack`")
     if (folder / PACKAGE_FILE).is_file():
@@ -96,13 +111,13 @@ def load_settings(folder: Path) -> dict[str, Any]:
         InputError: not such a folder, or damaged.
     """
     with _open(folder, FEATURES_FILE) as file:
-        found: dict[str, Any] = file.value("settings", dict)
-        return found
+        settings: dict[str, Any] = file.value("settings", dict)
+        return settings
 
 
 def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
     if not (folder / name).is_file():
-        raise InputError(f"{folder}: {name} is missing; this is no folder of gsencoder features")
+        raise InputError(f"{folder}: {name} is missing; expected a folder of gsencoder features")
     return open_archive(folder / name)
 
 

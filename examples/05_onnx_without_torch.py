@@ -1,16 +1,16 @@
-"""Finds a word in a splat with an exported encoder; needs no torch.
+"""Finds a word in a splat with an exported encoder, without torch.
 
-python examples/find_word.py encoder.onnx room.ply mug
+gsencoder export out=encoder.onnx
+python examples/05_onnx_without_torch.py encoder.onnx room.ply mug
 """
 
 import sys
 
-from gsencoder import InputError, Scene, load_splat, localize
-from gsencoder.infer.onnx.runtime import OnnxEncoder
+from gsencoder import InputError, Scene, load_encoder, load_splat, localize
 
 
 def main(model: str, splat: str, word: str) -> None:
-    encoder = OnnxEncoder(model)
+    encoder = load_encoder(model)
     if encoder.words is None:
         raise InputError(f"{model} holds no words")
     gaussians = load_splat(splat)

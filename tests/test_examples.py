@@ -1,0 +1,82 @@
+"""The numbered examples run on the demo's room, and print and write what they say."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+import gsencoder
+from gsencoder.app import cli
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+
+pytestmark = pytest.mark.slow
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "room"
+    write_room(make_room(0, objects=6, views=6, width=120, height=90), folder)
+    return folder
+
+
+def run(number: int, folder: Path, *arguments: object) -> str:
+    """What an example prints, run in a folder."""
+    (script,) = EXAMPLES.glob(f"{number:02d}_*.py")
+    words = [sys.executable, "-W", "error", str(script), *map(str, arguments)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_an_example_fuses_and_localizes(room: Path, tmp_path: Path) -> None:
+    out = run(1, tmp_path, room, "red")
+    seen, total = (int(number.replace(",", "")) for number in re.findall(r"[\d,]+\d", out.splitlines()[0]))
+    assert 0.9 * total < seen <= total
+    assert re.search(r"^red at \[.*\], \d\.\d\d × \d\.\d\d × \d\.\d\d m, score 0\.\d\d, \d+ Gaussians$", out, re.M)
+
+
+def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(room: Path, tmp_path: Path) -> None:
+    out = run(2, tmp_path, room)
+    left, right = (float(number) for number in re.findall(r"= (-?[\d.]+)", out)[:2])
+    assert left == pytest.approx(right, rel=1e-3, abs=0.5)
+    assert float(re.findall(r"gradient and lift: (\S+)", out)[0]) < 1e-4
+
+
+def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(room: Path, tmp_path: Path) -> None:
+    out = run(3, tmp_path, room, "table,chair")
+    assert re.search(r"^[\d,]+ features of ", out)
+    assert re.findall(r"^(table|chair): \d+ boxes above 0\.50", out, re.MULTILINE) == ["table", "chair"]
+    assert gsencoder.load_features(tmp_path / "encoded").features
+
+
+def test_an_example_renders_views_of_a_target(room: Path, tmp_path: Path) -> None:
+    assert cli.main(["fuse", str(room), "teacher=palette", f"out={tmp_path / 'features'}", "quiet=true"]) == 0
+    out = run(4, tmp_path, "features", "red")
+    pictures = sorted(tmp_path.glob("view_*.png"))
+    assert len(pictures) == len(out.splitlines()) == 8
+    for picture in pictures:
+        with Image.open(picture) as image:
+            assert image.size == (640, 480)
+    assert re.match(r"view_00\.png: .*, shows \d+% of red", out)
+
+
+def test_examples_are_numbered_and_short_and_use_public_names_alone() -> None:
+    scripts = sorted(EXAMPLES.glob("*.py"))
+    assert [path.name[:3] for path in scripts] == [f"{number:02d}_" for number in range(1, 6)]
+    for path in scripts:
+        text = path.read_text()
+        assert len(text.splitlines()) <= 60
+        imports = set(re.findall(r"^(?:from|import) (gsencoder[\w.]*)", text, re.MULTILINE))
+        assert imports <= {"gsencoder", "gsencoder.render"}
+
+
+@pytest.mark.parametrize("name", gsencoder.__all__)
+def test_every_public_name_loads_and_says_what_it_is(name: str) -> None:
+    assert (getattr(gsencoder, name).__doc__ or "").strip()
