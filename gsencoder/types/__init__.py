@@ -9,7 +9,7 @@ opacities are probabilities, never logarithms or logits.
 from gsencoder.types.cameras import Cameras
 from gsencoder.types.checks import UNIT_TOLERANCE, check_unit
 from gsencoder.types.features import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
-from gsencoder.types.gaussians import SH_C0, Gaussians
+from gsencoder.types.gaussians import SH_C0, Gaussians, sh_from_colors
 from gsencoder.types.localization import Box, Localization
 from gsencoder.types.scene import Scene, SceneObject, Views
 
@@ -28,4 +28,5 @@ __all__ = [
     "SceneObject",
     "Views",
     "check_unit",
+    "sh_from_colors",
 ]

@@ -4,12 +4,17 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from gsencoder.types.checks import UNIT_TOLERANCE, check_array, check_finite, check_rows, fail
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """A color is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction."""
+
+
+def sh_from_colors(colors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 1 3"]:
+    """Degree-0 coefficients that show `colors` (0 to 1) from everywhere, in their float type."""
+    return ((colors - 0.5) / SH_C0)[:, None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -11,7 +11,7 @@ from gsencoder.data.seeding.flat import OPACITY, SIZE, THICKNESS, quats_from_nor
 from gsencoder.data.synthetic.plan import COLORS, HALF_ROOM, TABLE, PlannedObject, plan_room
 from gsencoder.data.synthetic.shapes import Solid
 from gsencoder.data.synthetic.write import write_room
-from gsencoder.types import SH_C0, Cameras, Gaussians, Scene, SceneObject, Views
+from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views, sh_from_colors
 
 __all__ = ["color_words", "make_room", "plan_room", "write_room"]
 
@@ -189,7 +189,7 @@ def _gaussians(surfaces: list[_Surface], spacing: float) -> Gaussians:
         quats=quats_from_normals(np.concatenate(normals).astype(np.float32)),
         scales=np.stack([size, size, size * np.float32(THICKNESS)], axis=1),
         opacities=np.full(len(size), OPACITY, np.float32),
-        sh=((np.concatenate(colors) - 0.5) / SH_C0).astype(np.float32)[:, None],
+        sh=sh_from_colors(np.concatenate(colors)).astype(np.float32),
     )
 
 
