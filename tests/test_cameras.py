@@ -80,7 +80,7 @@ def test_projecting_what_was_unprojected_gives_the_pixels_and_depths_again(seed:
 
 
 def test_projection_is_that_of_colmap() -> None:
-    """COLMAP's pixel centres lie at .5, too, so that nothing is added or taken off."""
+    """COLMAP's pixel centers lie at .5, too, so that nothing is added or taken off."""
     cameras, points = random_cameras(), some_points(200)
     compared = 0
     for view, (camera, cam_from_world) in enumerate(colmap_cameras(cameras)):
