@@ -33,11 +33,7 @@ def timed(work: Callable[[], Any], runs: int = 5) -> tuple[float, Any]:
 
 
 def enlarged(cameras: Cameras, factor: int) -> Cameras:
-    Ks = cameras.Ks.copy()
-    Ks[:, :2] *= factor
-    return Cameras(
-        cam_from_world=cameras.cam_from_world, Ks=Ks, widths=cameras.widths * factor, heights=cameras.heights * factor
-    )
+    return cameras.resized_to(cameras.widths * factor, cameras.heights * factor)
 
 
 def main() -> None:

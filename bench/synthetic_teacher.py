@@ -104,9 +104,7 @@ class SyntheticTeacher:
         lattice = grid_lattice(affine, self.width, self.height, RAYS)
         y, x = ray_pixels(lattice, *size)
         z = views.depths[view][np.ix_(y, x)].astype(np.float64)
-        K, pose = cameras.Ks[view].astype(np.float64), cameras.cam_from_world[view].astype(np.float64)
-        local = np.stack(((x + 0.5 - K[0, 2]) / K[0, 0] * z, ((y + 0.5 - K[1, 2]) / K[1, 1])[:, None] * z, z), axis=-1)
-        points = (local - pose[:3, 3]) @ pose[:3, :3]
+        points = cameras.unproject(np.stack(np.meshgrid(x + 0.5, y + 0.5), axis=-1), z, view)
         mixed = np.cos(points @ self.waves.T + self.phases) * (z > 0)[..., None]
         blocks = mixed.reshape(self.height, lattice.side, self.width, lattice.side, -1)
         rays = (z > 0).reshape(self.height, lattice.side, self.width, lattice.side).sum(axis=(1, 3))

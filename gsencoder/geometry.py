@@ -1,7 +1,8 @@
 """Rotations, covariances, projection and spherical harmonics: pure functions of torch tensors, in any float type.
 
 Frames are named in the arguments (`target_from_source`). Camera axes are OpenCV's, quaternions are wxyz, pixel centers
-lie at .5, scales are standard deviations. Every function keeps the dtype and device that it is given.
+lie at .5, scales are standard deviations. Every function keeps the dtype and device that it is given. The pinhole and
+rigid transforms of numpy arrays, which need no torch, are those of `Cameras` and gsencoder.types.poses.
 """
 
 import math
@@ -62,8 +63,8 @@ def covariances(quats: Float[Tensor, "*n 4"], scales: Float[Tensor, "*n 3"]) -> 
     return half @ half.mT
 
 
-def transform(target_from_source: Float[Tensor, "4 4"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Rigid motion of points."""
+def transform(target_from_source: Float[Tensor, "4 4"], points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Rigid motion of points, R x + t."""
     return points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
 
 
@@ -75,6 +76,33 @@ def invert_rigid(target_from_source: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "
     inverse[..., :3, 3] = -(rotation @ target_from_source[..., :3, 3:]).squeeze(-1)
     inverse[..., 3, 3] = 1
     return inverse
+
+
+def project_points(
+    points: Float[Tensor, "*n 3"], K: Float[Tensor, "3 3"], *, min_depth: float | None = None
+) -> Float[Tensor, "*n 2"]:
+    """Pixels (fx·x/z + cx, fy·y/z + cy) of points in camera axes; not finite where z = 0.
+
+    A point behind the camera has the pixel of its mirror image −x in front of it, so that `unproject_points` with its
+    negative depth gives it back.
+
+    Args:
+        points: [x, y, z] in camera axes.
+        K: intrinsics in pixels.
+        min_depth: where given, z is raised to it first, so that points behind the camera leave the image sideways.
+    """
+    x, y, z = points.unbind(dim=-1)
+    if min_depth is not None:
+        z = z.clamp(min=min_depth)
+    return torch.stack((K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]), dim=-1)
+
+
+def unproject_points(
+    pixels: Float[Tensor, "*n 2"], depths: Float[Tensor, "*n"], K: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*n 3"]:
+    """Points in camera axes of pixels at depths z: the inverse of `project_points`."""
+    u, v = pixels.unbind(dim=-1)
+    return torch.stack(((u - K[0, 2]) / K[0, 0] * depths, (v - K[1, 2]) / K[1, 1] * depths, depths), dim=-1)
 
 
 def project(
@@ -177,8 +205,3 @@ def colors_from_sh(
     directions = directions / torch.sqrt((directions * directions).sum(-1, keepdim=True) + 1e-24)
     basis = sh_basis(directions, math.isqrt(sh.shape[1]) - 1)
     return ((basis.unsqueeze(-1) * sh).sum(dim=1) + 0.5).clamp(min=0)
-
-
-def sh_from_colors(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
-    """Degree-0 coefficients that show `colors` (0 to 1) from everywhere."""
-    return ((colors - 0.5) / SH_C0).unsqueeze(1)

@@ -54,3 +54,21 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q if np.linalg.det(q) > 0 else -q
+
+
+def random_cameras(count: int = 20, seed: int = 0, *, spread: float = 3.0) -> Cameras:
+    """Cameras that look anywhere from centers `spread` around the origin, each of another size and field of view."""
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = [random_rotation(rng) for _ in range(count)]
+    poses[:, :3, 3] = spread * rng.normal(size=(count, 3))
+    sizes = rng.integers(40, 2000, (count, 2)).astype(np.int32)
+    Ks = np.tile(np.eye(3), (count, 1, 1))
+    Ks[:, [0, 1], [0, 1]] = sizes * rng.uniform(0.3, 3.0, (count, 2))
+    Ks[:, :2, 2] = sizes * rng.uniform(0.2, 0.8, (count, 2))
+    return Cameras(
+        cam_from_world=poses.astype(np.float32),
+        Ks=Ks.astype(np.float32),
+        widths=sizes[:, 0].copy(),
+        heights=sizes[:, 1].copy(),
+    )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from splats import random_cameras
 
 from gsencoder.geometry import (
     colors_from_sh,
@@ -13,11 +14,15 @@ from gsencoder.geometry import (
     invert_rigid,
     normalize_quats,
     project,
+    project_points,
     rotmats_from_quats,
     sh_basis,
-    sh_from_colors,
     transform,
+    unproject_points,
 )
+from gsencoder.types import cameras as numpy_cameras
+from gsencoder.types import poses as numpy_poses
+from gsencoder.types import sh_from_colors
 
 
 def random_quats(n: int, seed: int = 0) -> torch.Tensor:
@@ -54,6 +59,51 @@ def test_inverting_a_rigid_transform_undoes_it() -> None:
     pose[:3, 3] = torch.tensor([1.0, -2.0, 3.0])
     points = torch.randn(10, 3, dtype=torch.float64)
     torch.testing.assert_close(transform(invert_rigid(pose), transform(pose, points)), points)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_the_pinhole_and_poses_of_tensors_are_those_of_arrays(kind: type) -> None:
+    """The two stand apart because programs without torch project, too."""
+    eps = float(np.finfo(kind).eps)
+    cameras, points = random_cameras(), (3 * np.random.default_rng(0).normal(size=(40, 3))).astype(kind)
+    for view in range(len(cameras)):
+        pose, K = cameras.cam_from_world[view].astype(kind), cameras.Ks[view].astype(kind)
+        local = numpy_poses.transform(pose, points)
+        np.testing.assert_allclose(transform(*map(torch.from_numpy, (pose, points))).numpy(), local, atol=50 * eps)
+        inverse = invert_rigid(torch.from_numpy(pose))
+        np.testing.assert_allclose(inverse.numpy(), numpy_poses.invert_rigid(pose), atol=50 * eps)
+        tensors = torch.from_numpy(np.ascontiguousarray(local)), torch.from_numpy(K)
+        for min_depth in (None, 0.7):
+            pixels = numpy_cameras.project_points(local, K, min_depth=min_depth)
+            found = project_points(*tensors, min_depth=min_depth)
+            np.testing.assert_allclose(found.numpy(), pixels, rtol=10 * eps, atol=1e4 * eps)
+        back = unproject_points(torch.from_numpy(pixels.copy()), tensors[0][:, 2], tensors[1])
+        again = numpy_cameras.unproject_points(pixels, local[:, 2], K)
+        np.testing.assert_allclose(back.numpy(), again, rtol=10 * eps, atol=50 * eps)
+
+
+def test_tensors_project_and_unproject_in_any_shape_with_gradients() -> None:
+    torch.manual_seed(0)
+    K = torch.tensor([[50.0, 0, 32], [0, 60, 24], [0, 0, 1]], dtype=torch.float64)
+    points = torch.randn(4, 5, 3, dtype=torch.float64)
+    pixels = project_points(points, K)
+    torch.testing.assert_close(unproject_points(pixels, points[..., 2], K), points)
+    torch.testing.assert_close(project_points(unproject_points(pixels, points[..., 2], K), K), pixels)
+    assert torch.autograd.gradcheck(project_points, (points.requires_grad_(), K))
+
+
+def test_the_middle_of_a_projected_gaussian_is_its_projected_mean() -> None:
+    cameras, points = random_cameras(), 3 * torch.from_numpy(np.random.default_rng(0).normal(size=(500, 3)))
+    n, touching = len(points), 0
+    shapes = random_quats(n), torch.full((n, 3), 0.1, dtype=torch.float64), torch.ones(n, dtype=torch.float64)
+    for view in range(len(cameras)):
+        pose, K = (torch.from_numpy(array[view]).double() for array in (cameras.cam_from_world, cameras.Ks))
+        found = project(points, *shapes, pose, K, int(cameras.widths[view]), int(cameras.heights[view]))
+        local = transform(pose, points)
+        torch.testing.assert_close(found.means2d[found.valid], project_points(local, K)[found.valid])
+        torch.testing.assert_close(found.depths[found.valid], local[found.valid, 2])
+        touching += int(found.valid.sum())
+    assert touching > 100
 
 
 def project_one(mean: torch.Tensor, scale: float = 1e-3, **options: float) -> tuple[torch.Tensor, ...]:
@@ -131,9 +181,13 @@ def test_spherical_harmonics_are_orthonormal_on_the_sphere() -> None:
 def test_colors_survive_the_round_trip_through_degree_zero() -> None:
     colors = torch.rand(30, 3, dtype=torch.float64)
     means = torch.randn(30, 3, dtype=torch.float64)
-    torch.testing.assert_close(
-        colors_from_sh(sh_from_colors(colors), means, torch.ones(3, dtype=torch.float64)), colors
-    )
+    sh = torch.from_numpy(sh_from_colors(colors.numpy()))
+    torch.testing.assert_close(colors_from_sh(sh, means, torch.ones(3, dtype=torch.float64)), colors)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_colors_at_degree_zero_keep_their_float_type(kind: type) -> None:
+    assert sh_from_colors(np.zeros((2, 3), kind)).dtype == kind
 
 
 def test_a_gaussian_at_the_camera_center_has_a_finite_color() -> None:

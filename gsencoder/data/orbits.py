@@ -7,6 +7,8 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.types import Cameras, Gaussians
+from gsencoder.types.cameras import intrinsic_matrix
+from gsencoder.types.poses import look_at
 
 COVERED = 0.95
 """The opacity-weighted share of the Gaussians that must fit into the picture, …"""
@@ -105,15 +107,10 @@ def looking_cameras(
 
     They share a focal length and a size in pixels; the principal point is the middle.
     """
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
     count = len(centers)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    poses[:, :3, 3] = -np.einsum("vij,vj->vi", poses[:, :3, :3], centers)
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
+    K = intrinsic_matrix(focal, focal, width / 2, height / 2).astype(np.float32)
     return Cameras(
-        cam_from_world=poses.astype(np.float32),
+        cam_from_world=look_at(centers, forward, up).astype(np.float32),
         Ks=np.tile(K, (count, 1, 1)),
         widths=np.full(count, width, np.int32),
         heights=np.full(count, height, np.int32),

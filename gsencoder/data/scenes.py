@@ -22,7 +22,7 @@ from gsencoder.data.readers.images import (
     picture_size,
 )
 from gsencoder.data.readers.objects_json import read_objects
-from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin, inverse_rigid
+from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin
 from gsencoder.data.readers.scannet import is_scannet_export, read_scannet
 from gsencoder.data.readers.scene_splat import (
     SPLAT_SUFFIXES,
@@ -35,6 +35,7 @@ from gsencoder.data.readers.transforms_json import TRANSFORMS, read_transforms
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.data.splats import load_splat
 from gsencoder.types import Cameras, Scene, Views
+from gsencoder.types.poses import invert_rigid, move_origin
 
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 FEW_CAMERAS = 8
@@ -271,10 +272,10 @@ def make_views(
         raise InputError(f"{posed.source}: no view")
     if max_views:
         chosen = tuple(chosen[row] for row in evenly(len(chosen), max_views))
-    centers = np.array([inverse_rigid(image.cam_from_world)[:3, 3] for image in chosen])
-    origin = choose_origin(centers)
+    cam_from_world = np.stack([image.cam_from_world for image in chosen])
+    origin = choose_origin(invert_rigid(cam_from_world)[:, :3, 3])
     pinholes: dict[CameraModel, Pinhole] = {}
-    poses, grids, depth_grids = [], [], []
+    grids, depth_grids = [], []
     transparent: list[Path | None] = []
     for image in chosen:
         where = f"{posed.source}: view {image.name[:120]!r}"
@@ -287,13 +288,9 @@ def make_views(
         depth_camera = image.depth_camera or image.camera
         depth_grids.append(PixelGrid(source=depth_camera, pinhole=pinhole, width=width, height=height))
         transparent.append(image.image if _check_sizes(image, depth_camera, where) else None)
-        # With t = −R (c − origin) the large numbers cancel in float64, before the cast.
-        pose = image.cam_from_world.copy()
-        pose[:3, 3] += pose[:3, :3] @ origin
-        poses.append(pose)
     remaps = RemapCache()
     cameras = Cameras(
-        cam_from_world=np.array(poses).astype(np.float32),
+        cam_from_world=move_origin(cam_from_world, origin).astype(np.float32),
         Ks=np.array([grid.pinhole.matrix(grid.width, grid.height) for grid in grids]).astype(np.float32),
         widths=np.array([grid.width for grid in grids], np.int32),
         heights=np.array([grid.height for grid in grids], np.int32),

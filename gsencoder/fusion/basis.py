@@ -117,10 +117,3 @@ def table_basis(
 def encode(basis: FeatureBasis, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:
     """Coordinates of vectors: (x − mean) @ componentsᵀ."""
     return ((vectors - basis.mean) @ basis.components.T).astype(np.float32)
-
-
-def decode_map(
-    basis: FeatureBasis, coordinates: Float32[np.ndarray, "*n R"], alpha: Float32[np.ndarray, "*n"]
-) -> Float32[np.ndarray, "*n D"]:
-    """The features of rendered coordinates: (B @ z) @ components + alpha · mean."""
-    return coordinates @ basis.components + alpha[..., None] * basis.mean

@@ -10,7 +10,6 @@ from gsencoder.core.runtime.clock import Clock
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.checkpoint import FusionCheckpoint
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
-from gsencoder.geometry import transform
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import depth_image
 from gsencoder.render.rays import grid_lattice
@@ -169,21 +168,13 @@ def center_matrix(
 ) -> Blend:
     """The paper's lift as a matrix: one entry of weight 1 for each visible center, in the cell that it falls into."""
     cameras = views.cameras
-    pose, K = torch.from_numpy(cameras.cam_from_world[view]), cameras.Ks[view]
-    points = transform(pose, torch.from_numpy(gaussians.means)).numpy()
-    z = points[:, 2]
-    safe = np.where(z > config.near, z, 1)
-    x = K[0, 0] * points[:, 0] / safe + K[0, 2]
-    y = K[1, 1] * points[:, 1] / safe + K[1, 2]
-    width, height = int(cameras.widths[view]), int(cameras.heights[view])
-    rows = np.flatnonzero((z > config.near) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
-    pixels = np.stack((x[rows], y[rows]), axis=1).astype(np.int64)
+    pixels, z = cameras.project(gaussians.means, view)
+    rows = np.flatnonzero(cameras.in_image(pixels, z, view, near=config.near))
     for depth in depths:
-        kept = visible_points(z[rows], pixels, depth, visibility)
-        rows, pixels = rows[kept], pixels[kept]
-    affine = feature_map.grid_from_image
-    column = np.floor(affine[0, 0] * x[rows] + affine[0, 2]).astype(np.int64)
-    line = np.floor(affine[1, 1] * y[rows] + affine[1, 2]).astype(np.int64)
+        rows = rows[visible_points(z[rows], pixels[rows].astype(np.int64), depth, visibility)]
+    affine, (x, y) = feature_map.grid_from_image, pixels[rows].T
+    column = np.floor(affine[0, 0] * x + affine[0, 2]).astype(np.int64)
+    line = np.floor(affine[1, 1] * y + affine[1, 2]).astype(np.int64)
     inside = (column >= 0) & (column < feature_map.width) & (line >= 0) & (line < feature_map.height)
     rows, cell = rows[inside], (line * feature_map.width + column)[inside]
     order = np.argsort(cell, kind="stable")

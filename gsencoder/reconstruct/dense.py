@@ -23,7 +23,6 @@ from gsencoder.reconstruct.stereo import (
     agreeing,
     depth_range,
     finds,
-    in_image,
     look_up,
     neighbors_of,
     sees_through,
@@ -105,10 +104,8 @@ def coverage(cameras: Cameras, views: Sequence[int], points: Float32[np.ndarray,
     for view in views:
         width, height = int(cameras.widths[view]), int(cameras.heights[view])
         cell = max(1.0, CELL * max(width, height))
-        chosen = points[in_image(cameras, view, points)].astype(np.float64)
-        pose, K = cameras.cam_from_world[view].astype(np.float64), cameras.Ks[view]
-        camera = chosen @ pose[:3, :3].T + pose[:3, 3]
-        columns, rows = (((K[i, i] * camera[:, i] / camera[:, 2] + K[i, 2]) / cell).astype(np.int64) for i in (0, 1))
+        pixels, depths = cameras.project(points.astype(np.float64), view)
+        columns, rows = (pixels[cameras.in_image(pixels, depths, view)] / cell).astype(np.int64).T
         across, down = math.ceil(width / cell), math.ceil(height / cell)
         shares.append(len(np.unique(rows * across + columns)) / (across * down))
     return float(np.mean(shares))

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gsencoder.geometry import colors_from_sh, normalize_quats, transform
+from gsencoder.geometry import colors_from_sh, normalize_quats, project_points, transform
 from gsencoder.types import Cameras, Gaussians
 
 OPACITY_ENDS = 1e-3
@@ -81,13 +81,14 @@ def rows_in_view(
     A splat's half width is at most REACH·√((f·s/z)²(1 + t²) + eps2d), where s is its largest scale and t the tangent
     at which geometry.project stops following it sideways.
     """
-    x, y, z = transform(cam_from_world, raw["means"]).unbind(1)
+    local = transform(cam_from_world, raw["means"])
+    z = local[:, 2]
     inside: Bool[Tensor, " N"] = z > near
     largest = raw["log_scales"].amax(dim=1).exp() / z.clamp(min=near)
-    for along, focal, middle, size in ((x, K[0, 0], K[0, 2], width), (y, K[1, 1], K[1, 2], height)):
+    focals, middles, sizes = K.diagonal()[:2], K[:2, 2], (width, height)
+    for place, focal, middle, size in zip(project_points(local, K).unbind(1), focals, middles, sizes, strict=True):
         tangent = torch.maximum(middle, size - middle) / focal + 0.15 * size / focal
         reach = REACH * torch.sqrt((focal * largest).square() * (1 + tangent.square()) + eps2d)
-        place = focal * along / z + middle
         inside &= (place + reach > 0) & (place - reach < size)
     return inside.nonzero().squeeze(1)
 

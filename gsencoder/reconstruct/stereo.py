@@ -12,15 +12,18 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
-from gsencoder.geometry import transform
+from gsencoder.geometry import invert_rigid, project_points, transform, unproject_points
 from gsencoder.reconstruct.photographs import Shot
 from gsencoder.types import Cameras
+from gsencoder.types.cameras import pixel_centers
 
 WINDOW = 5
 """Side of the windows that are compared, in pixels of the small pictures."""
 PLANE_STEP = 0.7
 """Neighboring planes move a pixel by so many pixels in the view where it moves most."""
 MOST_PLANES = 128
+SMALLEST_DEPTH = 1e-6
+"""Points nearer to a camera, or behind it, are in no picture, world units."""
 LEAST_CONTRAST = 0.01
 """Windows whose colors deviate less (of 1) say nothing."""
 BEST_ANGLE = np.deg2rad(8.0)
@@ -49,7 +52,8 @@ def neighbors_of(
     A shared point counts exp(−(ln(angle / BEST_ANGLE))²), so that both half and twice the best angle count a little
     over a half.
     """
-    inside = {view: in_image(cameras, view, points) for view in chosen}
+    exact = points.astype(np.float64)
+    inside = {view: cameras.in_image(*cameras.project(exact, view), view) for view in chosen}
     centers = cameras.centers
     found: dict[int, list[int]] = {}
     for view in chosen:
@@ -67,53 +71,33 @@ def neighbors_of(
     return found
 
 
-def in_image(cameras: Cameras, view: int, points: Float32[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Points in front of a camera that project into its picture, hidden ones included."""
-    pose, K = cameras.cam_from_world[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
-    camera = points @ pose[:3, :3].T + pose[:3, 3]
-    z = np.maximum(camera[:, 2], 1e-9)
-    u, v = (K[i, i] * camera[:, i] / z + K[i, 2] for i in (0, 1))
-    return (camera[:, 2] > 0) & (u > 0) & (u < cameras.widths[view]) & (v > 0) & (v < cameras.heights[view])
-
-
 def depth_range(cameras: Cameras, view: int, points: Float32[np.ndarray, "P 3"]) -> tuple[float, float] | None:
     """Where to look: the depths of the points in the picture, 2 % of the strays cut off at each end, and a margin."""
-    pose = cameras.cam_from_world[view]
-    z = points[in_image(cameras, view, points)] @ pose[2, :3] + pose[2, 3]
-    if len(z) < 10:
+    pixels, depths = cameras.project(points.astype(np.float64), view)
+    depths = depths[cameras.in_image(pixels, depths, view)]
+    if len(depths) < 10:
         return None
-    near, far = np.quantile(z, (0.02, 0.98))
+    near, far = np.quantile(depths, (0.02, 0.98))
     return 0.85 * float(near), 1.3 * float(far)
 
 
-def _relative(reference: Float[Tensor, "4 4"], source: Float[Tensor, "4 4"]) -> tuple[Tensor, Tensor]:
-    """Rotation and translation source_from_reference."""
-    rotation = source[:3, :3] @ reference[:3, :3].T
-    return rotation, source[:3, 3] - rotation @ reference[:3, 3]
-
-
 def _pixel_rays(shot: Shot) -> Float[Tensor, "h w 3"]:
-    """Directions of z = 1 through the pixel centers."""
-    v, u = torch.meshgrid(torch.arange(shot.height) + 0.5, torch.arange(shot.width) + 0.5, indexing="ij")
-    K = shot.K
-    return torch.stack(((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)), dim=-1).float()
+    """Directions of z = 1 through the pixel centers, in camera axes."""
+    centers = torch.from_numpy(pixel_centers(shot.width, shot.height)).float()
+    return unproject_points(centers, torch.ones_like(centers[..., 0]), shot.K)
 
 
 def _planes(
-    rays: Tensor, poses: Sequence[tuple[Tensor, Tensor]], sources: Sequence[Shot], near: float, far: float
+    rays: Tensor, relative: Sequence[Tensor], sources: Sequence[Shot], near: float, far: float
 ) -> Float[Tensor, " D"]:
     """Depths from near to far, evenly spaced in 1/depth, as close as pixels ask."""
     corners = rays[:: max(1, rays.shape[0] - 1), :: max(1, rays.shape[1] - 1)].reshape(-1, 3)
     longest = 0.0
-    for (rotation, translation), source in zip(poses, sources, strict=True):
-        ends = []
-        for depth in (near, far):
-            x, y, z = (depth * corners @ rotation.T + translation).unbind(-1)
-            ends.append(
-                torch.stack(
-                    (source.K[0, 0] * x / z.clamp(min=1e-3 * near), source.K[1, 1] * y / z.clamp(min=1e-3 * near)), -1
-                )
-            )
+    for source_from_reference, source in zip(relative, sources, strict=True):
+        ends = [
+            project_points(transform(source_from_reference, depth * corners), source.K, min_depth=1e-3 * near)
+            for depth in (near, far)
+        ]
         moved = (ends[0] - ends[1]).norm(dim=-1)
         longest = max(longest, float(moved.median()))
     count = int(np.clip(np.ceil(longest / PLANE_STEP), 16, MOST_PLANES))
@@ -139,13 +123,13 @@ def sweep(
         far: largest depth.
     """
     rays = _pixel_rays(reference)
-    relative = [_relative(pose, other) for other in source_poses]
+    relative = [other @ invert_rigid(pose) for other in source_poses]
     depths = _planes(rays, relative, sources, near, far)
     windows = _Windows(reference.image.mean(dim=-1)[None, None])
     scores = torch.stack(
         [
-            _alike(windows, rays, rotation, translation, source, depths)
-            for (rotation, translation), source in zip(relative, sources, strict=True)
+            _alike(windows, rays, source_from_reference, source, depths)
+            for source_from_reference, source in zip(relative, sources, strict=True)
         ]
     )
     best = scores.topk(min(2, len(sources)), dim=0).values.mean(dim=0)
@@ -183,11 +167,12 @@ def window_mean(maps: Float[Tensor, "n c h w"], side: int = WINDOW) -> Float[Ten
 
 
 def _alike(
-    reference: _Windows, rays: Tensor, rotation: Tensor, translation: Tensor, source: Shot, depths: Tensor
+    reference: _Windows, rays: Tensor, source_from_reference: Tensor, source: Shot, depths: Tensor
 ) -> Float[Tensor, "D h w"]:
     """Zero-mean normalized cross-correlation of each pixel's window with where each plane carries it."""
-    turned = rays @ rotation.T
-    points = depths[:, None, None, None] * turned + translation
+    # Turned once, and not once for each plane.
+    turned = rays @ source_from_reference[:3, :3].T
+    points = depths[:, None, None, None] * turned + source_from_reference[:3, 3]
     grid, inside = to_grid(points, source)
     picture = source.image.mean(dim=-1)[None, None]
     warped = torch.nn.functional.grid_sample(
@@ -201,12 +186,13 @@ def _alike(
 
 def to_grid(points: Float[Tensor, "*n 3"], shot: Shot) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
     """Where points in a camera lie in its picture, as grid_sample counts (−1 to 1), and whether they are in it."""
-    x, y, z = points.unbind(-1)
-    safe = z.clamp(min=1e-6)
-    u = shot.K[0, 0] * x / safe + shot.K[0, 2]
-    v = shot.K[1, 1] * y / safe + shot.K[1, 2]
-    inside = (z > 1e-6) & (u > 0) & (u < shot.width) & (v > 0) & (v < shot.height)
-    return torch.stack((2 * u / shot.width - 1, 2 * v / shot.height - 1), dim=-1), inside
+    # The intrinsics of an image whose pixels run from −1 to 1.
+    scale = shot.K.new_tensor([2 / shot.width, 2 / shot.height, 1.0])
+    K = scale[:, None] * shot.K
+    K[:2, 2] -= 1
+    grid = project_points(points, K, min_depth=SMALLEST_DEPTH)
+    u, v = grid.unbind(-1)
+    return grid, (points[..., 2] > SMALLEST_DEPTH) & (u.abs() < 1) & (v.abs() < 1)
 
 
 def sample_nearest(values: Float[Tensor, "h w"], grid: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
@@ -261,5 +247,4 @@ def agreeing(
 
 def world_points(depth: Float[Tensor, "h w"], shot: Shot, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "h w 3"]:
     """Where the pixels' surfaces lie in the world."""
-    camera = _pixel_rays(shot) * depth.unsqueeze(-1)
-    return (camera - pose[:3, 3]) @ pose[:3, :3]
+    return transform(invert_rigid(pose), _pixel_rays(shot) * depth.unsqueeze(-1))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
+from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import sh_basis
@@ -61,14 +62,15 @@ def augment(
         voxel: the unit of `jitter`, world units.
         up: the axis of `turn`; the world's z where it is not known.
     """
-    axis = np.array([0.0, 0.0, 1.0]) if up is None else up
-    rotation = _rotation(axis, math.radians(rng.uniform(-config.turn, config.turn)))
+    axis = np.array([0.0, 0.0, 1.0]) if up is None else up / np.linalg.norm(up)
+    rotation = Rotation.from_rotvec(axis * math.radians(rng.uniform(-config.turn, config.turn)))
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across = _rotation(axis, rng.uniform(0, 2 * math.pi)) @ (across / np.linalg.norm(across))
-    rotation = _rotation(across, math.radians(rng.normal(0, config.tilt))) @ rotation
+    across = Rotation.from_rotvec(axis * rng.uniform(0, 2 * math.pi)).apply(across / np.linalg.norm(across))
+    rotation = Rotation.from_rotvec(across * math.radians(rng.normal(0, config.tilt))) * rotation
+    to_from = rotation.as_matrix()
     if rng.random() < config.mirror:
-        rotation = rotation @ (np.eye(3) - 2 * np.outer(across, across))
-    turned = turn(gaussians, rotation, float(rng.uniform(1 - config.scale, 1 + config.scale)))
+        to_from = to_from @ (np.eye(3) - 2 * np.outer(across, across))
+    turned = turn(gaussians, to_from, float(rng.uniform(1 - config.scale, 1 + config.scale)))
     shift = rng.uniform(0, voxel, 3) + rng.normal(0, config.jitter * voxel, turned.means.shape)
     return replace(
         turned,
@@ -92,10 +94,14 @@ def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float
         raise InputError("turn: expected an orthonormal matrix and a positive scale")
     mirrored = np.linalg.det(to_from) < 0
     # A Gaussian looks the same mirrored through its center, so −M turns its axes as M does, and is a rotation.
-    quat = _quat(-to_from if mirrored else to_from)
+    rotation = Rotation.from_matrix(-to_from if mirrored else to_from)
+    # A product of quaternions is linear in each: those with 1, i, j and k make its matrix. For many Gaussians that is
+    # ten times faster than scipy's product with each.
+    units = Rotation.from_quat(np.eye(4), scalar_first=True)
+    quats = gaussians.quats @ (rotation * units).as_quat(scalar_first=True)
     return Gaussians(
         means=(gaussians.means.astype(np.float64) @ (scale * to_from.T)).astype(np.float32),
-        quats=_multiply(quat, gaussians.quats),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
         scales=(gaussians.scales * np.float32(scale)).astype(np.float32),
         opacities=gaussians.opacities,
         sh=_turn_sh(gaussians.sh, to_from),
@@ -127,24 +133,3 @@ def _relight(
     black = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
     changed[:, 0] += (black + rng.normal(0, config.noise, (len(sh), 3))) / SH_C0
     return changed.astype(np.float32)
-
-
-def _rotation(axis: np.ndarray, angle: float) -> Float64[np.ndarray, "3 3"]:
-    """Rodrigues' formula for a unit axis."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-
-
-def _quat(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "4"]:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]])
-
-
-def _multiply(left: Float64[np.ndarray, "4"], right: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
-    """Hamilton's product left · right, wxyz, normalized."""
-    w, x, y, z = left
-    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    product = right @ matrix.T
-    return (product / np.linalg.norm(product, axis=1, keepdims=True)).astype(np.float32)

@@ -50,23 +50,16 @@ def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras, *, near: floa
         near: smallest depth, world units.
     """
     inside = np.zeros(len(means), bool)
-    for pose, K, width, height in zip(cameras.cam_from_world, cameras.Ks, cameras.widths, cameras.heights, strict=True):
+    for view in range(len(cameras)):
         # The rows that are found already need not be looked at again.
         rows = np.flatnonzero(~inside)
-        x, y, z = (means[rows] @ pose[:3, :3].T + pose[:3, 3]).T
-        safe = np.where(z > near, z, 1)
-        u, v = K[0, 0] * x / safe + K[0, 2], K[1, 1] * y / safe + K[1, 2]
-        inside[rows] = (z > near) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        inside[rows] = cameras.in_image(*cameras.project(means[rows], view), view, near=near)
     return inside
 
 
 def seen_by(point: Float32[np.ndarray, "3"], cameras: Cameras, *, near: float = 0.01) -> Bool[np.ndarray, " V"]:
     """True for cameras in whose image a point lies, beyond the near plane."""
-    x, y, z = (cameras.cam_from_world[:, :3, :3] @ point + cameras.cam_from_world[:, :3, 3]).T
-    safe = np.where(z > near, z, 1)
-    u = cameras.Ks[:, 0, 0] * x / safe + cameras.Ks[:, 0, 2]
-    v = cameras.Ks[:, 1, 1] * y / safe + cameras.Ks[:, 1, 2]
-    return np.asarray((z > near) & (u >= 0) & (u < cameras.widths) & (v >= 0) & (v < cameras.heights))
+    return cameras.in_image(*cameras.project(point[None]), near=near)[:, 0]
 
 
 def nearest(means: Float32[np.ndarray, "n 3"], center: Float32[np.ndarray, "3"], count: int) -> Int64[np.ndarray, " m"]:

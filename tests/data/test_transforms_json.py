@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from scene_files import OPENGL, photograph, rewrite, save, world_from_cams, write_transforms
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.posed import inverse_rigid, rigid_pose
+from gsencoder.data.readers.posed import rigid_pose
 from gsencoder.data.readers.transforms_json import read_transforms
 from gsencoder.data.scenes import load_scene
+from gsencoder.types.poses import invert_rigid
 
 
 def change(folder: Path, data: dict[str, Any], frame: int = 1, **values: Any) -> Path:
@@ -229,7 +230,7 @@ def test_rounding_in_a_pose_is_removed(rng: np.random.Generator) -> None:
     rotation = pose[:3, :3]
     assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
     assert np.abs(pose - exact).max() < 2e-4
-    assert np.abs(inverse_rigid(pose) @ pose - np.eye(4)).max() < 1e-12
+    assert np.abs(invert_rigid(pose) @ pose - np.eye(4)).max() < 1e-12
 
 
 json_values = st.recursive(

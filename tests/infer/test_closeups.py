@@ -8,7 +8,6 @@ from rooms import corner_cameras, room
 
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.closeups import LEAST_WIDTH, MOST_SHARE, closeups
-from gsencoder.infer.views.free_space import in_picture
 from gsencoder.infer.views.photographs import photograph_cameras, photograph_of, with_photographs
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig
@@ -37,7 +36,7 @@ def photographed() -> tuple[Scene, Target]:
 
 
 def places(cameras: Cameras, view: int, points: np.ndarray) -> np.ndarray:
-    return np.stack(in_picture(cameras, view, points)[:2], axis=1)
+    return cameras.project(points, view)[0]
 
 
 def test_a_close_up_shows_each_point_where_the_photograph_has_it() -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import colors_from_sh, covariances
@@ -52,6 +53,14 @@ def test_a_turned_splat_looks_from_a_turned_place_as_it_did(
     after = covariances(torch.from_numpy(turned.quats), torch.from_numpy(turned.scales)).double().numpy()
     np.testing.assert_allclose(after, scale**2 * matrix @ before @ matrix.T, rtol=1e-3, atol=1e-4 * scale**2)
     np.testing.assert_allclose(turned.means, scale * one.means @ matrix.T, rtol=1e-4, atol=1e-4)
+
+
+@given(st.integers(0, 1000))
+def test_quaternions_are_turned_as_scipy_multiplies_rotations(seed: int) -> None:
+    one, matrix = splat(), orthonormal(seed, mirrored=False)
+    each = Rotation.from_quat(one.quats.astype(np.float64), scalar_first=True)
+    expected = (Rotation.from_matrix(matrix) * each).as_quat(scalar_first=True)
+    np.testing.assert_allclose(turn(one, matrix).quats, expected, atol=1e-6)
 
 
 @given(st.integers(0, 100), st.booleans())

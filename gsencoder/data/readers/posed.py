@@ -109,14 +109,6 @@ def _list(values: np.ndarray) -> str:
     return ", ".join(f"{value:.6g}" for value in values)
 
 
-def inverse_rigid(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-    """world_from_cam of a rigid cam_from_world, and the other way round."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse
-
-
 def inside(folder: Path, relative: str, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
     """`folder / relative`, which may not leave `root` through "..", an absolute path or a link unless allowed.
 

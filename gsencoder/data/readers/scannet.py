@@ -13,8 +13,9 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.images import picture_size
-from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, inverse_rigid, rigid_pose, warn_left_out
+from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera
+from gsencoder.types.poses import invert_rigid
 
 MILLIMETRES = 1e-3
 
@@ -71,7 +72,7 @@ def read_scannet(root: Path, *, allow_outside: bool = False, depth_scale: float 
             PosedImage(
                 name=f"color/{path.name}",
                 camera=camera,
-                cam_from_world=inverse_rigid(rigid_pose(pose, str(pose_file))),
+                cam_from_world=invert_rigid(rigid_pose(pose, str(pose_file))),
                 image=path,
                 depth=depth,
                 depth_camera=depth_camera,

@@ -23,18 +23,17 @@ from gsencoder.data.readers.posed import (
     PosedImage,
     PosedImages,
     inside,
-    inverse_rigid,
     number,
     rigid_pose,
     warn_left_out,
 )
 from gsencoder.data.readers.undistort import CameraModel, check_camera
+from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
 
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 NERFSTUDIO_DEPTH_SCALE = 1e-3
 """nerfstudio's own default for depth_unit_scale_factor: integer millimetres."""
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 """The names that such files have."""
@@ -121,7 +120,7 @@ def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: flo
             PosedImage(
                 name=name,
                 camera=camera,
-                cam_from_world=inverse_rigid(pose @ _OPENCV_FROM_OPENGL),
+                cam_from_world=invert_rigid(pose @ OPENCV_FROM_OPENGL),
                 image=image,
                 depth=beside["depth"],
                 depth_scale=scale,

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.types.cameras import intrinsic_matrix, pixel_centers, project_points, unproject_points
 
 MAX_HALF_FIELD = math.radians(85)
 """Rays further from the optical axis than this (a field of view of 170°) are not used."""
@@ -83,7 +84,7 @@ class Pinhole:
     def matrix(self, width: int, height: int) -> Float64[np.ndarray, "3 3"]:
         """K for the same picture resized to width × height."""
         sx, sy = width / self.width, height / self.height
-        return np.array([[self.fx * sx, 0, self.cx * sx], [0, self.fy * sy, self.cy * sy], [0, 0, 1]])
+        return intrinsic_matrix(self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
 
 def check_camera(camera: CameraModel, where: str) -> None:
@@ -147,20 +148,19 @@ def _colmap_camera(camera: CameraModel, where: str) -> Any:
 
 
 def _project(
-    camera: CameraModel, fx: float, fy: float, cx: float, cy: float, pixels: Float64[np.ndarray, "P 2"]
+    camera: CameraModel, K: Float64[np.ndarray, "3 3"], pixels: Float64[np.ndarray, "P 2"]
 ) -> tuple[Float64[np.ndarray, "P 2"], Bool[np.ndarray, " P"]]:
-    """Where pixels of the pinhole (fx, fy, cx, cy) lie in the distorted picture, and which of them are usable."""
-    rays = np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))])
+    """Where pixels of the pinhole K lie in the distorted picture, and which of them are usable."""
+    rays = unproject_points(pixels, np.ones(len(pixels)), K)
     used = np.hypot(rays[:, 0], rays[:, 1]) <= math.tan(MAX_HALF_FIELD)
     if camera.is_pinhole:
-        f_x, f_y, c_x, c_y = camera.pinhole_params()
-        where = rays[:, :2] * (f_x, f_y) + (c_x, c_y)
+        where = np.ascontiguousarray(project_points(rays, intrinsic_matrix(*camera.pinhole_params())))
     else:
         made = _colmap_camera(camera, camera.model)
         where = np.asarray(made.img_from_cam(rays), dtype=np.float64)
         back = np.asarray(made.cam_from_img(np.nan_to_num(where)), dtype=np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
-            used &= (np.abs(back - rays[:, :2]) * (fx, fy)).max(axis=1) <= PIXEL_TOLERANCE
+            used &= (np.abs(back - rays[:, :2]) * (K[0, 0], K[1, 1])).max(axis=1) <= PIXEL_TOLERANCE
     with np.errstate(invalid="ignore"):
         used &= (where >= 0).all(axis=1) & (where <= (camera.width, camera.height)).all(axis=1)
     return where, used
@@ -183,7 +183,7 @@ def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
         rim = np.concatenate(border)
 
         def covered(zoom: float) -> bool:
-            return bool(_project(camera, fx * zoom, fy * zoom, cx, cy, rim)[1].all())
+            return bool(_project(camera, intrinsic_matrix(fx * zoom, fy * zoom, cx, cy), rim)[1].all())
 
         if covered(MIN_ZOOM):
             zoom = MIN_ZOOM
@@ -194,7 +194,7 @@ def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
                 low, high = (low, middle) if covered(middle) else (middle, high)
             zoom = high
         coarse = np.stack(np.meshgrid(np.linspace(0.5, w - 0.5, 33), np.linspace(0.5, h - 0.5, 33)), -1).reshape(-1, 2)
-        used = _project(camera, fx * zoom, fy * zoom, cx, cy, coarse)[1].mean()
+        used = _project(camera, intrinsic_matrix(fx * zoom, fy * zoom, cx, cy), coarse)[1].mean()
         if used < MIN_USED:
             raise InputError(
                 f"{where}: {camera.model} with {list(camera.params)} can be inverted on only {used:.0%} of its pixels "
@@ -251,9 +251,8 @@ class Remap:
 
 def build_remap(target: Pinhole, source: CameraModel) -> Remap:
     """The exact map from the pixels of `target` to those of `source`, both looking from the same place."""
-    x, y = np.meshgrid(np.arange(target.width) + 0.5, np.arange(target.height) + 0.5)
-    pixels = np.column_stack([x.reshape(-1), y.reshape(-1)])
-    where, used = _project(source, target.fx, target.fy, target.cx, target.cy, pixels)
+    pixels = pixel_centers(target.width, target.height).reshape(-1, 2)
+    where, used = _project(source, target.matrix(target.width, target.height), pixels)
     where[~used] = np.nan
     grid = where.astype(np.float32).reshape(target.height, target.width, 2)
     return Remap(x=np.ascontiguousarray(grid[..., 0]), y=np.ascontiguousarray(grid[..., 1]))

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32, UInt8
 from gsencoder.core.errors import InputError, about
 from gsencoder.data.seeding.surface_grid import SurfaceGrid, SurfaceSamples
 from gsencoder.types import Cameras, Views
+from gsencoder.types.cameras import pixel_centers, unproject_points
 
 LINEAR = 3.0
 """A second difference of inverse depth within this many of its noise's standard deviations counts as zero."""
@@ -192,14 +193,15 @@ def _gradient(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> tuple
 
 def _rays(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """x/z of each column [1, W] and y/z of each row [H, 1]."""
-    u = (np.arange(shape[1], dtype=np.float32) + np.float32(0.5) - K[0, 2]) / K[0, 0]
-    v = (np.arange(shape[0], dtype=np.float32) + np.float32(0.5) - K[1, 2]) / K[1, 1]
-    return u[None, :], v[:, None]
+    height, width = shape
+    across, down = (pixel_centers(*size).astype(np.float32) for size in ((width, 1), (1, height)))
+    columns, rows = (unproject_points(line, np.ones_like(line[..., 0]), K) for line in (across, down))
+    return columns[..., 0], rows[..., 1]
 
 
 def _to_world(pixels: SurfacePixels, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
     """World positions and normals of the used pixels, float32 [n, 3] each."""
-    ray_u, ray_v = _rays(pixels.depth.shape, cameras.Ks[view])
-    local = np.stack([ray_u * pixels.depth, ray_v * pixels.depth, pixels.depth], axis=-1)[pixels.use]
-    rotation = cameras.cam_from_world[view, :3, :3]  # Row vectors times R are Rᵀ times column vectors.
-    return local @ rotation + cameras.centers[view].astype(np.float32), pixels.normals[pixels.use] @ rotation
+    height, width = pixels.depth.shape
+    centers = pixel_centers(width, height)[pixels.use].astype(np.float32)
+    points = cameras.unproject(centers, pixels.depth[pixels.use], view)
+    return points, cameras.rotate_to_world(pixels.normals[pixels.use], view)

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.types import SH_C0, Gaussians
+from gsencoder.types import Gaussians, sh_from_colors
 
 SIZE = 0.6
 """In-plane standard deviation as a share of the spacing. Rendered against the photographs of RGB-D rooms 0.55 is
@@ -23,7 +23,6 @@ OVER_ANY = 1.5
 scrap of surface with no like neighbor must not swell over the others."""
 STRETCH = 3.0
 """A spacing may be so many times the median of the neighbors' own: a stray point must not become a great blob."""
-"""The constant spherical harmonic, 1 / (2√π)."""
 
 
 def flat_gaussians(
@@ -50,7 +49,7 @@ def flat_gaussians(
         quats=quats_from_normals(normals),
         scales=np.maximum(scales, np.float32(1e-12)),
         opacities=np.full(len(points), OPACITY, np.float32),
-        sh=((colors - np.float32(0.5)) / np.float32(SH_C0)).astype(np.float32)[:, None],
+        sh=sh_from_colors(colors),
     )
 
 

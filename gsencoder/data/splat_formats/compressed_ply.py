@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from gsencoder.core.errors import InputError
 from gsencoder.data.splat_formats.ply import PlyHeader, element_start
 from gsencoder.data.splat_formats.raw import RawSplat, logits_from_opacities, quats_from_smallest_three
-from gsencoder.types import SH_C0
+from gsencoder.types import sh_from_colors
 
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -82,7 +82,7 @@ def read_compressed(path: Path, stream: BinaryIO, header: PlyHeader, size: int) 
         # Files before the color bounds were introduced spread colors over 0 to 1.
         rgb = between(_COLOR_BOUNDS, rgba[:, :3]) if "min_r" in chunk_names else rgba[:, :3]
         sh = np.empty((count, coefficients + 1, 3), np.float32)
-        sh[:, 0] = (rgb - 0.5) / SH_C0
+        sh[:, :1] = sh_from_colors(rgb)
     if rest is not None and rest.dtype is not None:
         stream.seek(starts["sh"])
         packed = np.fromfile(stream, rest.dtype, count)

@@ -7,7 +7,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splat_formats.raw import RawSplat, logits_from_opacities, logs_from_scales
-from gsencoder.types import SH_C0
+from gsencoder.types import sh_from_colors
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
@@ -25,6 +25,6 @@ def read_dotsplat(path: Path, stream: BinaryIO, size: int) -> RawSplat:
         quats=((rows["quats"].astype(np.float32) - 128) / 128),
         log_scales=logs_from_scales(rows["scales"]),
         logit_opacities=logits_from_opacities(rgba[:, 3]),
-        sh=((rgba[:, None, :3] - 0.5) / SH_C0).astype(np.float32),
+        sh=sh_from_colors(rgba[:, :3]).astype(np.float32),
         format=".splat",
     )

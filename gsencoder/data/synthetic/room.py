@@ -11,7 +11,7 @@ from gsencoder.data.seeding.flat import OPACITY, SIZE, THICKNESS, quats_from_nor
 from gsencoder.data.synthetic.plan import COLORS, HALF_ROOM, TABLE, PlannedObject, plan_room
 from gsencoder.data.synthetic.shapes import Solid
 from gsencoder.data.synthetic.write import write_room
-from gsencoder.types import SH_C0, Cameras, Gaussians, Scene, SceneObject, Views
+from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views, sh_from_colors
 
 __all__ = ["color_words", "make_room", "plan_room", "write_room"]
 
@@ -124,21 +124,17 @@ def _cast(
     surfaces: list[_Surface], cameras: Cameras, view: int
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
     """Image, depth and instance map of one view. The rays have z = 1 in the camera, so that t is depth."""
-    height, width = int(cameras.heights[view]), int(cameras.widths[view])
-    K, pose = cameras.Ks[view].astype(np.float64), cameras.cam_from_world[view].astype(np.float64)
-    u = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
-    v = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
-    local = np.stack([*np.meshgrid(u, v), np.ones((height, width))], axis=-1)
-    rays, origin = local @ pose[:3, :3], cameras.centers[view]
-    depth, owner = np.full((height, width), np.inf), np.full((height, width), -1)
+    rays, origin = cameras.rays(view), cameras.centers[view]
+    size = rays.shape[:2]
+    depth, owner = np.full(size, np.inf), np.full(size, -1)
     for row, surface in enumerate(surfaces):
-        window = _window(surface.solid, pose, K, width, height)
+        window = _window(surface.solid, cameras, view)
         hits = surface.solid.hits(origin, rays[window])
         nearer = hits < depth[window]
         depth[window] = np.where(nearer, hits, depth[window])
         owner[window] = np.where(nearer, row, owner[window])
-    image = np.full((height, width, 3), 200, np.uint8)  # Above the walls.
-    labels = np.zeros((height, width), np.int32)
+    image = np.full((*size, 3), 200, np.uint8)  # Above the walls.
+    labels = np.zeros(size, np.int32)
     for row in np.unique(owner[owner >= 0]):
         pixels = owner == row
         points = origin + rays[pixels] * depth[pixels][:, None]
@@ -148,16 +144,16 @@ def _cast(
     return image, np.where(np.isfinite(depth), depth, 0).astype(np.float32), labels
 
 
-def _window(solid: Solid, pose: np.ndarray, K: np.ndarray, width: int, height: int) -> tuple[slice, slice]:
+def _window(solid: Solid, cameras: Cameras, view: int) -> tuple[slice, slice]:
     """The pixels that can see the solid: around its projected corners, or all where it reaches behind the camera."""
     lower, upper = solid.aabb()
     corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True)), axis=-1).reshape(-1, 3)
-    local = corners @ pose[:3, :3].T + pose[:3, 3]
-    if local[:, 2].min() < 1e-3:
-        return slice(0, height), slice(0, width)
-    pixels = local[:, :2] / local[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
-    first = np.clip(np.floor(pixels.min(axis=0)).astype(int), 0, [width, height])
-    last = np.clip(np.ceil(pixels.max(axis=0)).astype(int), 0, [width, height])
+    size = np.array([cameras.widths[view], cameras.heights[view]])
+    pixels, depths = cameras.project(corners, view)
+    first, last = np.zeros(2, int), size
+    if depths.min() >= 1e-3:
+        first = np.clip(np.floor(pixels.min(axis=0)).astype(int), 0, size)
+        last = np.clip(np.ceil(pixels.max(axis=0)).astype(int), 0, size)
     return slice(first[1], last[1]), slice(first[0], last[0])
 
 
@@ -189,7 +185,7 @@ def _gaussians(surfaces: list[_Surface], spacing: float) -> Gaussians:
         quats=quats_from_normals(np.concatenate(normals).astype(np.float32)),
         scales=np.stack([size, size, size * np.float32(THICKNESS)], axis=1),
         opacities=np.full(len(size), OPACITY, np.float32),
-        sh=((np.concatenate(colors) - 0.5) / SH_C0).astype(np.float32)[:, None],
+        sh=sh_from_colors(np.concatenate(colors)).astype(np.float32),
     )
 
 

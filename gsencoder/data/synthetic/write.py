@@ -10,6 +10,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.types import Scene, Views
+from gsencoder.types.poses import OPENCV_FROM_OPENGL
 
 
 def write_room(scene: Scene, folder: str | Path) -> None:
@@ -62,14 +63,14 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
         Image.fromarray(views.images[view]).save(folder / "images" / stem)
         Image.fromarray(millimetres.astype(np.uint16)).save(folder / "depth" / stem)
         Image.fromarray(views.instances[view].astype(np.uint16)).save(folder / "instance" / stem)
-        world_from_cam = np.linalg.inv(cameras.cam_from_world[view].astype(np.float64))
+        world_from_cam = cameras.world_from_cam[view]
         world_from_cam[:3, 3] += scene.origin
         frames.append(
             {
                 "file_path": f"images/{stem}",
                 "depth_file_path": f"depth/{stem}",
                 "instance_file_path": f"instance/{stem}",
-                "transform_matrix": (world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+                "transform_matrix": (world_from_cam @ OPENCV_FROM_OPENGL).tolist(),
             }
         )
     K = cameras.Ks[0].astype(float)

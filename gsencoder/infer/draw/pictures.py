@@ -14,6 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from gsencoder.core.errors import InputError
 from gsencoder.infer.draw.boxes_ply import EDGES, box_corners, word_color
 from gsencoder.types import Box
+from gsencoder.types.cameras import project_points
+from gsencoder.types.poses import transform
 
 Picture = UInt8[np.ndarray, "_h _w 3"]
 
@@ -130,7 +132,7 @@ def draw_boxes(
         corners = box_corners(box, oriented=oriented)
         if origin is not None:
             corners = corners - origin
-        segments = _project_edges(corners @ pose[:3, :3].T + pose[:3, 3], intrinsics, image.width, image.height)
+        segments = _project_edges(transform(pose, corners), intrinsics, image.width, image.height)
         if not segments:
             continue
         color = word_color(order[box.query])
@@ -155,10 +157,9 @@ def _project_edges(
         if min(start[2], end[2]) < NEAR:
             cut = start + (NEAR - start[2]) / (end[2] - start[2]) * (end - start)
             start, end = (cut, end) if start[2] < NEAR else (start, cut)
-        ends = np.stack([start, end]) @ intrinsics.T
         # A box of 1e20 units may be cut so near its end that rounding leaves nothing to divide by.
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-            inside = _clip_to_picture(ends[:, :2] / ends[:, 2:], width, height)
+            inside = _clip_to_picture(project_points(np.stack([start, end]), intrinsics), width, height)
         if inside is not None and np.isfinite(inside).all():
             segments.append(inside)
     return segments

@@ -133,12 +133,15 @@ def box_around(
         margin: length added on every side.
         up: direction of the last axis of the oriented box; None = the smallest box of any orientation.
     """
+    from scipy.spatial.transform import Rotation
+
     points = gaussians.means[rows].astype(np.float64)
     rotation = oriented_axes(points, up)
     half_widths = np.zeros_like(points)
     half_widths_rotated = half_widths
     if extent == "sigma":
-        stretched = _rotations(gaussians.quats[rows]) * gaussians.scales[rows].astype(np.float64)[:, None, :]
+        rotations = Rotation.from_quat(gaussians.quats[rows].astype(np.float64), scalar_first=True).as_matrix()
+        stretched = rotations * gaussians.scales[rows].astype(np.float64)[:, None, :]
         half_widths = sigmas * np.sqrt((stretched**2).sum(axis=2))
         half_widths_rotated = sigmas * np.sqrt((np.einsum("ka,nkj->naj", rotation, stretched) ** 2).sum(axis=2))
     # Coordinates about the middle: rotating those of a far-away scene would round.
@@ -241,10 +244,3 @@ def _right_handed(axes: np.ndarray) -> Float64[np.ndarray, "3 3"]:
     if np.linalg.det(axes) < 0:
         axes[:, 2] = -axes[:, 2]
     return axes
-
-
-def _rotations(quats: Float32[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 3 3"]:
-    """Rotation matrices of wxyz quaternions."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_quat(quats[:, [1, 2, 3, 0]].astype(np.float64)).as_matrix()

@@ -66,7 +66,7 @@ class LocalizeConfig:
 
     def __post_init__(self) -> None:
         if self.mode not in ("centred", "raw"):
-            raise InputError(f"mode: expected centred or raw, got {self.mode!r}")
+            raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
         if self.extent not in ("means", "sigma"):
             raise InputError(f"extent: expected means or sigma, got {self.extent!r}")
         for name in ("temperature", "eps_spacings", *(("eps",) if self.eps is not None else ())):

@@ -57,7 +57,7 @@ def relevancy(
 
     The cosine is computed in the coordinates that are stored: with the stacked rows M = [components; basis mean −
     removed mean] = L·Q (Q orthonormal), the feature of z is [z, 1]·L in the axes Q, so norms and products need R + 1
-    numbers and no decoding. Rows stream in chunks. In the mode "centred" the features lose `features.mean` and the
+    numbers and no decoding. Rows stream in chunks. In the mode "centered" the features lose `features.mean` and the
     words `text_mean`; a centered feature shorter than 1e-3 of the mean counts as having no direction, and its cosine
     fades to 0.
 
@@ -72,7 +72,7 @@ def relevancy(
         text_mean: mean of the text side.
         negatives: vectors of negative words (there may be none of them), or None for plain cosines.
         temperature: t above; LERF's factor of 10 is 0.1.
-        mode: "centred" or "raw" cosines.
+        mode: "centered" or "raw" cosines.
 
     Returns:
         Relevancy, in [−1, 1] for cosines; NaN for Gaussians never seen.
@@ -90,7 +90,7 @@ def relevancy(
     if not (np.isfinite(words).all() and np.isfinite(text_mean).all()):
         raise InputError("relevancy: expected finite word vectors and text mean, got NaN or Inf")
     if mode not in ("centred", "raw") or not 0 < temperature < math.inf:
-        raise InputError(f"relevancy: expected mode centred or raw, temperature > 0, got {mode!r} and {temperature}")
+        raise InputError(f"relevancy: expected mode centered or raw, temperature > 0, got {mode!r} and {temperature}")
     directions = words.astype(np.float64) - (text_mean if mode == "centred" else 0.0)
     directions /= np.sqrt((directions**2).sum(axis=1, keepdims=True) + EPS)
     removed = features.mean.astype(np.float64) if mode == "centred" else np.zeros(channels)

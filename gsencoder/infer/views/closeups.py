@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.even_indices import evenly
-from gsencoder.infer.views.free_space import in_picture
 from gsencoder.infer.views.scores import AROUND
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians
@@ -42,11 +41,11 @@ def closeups(
     rows: list[int] = []
     Ks: list[Float64[np.ndarray, "3 3"]] = []
     for view in range(len(frames)):
-        x, y, _, shown = in_picture(frames, view, points)
+        pixels, depths = frames.project(points, view)
+        shown = frames.in_image(pixels, depths, view)
         if shown.mean() < LEAST_INSIDE:
             continue
-        places = np.stack((x[shown], y[shown]))
-        low, high = places.min(axis=1), places.max(axis=1)
+        low, high = pixels[shown].min(axis=0), pixels[shown].max(axis=0)
         wide, tall = (high - low) * (1 + 2 * AROUND)
         window = np.array([1, height / width]) * max(wide, tall * width / height, LEAST_WIDTH)
         size = np.array([frames.widths[view], frames.heights[view]], np.float64)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.even_indices import evenly
-from gsencoder.infer.views.free_space import FreeSpace, in_picture
+from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians
 
@@ -18,6 +18,8 @@ STOPPED = 0.02
 """What a frame counts in which all rays are stopped: rays may err."""
 FURTHER, LEAST_SHOWN = 4, 0.25
 """Half of the frames are spread over so many times as many, of those that show this share of what the best shows."""
+SMALLEST_DEPTH = 1e-9
+"""A target around the camera is taken to lie at this depth, world units."""
 
 
 def frames_on(
@@ -78,23 +80,22 @@ def _ranked(
 
 def _filled(cameras: Cameras, target: Target) -> Float64[np.ndarray, " V"]:
     """The share of each picture that a target's ball fills."""
-    pose = cameras.cam_from_world.astype(np.float64)
-    at = pose[:, :3, :3] @ target.center + pose[:, :3, 3]
-    z = np.maximum(at[:, 2], 1e-9)
-    x, y = (at[:, axis] / z * cameras.Ks[:, axis, axis] + cameras.Ks[:, axis, 2] for axis in (0, 1))
-    radius = np.minimum(target.radius * cameras.Ks[:, 0, 0] / z, cameras.widths + cameras.heights)
+    pixels, depths = (part[:, 0] for part in cameras.project(target.center[None], min_depth=SMALLEST_DEPTH))
+    radius = target.radius * cameras.Ks[:, 0, 0] / np.maximum(depths, SMALLEST_DEPTH)
+    radius = np.minimum(radius, cameras.widths + cameras.heights)
     filled = np.ones(len(cameras))
-    for place, size in ((x, cameras.widths), (y, cameras.heights)):
+    for place, size in zip(pixels.T, (cameras.widths, cameras.heights), strict=True):
         filled *= np.clip(np.minimum(place + radius, size) - np.maximum(place - radius, 0), 0, None) / size
-    return np.where(at[:, 2] > -target.radius, filled, 0)
+    return np.where(depths > -target.radius, filled, 0)
 
 
 def _open(
     cameras: Cameras, views: Int64[np.ndarray, " n"], points: Float64[np.ndarray, "p 3"], free: FreeSpace
 ) -> Float64[np.ndarray, " n"]:
     """The share of points that are in each picture with nothing between."""
-    inside = np.stack([in_picture(cameras, int(view), points)[3] for view in views])
-    towards = cameras.centers[views][:, None] - points
+    chosen = cameras.select(views)
+    inside = chosen.in_image(*chosen.project(points))
+    towards = chosen.centers[:, None] - points
     distance = np.linalg.norm(towards, axis=-1)
     towards /= np.maximum(distance, 1e-12)[..., None]
     # Rays begin beyond the cells of what the target lies on, and end before those in which the camera is.

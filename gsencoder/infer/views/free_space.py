@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Integer
 from gsencoder.core.even_indices import evenly
 from gsencoder.core.runtime.threads import parallel
 from gsencoder.data.seeding.spacing import NEIGHBOR
-from gsencoder.geometry import covariances, transform
+from gsencoder.geometry import covariances
 from gsencoder.infer.views.split_gaussians import SIGMAS, patches
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians
@@ -143,21 +143,8 @@ class FreeSpace:
         found = np.zeros(len(points), bool)
         for view, depth in enumerate(self._depths):
             assert self.watchers is not None
-            x, y, z, shown = in_picture(self.watchers, view, points)
-            column, row = (np.where(shown, part, 0).astype(np.int64) for part in (x, y))
+            pixels, z = self.watchers.project(points, view)
+            shown = self.watchers.in_image(pixels, z, view)
+            column, row = (np.where(shown, part, 0).astype(np.int64) for part in pixels.T)
             found |= shown & (depth[row, column] >= z + self.cell)
         return found
-
-
-def in_picture(
-    cameras: Cameras, view: int, points: Float64[np.ndarray, "n 3"]
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Where a camera sees points: x and y in pixels, depth z in world units, and whether they lie in its picture. Of
-    points that do not, x and y may be anything."""
-    pose, K = torch.from_numpy(cameras.cam_from_world[view]).double(), cameras.Ks[view].astype(np.float64)
-    at = transform(pose, torch.from_numpy(points)).numpy()
-    z = at[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        x, y = (at[:, axis] / z * K[axis, axis] + K[axis, 2] for axis in (0, 1))
-    shown = (z > 0) & (x >= 0) & (y >= 0) & (x < cameras.widths[view]) & (y < cameras.heights[view])
-    return x, y, z, shown

@@ -43,10 +43,7 @@ class Photographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
     def cameras(self) -> Cameras:
         """The cameras in the sizes that the pictures were taken in."""
         taken = self._views.cameras.select(self._rows)
-        scale = np.ones((len(self), 3))
-        scale[:, 0], scale[:, 1] = taken.widths / self._cameras.widths, taken.heights / self._cameras.heights
-        Ks = (self._cameras.Ks * scale[:, :, None]).astype(np.float32)
-        return replace(self._cameras, Ks=Ks, widths=taken.widths, heights=taken.heights)
+        return self._cameras.resized_to(taken.widths, taken.heights)
 
 
 def photograph_cameras(views: Views) -> Cameras:

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float32, Float64
 
 from gsencoder.core.even_indices import evenly
 from gsencoder.core.runtime.threads import parallel
-from gsencoder.infer.views.free_space import in_picture
 from gsencoder.infer.views.targets import Target
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians
@@ -137,10 +136,11 @@ class _Watched:
         depths = b.depths.numpy()[self._rows].astype(np.float64)
         pixels = float(small.Ks[view, 0, 0]) * self._sizes / np.maximum(depths, config.near)
         target, context = (weights[rows].astype(np.float32) for rows in self._samples)
+        inside = small.in_image(*small.project(self._alone.means.astype(np.float64), view), view)
         return _Seen(
             visible=min(float(shown[solid].sum()) / whole, 1.0) if whole > FAINT else 0.0,
             share=float(shown.mean()),
-            inside=float(in_picture(small, view, self._alone.means.astype(np.float64))[3].mean()),
+            inside=float(inside.mean()),
             alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
             blur=float(mine @ pixels / mine.sum()) / max(b.shape) if mine.sum() > 0 else 0.0,
             target=target,

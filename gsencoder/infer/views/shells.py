@@ -10,6 +10,7 @@ from gsencoder.data.orbits import looking_cameras, spiral_directions
 from gsencoder.infer.views.free_space import MOST_STEPS, FreeSpace
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians, Scene
+from gsencoder.types.poses import look_rotation
 
 TRIED = 8
 """So many times as many directions are tried as cameras are wanted …"""
@@ -95,9 +96,7 @@ def _backed(
     target, so that what it hangs on or lies on counts from either side."""
     forward = target.center - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(forward, vertical)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    down = np.cross(forward, right)
+    right, down, _ = np.moveaxis(look_rotation(forward, vertical), 1, 0)
     hits = np.zeros(len(centers))
     length = np.full(len(centers), MOST_STEPS * free.cell)
     for across in (-1.0, 0.0, 1.0):
@@ -126,10 +125,8 @@ def _distances(
     shares = np.clip(SHARES, between[0] * ROOM, between[1] / ROOM)
     cell = max(target.radius / OUTLINE, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
     wanted, least, reach = (np.empty(len(outward)) for _ in range(3))
-    for index, direction in enumerate(outward):
-        right = np.cross(direction, vertical)
-        right /= np.linalg.norm(right)
-        plane = np.stack((offsets @ right, offsets @ np.cross(direction, right)), axis=1)
+    for index, (right, down, direction) in enumerate(look_rotation(outward, vertical)):
+        plane = np.stack((offsets @ right, offsets @ down), axis=1)
         area = len(np.unique(np.floor(plane / cell).astype(np.int64), axis=0)) * cell**2
         reach[index] = max(float((offsets @ direction).max()), 0.0)
         # Distance at which an area fills a share of the picture: area · focal² / distance² = share · pixels.

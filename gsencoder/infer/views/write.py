@@ -11,6 +11,7 @@ from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.views.pictures import picture_kinds, view_sheet
 from gsencoder.infer.views.selection import ViewSet
 from gsencoder.types import Box, Scene
+from gsencoder.types.poses import move_origin
 
 SHEET = "sheet.png"
 
@@ -20,8 +21,7 @@ def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
     origin added back (cam_from_world and K as OpenCV has them)."""
     rows = []
     for number, (each, kind) in enumerate(zip(views.chosen, picture_kinds(scene, views), strict=True)):
-        pose = views.cameras.cam_from_world[number].astype(np.float64)
-        pose[:3, 3] -= pose[:3, :3] @ scene.origin
+        pose = move_origin(views.cameras.cam_from_world[number].astype(np.float64), -scene.origin)
         rows.append(
             {
                 "name": each.name,

@@ -1,0 +1,32 @@
+"""What passes between stages: frozen dataclasses over numpy arrays, checked when they are made.
+
+Axes: N Gaussians, V views, H W pixels, h w feature-map pixels, D channels, R basis rank, K = (sh_degree + 1)²,
+Q queries, C codes. World units are metres where known; camera axes are OpenCV's (x right, y down, z forward);
+pixel centers lie at .5; quaternions are wxyz; depth is z. Values are physical: scales are standard deviations and
+opacities are probabilities, never logarithms or logits.
+"""
+
+from gsencoder.types.cameras import Cameras
+from gsencoder.types.checks import UNIT_TOLERANCE, check_unit
+from gsencoder.types.features import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
+from gsencoder.types.gaussians import SH_C0, Gaussians, sh_from_colors
+from gsencoder.types.localization import Box, Localization
+from gsencoder.types.scene import Scene, SceneObject, Views
+
+__all__ = [
+    "SH_C0",
+    "UNIT_TOLERANCE",
+    "Box",
+    "Cameras",
+    "FeatureBasis",
+    "FeatureMap",
+    "FeatureSpace",
+    "GaussianFeatures",
+    "Gaussians",
+    "Localization",
+    "Scene",
+    "SceneObject",
+    "Views",
+    "check_unit",
+    "sh_from_colors",
+]
