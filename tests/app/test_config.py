@@ -219,7 +219,7 @@ def test_brackets_around_a_list_of_text_are_text(conf: Path) -> None:
         ("seed=true", "seed: expected a whole number, got True"),
         ("overwrite=yes", "overwrite: expected true or false, got 'yes'"),
         ("overwrite=1", "overwrite: expected true or false, got 1"),
-        ("lift=centre", "fusion.lift: expected one of center, blend, got 'center'; did you mean center?"),
+        ("lift=centr", "fusion.lift: expected one of center, blend, got 'centr'; did you mean center?"),
         ("window=1", "fusion.window: expected a list of 2 (a number, a number), got [1]"),
         ("ranks=a", "fusion.ranks: expected a list, each a whole number, got ['a']"),
         ("ranks=[1", "fusion.ranks: expected a list, each a whole number, got '[1'"),

@@ -215,7 +215,7 @@ def test_wrong_questions_are_errors_of_one_line(no_jaxtyping: None) -> None:
 
 def test_of_several_feature_sets_one_must_be_named() -> None:
     both = replace(SCENE, features={"a": SCENE.features["toy"], "b": SCENE.features["toy"]})
-    with pytest.raises(InputError, match="features of a, b; say which"):
+    with pytest.raises(InputError, match="features of a, b; name one"):
         localize(both, ["mug"], TABLE)
     with pytest.raises(InputError, match="none of 'c'"):
         localize(both, ["mug"], TABLE, space="c")
