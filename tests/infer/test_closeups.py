@@ -7,7 +7,8 @@ import pytest
 from rooms import corner_cameras, room
 
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.closeups import LEAST_WIDTH, MOST_SHARE, closeups
+from gsencoder.infer.views.closeups import closeups
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.photographs import photograph_cameras, photograph_of, with_photographs
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig
@@ -75,8 +76,8 @@ def test_windows_keep_their_shape_stay_in_the_frame_and_leave_room_around_the_ta
         size = zoom * shape
         assert (begins > -0.01).all()
         assert (begins + size < np.array([WIDTH, HEIGHT]) + 0.01).all()
-        assert (size[:, 0] >= LEAST_WIDTH * 0.999).all()
-        assert (size <= MOST_SHARE * np.array([WIDTH, HEIGHT]) * 1.001).all()
+        assert (size[:, 0] >= CONSTANTS.min_closeup_width * 0.999).all()
+        assert (size <= CONSTANTS.max_closeup_share * np.array([WIDTH, HEIGHT]) * 1.001).all()
         for view in range(len(rows)):
             at = places(found, view, scene.gaussians.means[target.rows].astype(np.float64))
             # Half of the target's size on every side: it takes half of the picture along one axis at most.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rooms import HALF, HEIGHT, STEP, corner_cameras, room, sheet, splat
 
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.infer.views.split_gaussians import SIGMAS
 from gsencoder.types import Gaussians
 
 
@@ -52,7 +52,7 @@ def test_clearance_from_a_wall_is_at_most_the_distance_less_two_standard_deviati
     # Straight in front of one of the Gaussians.
     away = np.array([0.5, 0.2, 0.1])
     at = np.array([[1 - d, *wall.means[600, 1:]] for d in away])
-    exact = away - SIGMAS * float(flat.scales[0, 0])
+    exact = away - CONSTANTS.surface_sigmas * float(flat.scales[0, 0])
     one = FreeSpace(flat.select(np.array([600]))).clearance(at)
     np.testing.assert_allclose(one, exact, atol=1e-6)
     all_of_it = FreeSpace(flat).clearance(at)

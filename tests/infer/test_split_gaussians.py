@@ -6,8 +6,9 @@ import torch
 from rooms import sheet, splat
 
 from gsencoder.geometry import rotmats_from_quats
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.infer.views.split_gaussians import MOST_OF_ONE, SIGMAS, patches
+from gsencoder.infer.views.split_gaussians import patches
 from gsencoder.types import Gaussians
 
 
@@ -46,18 +47,18 @@ def test_every_point_of_a_gaussian_is_near_a_patch_and_no_patch_leaves_it(
     turn = rotmats_from_quats(torch.from_numpy(whole.quats).double())[0].numpy()
     inside = rng.normal(size=(400, 3))
     inside *= rng.uniform(0, 1, (400, 1)) ** (1 / 3) / np.linalg.norm(inside, axis=1, keepdims=True)
-    points = whole.means[0] + (SIGMAS * np.array(scales) * inside) @ turn.T
+    points = whole.means[0] + (CONSTANTS.surface_sigmas * np.array(scales) * inside) @ turn.T
     nearest = np.linalg.norm(points[:, None] - parts.centers, axis=-1).min(axis=1)
     # Half a patch's diagonal, and the rest of those at the rim whose middles lie outside.
     assert nearest.max() < 1.5 * edge * np.sqrt(3)
-    local = (parts.centers - whole.means[0]) @ turn / (SIGMAS * np.array(scales))
+    local = (parts.centers - whole.means[0]) @ turn / (CONSTANTS.surface_sigmas * np.array(scales))
     assert np.linalg.norm(local, axis=1).max() <= 1 + 1e-6
-    assert (2 * SIGMAS * parts.scales).max() <= 2 * edge + 1e-6
+    assert (2 * CONSTANTS.surface_sigmas * parts.scales).max() <= 2 * edge + 1e-6
 
 
 def test_a_sky_is_cut_into_no_more_patches_than_are_allowed() -> None:
     sky = one((1e6, 1e6, 1e6), np.array([1.0, 0, 0, 0]))
-    assert len(patches(sky, 1e-3).rows) <= MOST_OF_ONE
+    assert len(patches(sky, 1e-3).rows) <= CONSTANTS.max_patches_per_gaussian
     many = together(*[sky] * 3000)
     assert len(patches(many, 1e-3).rows) <= 1 << 21
 
@@ -69,7 +70,7 @@ def test_a_wall_of_one_gaussian_stops_rays_and_is_near_all_along() -> None:
     free = FreeSpace(together(clutter, wall))
     at = np.array([[0.1, 0.0, 0.0]])
     assert free.clearance(at)[0] < 0.1
-    assert free.clearance(at)[0] == pytest.approx(0.1 - SIGMAS * 0.01, abs=0.03)
+    assert free.clearance(at)[0] == pytest.approx(0.1 - CONSTANTS.surface_sigmas * 0.01, abs=0.03)
     met = free.first_hit(at, np.array([[-1.0, 0, 0]]), np.array([2.0]))[0]
     assert met == pytest.approx(0.1, abs=2 * free.cell)
     passed = free.first_hit(np.array([[0.1, 5.0, 0.0]]), np.array([[-1.0, 0, 0]]), np.array([2.0]))[0]

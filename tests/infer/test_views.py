@@ -10,6 +10,7 @@ from rooms import CUBE, HALF, HEIGHT, UP, corner_cameras, cube, room, sheet, spl
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.frames import frames_on
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.pictures import view_pictures, view_sheet
@@ -17,7 +18,7 @@ from gsencoder.infer.views.scores import coverage, look
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.infer.views.shells import shell_cameras, up_of
 from gsencoder.infer.views.targets import Target, target_of, targets_of
-from gsencoder.infer.views.utility import BLURRED, LEAST_GAIN, NOTHING, Values, worth
+from gsencoder.infer.views.utility import Values, worth
 from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
 
 pytestmark = pytest.mark.slow
@@ -190,14 +191,14 @@ def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
     assert value(share=0.6) == pytest.approx(1)
     assert value(share=0.8) < 0.6
     assert value(share=1.0) == 0
-    assert value(blur=BLURRED) == pytest.approx(value() / 2)
+    assert value(blur=CONSTANTS.half_blur) == pytest.approx(value() / 2)
     # In proportion to what is not hidden, half of it for means outside the picture, and by the opacity's square.
     assert value(visible=0.3) == pytest.approx(0.3 * value())
     assert value(inside=0.0) == pytest.approx(0.5 * value())
     assert value(inside=0.5) == pytest.approx(0.75 * value())
     assert value(alpha=0.45) == pytest.approx(value() / 4)
     assert value(alpha=0.9) == value()
-    assert value(blur=2 * BLURRED) == pytest.approx(value() / 5)
+    assert value(blur=2 * CONSTANTS.half_blur) == pytest.approx(value() / 5)
 
 
 def test_a_target_fills_enough_from_the_least_share_on_and_too_much_beyond_the_most() -> None:
@@ -260,7 +261,7 @@ def test_a_view_adds_something_from_a_small_share_of_the_first_one_on_or_of_the_
     assert scene.gaussians is not None
     cameras = corner_cameras(4, 32, 24)
     (seen,) = look(scene.gaussians, cameras, [target])
-    least = max(NOTHING * best, LEAST_GAIN)
+    least = max(CONSTANTS.min_relative_gain * best, CONSTANTS.min_gain)
     config = ViewsConfig(count=4, candidates=4, cover_weight=0.0, context_weight=0.0, spread_weight=0.0)
     full = {"share": config.most_share / 2, "inside": 1.0, "alpha": 1.0, "blur": 0.0}
     arrays = {name: np.full(4, value) for name, value in full.items()}

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer.ask.prompts import Task, messages, number_in, prompt_text
-from gsencoder.infer.ask.question_words import words_in
+from gsencoder.infer.ask.question_words import ENGLISH, WordRules, words_in
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
@@ -105,6 +105,7 @@ class Asker:
         localization: LocalizeConfig = LocalizeConfig(),
         views: ViewsConfig = ViewsConfig(),
         vlm: VlmConfig = VlmConfig(),
+        word_rules: WordRules = ENGLISH,
     ) -> None:
         """Args:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
@@ -114,9 +115,11 @@ class Asker:
         localization: how words become boxes.
         views: how views are chosen.
         vlm: how requests are made; pictures are made smaller than its `image_side`.
+        word_rules: which words of a question make a name a verb or a color.
         """
         self.scene, self.table, self.space = scene, table, space
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
+        self.word_rules = word_rules
         self._kept: dict[Hashable, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
         self._drawn: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
 
@@ -133,7 +136,7 @@ class Asker:
         """
         words = question.query
         if not words and not question.aabb and self.table is not None:
-            words = words_in(question.text, self.table)
+            words = words_in(question.text, self.table, self.word_rules)
         key = (words, question.aabb, question.task == "caption")
         if key not in self._kept:
             self._kept[key] = self._look(words, question)

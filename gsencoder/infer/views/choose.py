@@ -16,21 +16,17 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.even_indices import evenly
 from gsencoder.data.orbits import orbit_cameras
 from gsencoder.infer.views.closeups import closeups
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.frames import frames_on
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.photographs import photograph_cameras
-from gsencoder.infer.views.scores import JUDGED, Looks, as_photographs, look
+from gsencoder.infer.views.scores import Looks, as_photographs, look
 from gsencoder.infer.views.selection import Chosen, Sight, ViewsConfig, ViewSet
 from gsencoder.infer.views.shells import shell_cameras, up_of
 from gsencoder.infer.views.targets import Target, check_targets
 from gsencoder.infer.views.utility import Values
 from gsencoder.render import BlendConfig
 from gsencoder.types import Cameras, Gaussians, Scene
-
-WATCHERS = 12
-"""So many of the scene's cameras tell what is empty around the targets, one for each target at least."""
-HARDLY = 0.1
-"""A target is hardly seen if less than this of it is in any picture and not hidden."""
 
 
 def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = ViewsConfig()) -> ViewSet:
@@ -54,7 +50,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
     if targets or config.method == "greedy":
         check_targets(targets, gaussians)
     free = FreeSpace(gaussians)
-    judged = replace(JUDGED, near=min(JUDGED.near, free.cell / 2))
+    judged = replace(CONSTANTS.score_blend, near=min(CONSTANTS.score_blend.near, free.cell / 2))
     if config.method == "uniform":
         found = _uniform(scene, gaussians, config)
     else:
@@ -115,7 +111,7 @@ def _tell(
         )
     for target, each in zip(targets, looks, strict=True):
         seen = (each.visible * each.inside)[order].max(initial=0)
-        if seen < HARDLY:
+        if seen < CONSTANTS.min_visible:
             warnings.warn(f"views: no view shows more than {seen:.0%} of {target.name}", SceneWarning, stacklevel=3)
 
 
@@ -175,7 +171,7 @@ def _candidates(
         frames += taken.tolist()
     if config.source != "frames":
         if own is not None:
-            watchers = frames_on(own, gaussians, targets, max(WATCHERS, len(targets)), spaces)
+            watchers = frames_on(own, gaussians, targets, max(CONSTANTS.free_space_cameras, len(targets)), spaces)
             free = free.seen_by(own.select(watchers), judged)
         for target, room in zip(targets, _shared_out(config.candidates - len(frames), len(targets)), strict=True):
             around = shell_cameras(

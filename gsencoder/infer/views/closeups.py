@@ -8,18 +8,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.even_indices import evenly
-from gsencoder.infer.views.scores import AROUND
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians
-
-SAMPLE = 1000
-"""Gaussians of a target that tell where it is in a frame."""
-LEAST_INSIDE = 0.5
-"""This share of them is in the frame at least."""
-LEAST_WIDTH = 160
-"""Windows are at least so wide, pixels of the photograph: smaller ones would be enlarged to a blur."""
-MOST_SHARE = 0.75
-"""Windows of more than this share of a frame's width or height are left out: the frame itself shows as much."""
 
 
 def closeups(
@@ -37,19 +28,19 @@ def closeups(
     Returns:
         n cameras at places of frames, and which frames these are, ascending.
     """
-    points = gaussians.means[target.rows[evenly(len(target.rows), SAMPLE)]].astype(np.float64)
+    points = gaussians.means[target.rows[evenly(len(target.rows), CONSTANTS.closeup_sample)]].astype(np.float64)
     rows: list[int] = []
     Ks: list[Float64[np.ndarray, "3 3"]] = []
     for view in range(len(frames)):
         pixels, depths = frames.project(points, view)
         shown = frames.in_image(pixels, depths, view)
-        if shown.mean() < LEAST_INSIDE:
+        if shown.mean() < CONSTANTS.min_closeup_inside:
             continue
         low, high = pixels[shown].min(axis=0), pixels[shown].max(axis=0)
-        wide, tall = (high - low) * (1 + 2 * AROUND)
-        window = np.array([1, height / width]) * max(wide, tall * width / height, LEAST_WIDTH)
+        wide, tall = (high - low) * (1 + 2 * CONSTANTS.frame_margin)
+        window = np.array([1, height / width]) * max(wide, tall * width / height, CONSTANTS.min_closeup_width)
         size = np.array([frames.widths[view], frames.heights[view]], np.float64)
-        if (window > MOST_SHARE * size).any():
+        if (window > CONSTANTS.max_closeup_share * size).any():
             continue
         corner = np.clip((low + high) / 2 - window / 2, 0, size - window)
         K = frames.Ks[view].astype(np.float64)

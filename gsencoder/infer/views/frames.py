@@ -6,20 +6,10 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.even_indices import evenly
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians
-
-RAYS = 12
-"""Rays by which a frame is judged before any render."""
-AT_ONCE = 32
-"""Frames that are judged by rays together."""
-STOPPED = 0.02
-"""What a frame counts in which all rays are stopped: rays may err."""
-FURTHER, LEAST_SHOWN = 4, 0.25
-"""Half of the frames are spread over so many times as many, of those that show this share of what the best shows."""
-SMALLEST_DEPTH = 1e-9
-"""A target around the camera is taken to lie at this depth, world units."""
 
 
 def frames_on(
@@ -50,26 +40,28 @@ def _ranked(
     count = min(count, len(cameras))
     half = (count + 1) // 2
     filled = _filled(cameras, target)
-    rows = target.rows[evenly(len(target.rows), RAYS)]
+    rows = target.rows[evenly(len(target.rows), CONSTANTS.frame_rays)]
     points = gaussians.means[rows].astype(np.float64)
     shown = np.full(len(cameras), -1.0)
 
+    blocked = CONSTANTS.blocked_frame_weight
+
     def judge(views: Int64[np.ndarray, " n"]) -> None:
-        for start in range(0, len(views), AT_ONCE):
-            block = views[start : start + AT_ONCE]
-            shown[block] = filled[block] * (STOPPED + (1 - STOPPED) * _open(cameras, block, points, free))
+        for start in range(0, len(views), CONSTANTS.frame_batch):
+            block = views[start : start + CONSTANTS.frame_batch]
+            shown[block] = filled[block] * (blocked + (1 - blocked) * _open(cameras, block, points, free))
 
     order = np.argsort(-filled, kind="stable")
-    for start in range(0, len(order), AT_ONCE):
-        block = order[start : start + AT_ONCE]
+    for start in range(0, len(order), CONSTANTS.frame_batch):
+        block = order[start : start + CONSTANTS.frame_batch]
         # No frame shows more than it would if nothing stood between: the rest is not better than what there is.
         if start >= half and filled[block[0]] <= np.sort(shown)[-half]:
             break
         judge(block)
     best = np.argsort(-shown, kind="stable")
-    enough = LEAST_SHOWN * shown[best[0]]
+    enough = CONSTANTS.min_spread_share * shown[best[0]]
     others = np.setdiff1d(np.flatnonzero(filled >= enough), best[:half])
-    others = others[evenly(len(others), FURTHER * count)]
+    others = others[evenly(len(others), CONSTANTS.spread_frames * count)]
     judge(others[shown[others] < 0])
     others = others[shown[others] >= enough]
     taken = np.concatenate([best[:half], others[evenly(len(others), count - half)]])
@@ -80,8 +72,8 @@ def _ranked(
 
 def _filled(cameras: Cameras, target: Target) -> Float64[np.ndarray, " V"]:
     """The share of each picture that a target's ball fills."""
-    pixels, depths = (part[:, 0] for part in cameras.project(target.center[None], min_depth=SMALLEST_DEPTH))
-    radius = target.radius * cameras.Ks[:, 0, 0] / np.maximum(depths, SMALLEST_DEPTH)
+    pixels, depths = (part[:, 0] for part in cameras.project(target.center[None], min_depth=CONSTANTS.min_frame_depth))
+    radius = target.radius * cameras.Ks[:, 0, 0] / np.maximum(depths, CONSTANTS.min_frame_depth)
     radius = np.minimum(radius, cameras.widths + cameras.heights)
     filled = np.ones(len(cameras))
     for place, size in zip(pixels.T, (cameras.widths, cameras.heights), strict=True):

@@ -10,23 +10,10 @@ from gsencoder.core.even_indices import evenly
 from gsencoder.core.runtime.threads import parallel
 from gsencoder.data.seeding.spacing import NEIGHBOR
 from gsencoder.geometry import covariances
-from gsencoder.infer.views.split_gaussians import SIGMAS, patches
+from gsencoder.infer.views.constants import CONSTANTS
+from gsencoder.infer.views.split_gaussians import patches
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians
-
-OPAQUE = 0.3
-"""Gaussians of less opacity are no obstacle."""
-WATCHED_SIDE = 96
-"""Longer side of the depth maps that tell what is empty, pixels."""
-NEAREST = 8
-"""So many patches are asked how far away their surface is."""
-CELL = 2.0
-"""Edge of the cells in which rays are followed, in spacings of the splat: surfaces have no holes in such cells."""
-SPACING_SAMPLE = 5000
-"""Gaussians that tell the spacing."""
-CELLS = 1 << 20
-MOST_STEPS = 512
-"""Rays are followed for so many cells."""
 
 
 class FreeSpace:
@@ -43,19 +30,19 @@ class FreeSpace:
         """
         from scipy.spatial import cKDTree
 
-        solid = np.flatnonzero(gaussians.opacities >= OPAQUE)
+        solid = np.flatnonzero(gaussians.opacities >= CONSTANTS.min_obstacle_opacity)
         if not len(solid):
             solid = np.arange(len(gaussians))
         self._gaussians, self._quats = gaussians, gaussians.quats[solid]
         means = gaussians.means[solid].astype(np.float64)
-        asked = means[evenly(len(means), SPACING_SAMPLE)]
+        asked = means[evenly(len(means), CONSTANTS.spacing_sample)]
         distances = cKDTree(means).query(asked, k=[min(NEIGHBOR + 1, len(means))])[0]
         # Of a single Gaussian, and of many in one place, the size is known.
-        self.cell = CELL * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))
+        self.cell = CONSTANTS.cell_spacings * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))
         self._patches = patches(gaussians.select(solid), self.cell)
         self._tree = cKDTree(self._patches.centers)
         # Floaters may be any distance away: what is beyond the middle's million cells on a side is met by no ray.
-        self._low = np.floor(np.median(means, axis=0) / self.cell) - CELLS // 2
+        self._low = np.floor(np.median(means, axis=0) / self.cell) - CONSTANTS.grid_cells // 2
         self._met, self._cell_of = solid[self._patches.rows], self._codes(self._patches.centers)
         self._occupied = np.unique(self._cell_of[self._cell_of >= 0])
         self.watchers: Cameras | None = None
@@ -71,12 +58,12 @@ class FreeSpace:
         if not len(cameras):
             return self
         other = copy(self)
-        small = other.watchers = cameras.resized(WATCHED_SIDE)
+        small = other.watchers = cameras.resized(CONSTANTS.free_space_side)
 
         def depth_map(view: int) -> Float32[np.ndarray, "h w"]:
             b = blend(self._gaussians, small, view, config=config)
             # Rays that end nowhere have looked through nothing that is known.
-            return torch.where(b.alpha >= 0.5, b.depth, 0.0).reshape(b.shape).float().numpy()
+            return torch.where(b.alpha >= CONSTANTS.min_depth_alpha, b.depth, 0.0).reshape(b.shape).float().numpy()
 
         other._depths = parallel(depth_map, range(len(small)))
         return other
@@ -84,9 +71,9 @@ class FreeSpace:
     def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
         """The cell of each point as a number; −1 far outside the splat."""
         cells = np.floor(points / self.cell) - self._low
-        inside = ((cells >= 0) & (cells < CELLS)).all(axis=1)
+        inside = ((cells >= 0) & (cells < CONSTANTS.grid_cells)).all(axis=1)
         x, y, z = np.where(inside[:, None], cells, 0).astype(np.int64).T
-        return np.where(inside, (x * CELLS + y) * CELLS + z, -1)
+        return np.where(inside, (x * CONSTANTS.grid_cells + y) * CONSTANTS.grid_cells + z, -1)
 
     def without(self, rows: Integer[np.ndarray, " n"]) -> "FreeSpace":
         """The same space, in which rays go through these Gaussians."""
@@ -114,9 +101,9 @@ class FreeSpace:
         Args:
             starts: of the rays.
             directions: unit vectors.
-            lengths: rays are followed so far, world units, or for `MOST_STEPS` cells.
+            lengths: rays are followed so far, world units, or for `ViewConstants.max_ray_cells` cells.
         """
-        steps = int(np.clip(np.ceil(2 * lengths.max(initial=0) / self.cell), 1, 2 * MOST_STEPS))
+        steps = int(np.clip(np.ceil(2 * lengths.max(initial=0) / self.cell), 1, 2 * CONSTANTS.max_ray_cells))
         along = self.cell / 2 * np.arange(steps + 1)
         points = starts[:, None] + along[:, None] * directions[:, None]
         hit = self.occupied(points.reshape(-1, 3)).reshape(len(starts), -1) & (along <= lengths[:, None])
@@ -129,13 +116,14 @@ class FreeSpace:
         the line from the center to the point, is no farther away than the surface; of the nearest patches.
         """
         parts = self._patches
-        count = min(NEAREST, len(parts.rows))
+        count = min(CONSTANTS.clearance_neighbors, len(parts.rows))
         distances, near = self._tree.query(points, k=[*range(1, count + 1)])
         offsets = points[:, None] - parts.centers[near]
         directions = offsets / np.maximum(distances, 1e-12)[..., None]
         quats, scales = self._quats[parts.rows[near]], parts.scales[near]
         spread = covariances(torch.from_numpy(quats).double(), torch.from_numpy(scales).double())
-        reach = SIGMAS * np.sqrt(np.einsum("nki,nkij,nkj->nk", directions, spread.numpy(), directions))
+        variances = np.einsum("nki,nkij,nkj->nk", directions, spread.numpy(), directions)
+        reach = CONSTANTS.surface_sigmas * np.sqrt(variances)
         return np.asarray((distances - reach).min(axis=1))
 
     def seen_empty(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

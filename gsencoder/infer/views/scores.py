@@ -10,20 +10,10 @@ from jaxtyping import Bool, Float32, Float64
 
 from gsencoder.core.even_indices import evenly
 from gsencoder.core.runtime.threads import parallel
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.targets import Target
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians
-
-JUDGED = BlendConfig(stop_transmittance=0.02, min_weight=1e-3)
-"""Rays of the small renders end where a fiftieth of them is left."""
-SURROUNDINGS = 2.0
-"""A target's context is in the ball so many times as large as its own."""
-SAMPLE = 2000
-"""Gaussians of a target, and of its context, on which coverage is counted."""
-FAINT = 0.05
-"""A pixel shows a target from so much weight on."""
-AROUND = 0.5
-"""The frame around a target is this share of its size on every side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,7 +47,7 @@ def look(
     targets: Sequence[Target],
     *,
     side: int = 160,
-    config: BlendConfig = JUDGED,
+    config: BlendConfig = CONSTANTS.score_blend,
 ) -> tuple[Looks, ...]:
     """Judges cameras by small renders, one for each, in which every Gaussian hides what is behind it.
 
@@ -117,9 +107,9 @@ class _Watched:
         member = np.zeros(len(gaussians), np.float32)
         member[target.rows] = 1
         self._member = torch.from_numpy(member)
-        near = np.linalg.norm(gaussians.means - target.center, axis=1) <= SURROUNDINGS * target.radius
+        near = np.linalg.norm(gaussians.means - target.center, axis=1) <= CONSTANTS.context_radii * target.radius
         around = np.flatnonzero(near & (member == 0))
-        self._samples = tuple(rows[evenly(len(rows), SAMPLE)] for rows in (target.rows, around))
+        self._samples = tuple(rows[evenly(len(rows), CONSTANTS.coverage_sample)] for rows in (target.rows, around))
         # The size of a flat Gaussian is that of its disc.
         self._sizes = np.sqrt(np.sort(self._alone.scales, axis=1)[:, 1:].prod(axis=1, dtype=np.float64))
 
@@ -130,7 +120,7 @@ class _Watched:
         alone = blend(self._alone, small, view, config=config).alpha
         shown = b.render(self._member)
         # What is half transparent at a target's rim belongs to what is behind it, too.
-        solid = alone >= 0.5 * float(alone.max())
+        solid = alone >= CONSTANTS.solid_share * float(alone.max())
         whole = float(alone[solid].sum())
         mine = weights[self._rows]
         depths = b.depths.numpy()[self._rows].astype(np.float64)
@@ -138,7 +128,7 @@ class _Watched:
         target, context = (weights[rows].astype(np.float32) for rows in self._samples)
         inside = small.in_image(*small.project(self._alone.means.astype(np.float64), view), view)
         return _Seen(
-            visible=min(float(shown[solid].sum()) / whole, 1.0) if whole > FAINT else 0.0,
+            visible=min(float(shown[solid].sum()) / whole, 1.0) if whole > CONSTANTS.min_weight else 0.0,
             share=float(shown.mean()),
             inside=float(inside.mean()),
             alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
@@ -152,10 +142,10 @@ def _around(alone: torch.Tensor, alpha: torch.Tensor) -> float:
     """Mean alpha in the rectangle around what shows the target, with a frame; 0 where nothing shows it."""
     spans = []
     for axis in (1, 0):
-        places = np.flatnonzero((alone > FAINT).any(dim=axis).numpy())
+        places = np.flatnonzero((alone > CONSTANTS.min_weight).any(dim=axis).numpy())
         if not len(places):
             return 0.0
-        margin = int(np.ceil(AROUND * (places[-1] - places[0] + 1)))
+        margin = int(np.ceil(CONSTANTS.frame_margin * (places[-1] - places[0] + 1)))
         spans.append(slice(max(int(places[0]) - margin, 0), int(places[-1]) + 1 + margin))
     return float(alpha[spans[0], spans[1]].mean())
 

@@ -7,31 +7,11 @@ from jaxtyping import Float64
 
 from gsencoder.core.even_indices import evenly
 from gsencoder.data.orbits import looking_cameras, spiral_directions
-from gsencoder.infer.views.free_space import MOST_STEPS, FreeSpace
+from gsencoder.infer.views.constants import CONSTANTS
+from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians, Scene
 from gsencoder.types.poses import look_rotation
-
-TRIED = 8
-"""So many times as many directions are tried as cameras are wanted …"""
-LEAST_TRIED = 64
-"""… but at least so many."""
-SHARES = (0.30, 0.18, 0.10)
-"""Shares of the picture that targets are to fill, direction by direction …"""
-ROOM = 1.5
-"""… but so many times the least share, and less than the largest by as much: outlines are counted in cells."""
-LARGEST_SHARE, THIN_SHARE = 0.5, 0.08
-"""A camera comes no nearer than the first; what is long and thin may leave the picture to fill the second."""
-FILLED = 0.9
-"""What fits into the picture keeps within so much of it."""
-CLEARANCE = 0.2
-"""Cameras keep off surfaces by this share of their distance to the target, or of its radius where that is less."""
-OUTLINE = 16
-"""Cells along a target's radius in which its outline is counted."""
-BESIDE = 1.5
-"""Rays that tell what is behind a target pass so many radii beside its center."""
-SAMPLE = 1000
-"""Gaussians of a target that tell its outline."""
 
 
 def shell_cameras(
@@ -68,15 +48,16 @@ def shell_cameras(
         Cameras relative to the scene's origin; none where there is no room.
     """
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
-    outward, vertical = spiral_directions(max(TRIED * count, LEAST_TRIED), up)
+    outward, vertical = spiral_directions(max(CONSTANTS.tried_directions * count, CONSTANTS.min_tried_directions), up)
     wanted, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height, between)
     # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
     begins = reach + 2 * free.cell
     starts = target.center + begins[:, None] * outward
-    open_until = begins + free.first_hit(starts, outward, np.maximum(wanted * (1 + CLEARANCE) - begins, 0))
-    distance = np.minimum(wanted, open_until / (1 + CLEARANCE))
+    clearance = CONSTANTS.clearance_share
+    open_until = begins + free.first_hit(starts, outward, np.maximum(wanted * (1 + clearance) - begins, 0))
+    distance = np.minimum(wanted, open_until / (1 + clearance))
     centers = target.center + distance[:, None] * outward
-    good = (distance >= least) & (free.clearance(centers) >= CLEARANCE * np.minimum(distance, target.radius))
+    good = (distance >= least) & (free.clearance(centers) >= clearance * np.minimum(distance, target.radius))
     if free.watchers is not None:
         good &= free.seen_empty(centers)
     tried = np.flatnonzero(good)
@@ -98,13 +79,14 @@ def _backed(
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right, down, _ = np.moveaxis(look_rotation(forward, vertical), 1, 0)
     hits = np.zeros(len(centers))
-    length = np.full(len(centers), MOST_STEPS * free.cell)
+    length = np.full(len(centers), CONSTANTS.max_ray_cells * free.cell)
+    beside = CONSTANTS.background_radii * target.radius
     for across in (-1.0, 0.0, 1.0):
         for along in (-1.0, 0.0, 1.0):
-            through = target.center + BESIDE * target.radius * (across * right + along * down)
+            through = target.center + beside * (across * right + along * down)
             ray = through - centers
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            hits += np.isfinite(free.first_hit(through - BESIDE * target.radius * ray, ray, length))
+            hits += np.isfinite(free.first_hit(through - beside * ray, ray, length))
     return hits / 9
 
 
@@ -119,11 +101,12 @@ def _distances(
     between: tuple[float, float],
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Along each direction how far a camera should be, how far at least, and how far the target itself reaches."""
-    rows = target.rows[evenly(len(target.rows), SAMPLE)]
+    rows = target.rows[evenly(len(target.rows), CONSTANTS.outline_sample)]
     offsets = gaussians.means[rows].astype(np.float64) - target.center
     # A Gaussian fills a cell of its own size.
-    shares = np.clip(SHARES, between[0] * ROOM, between[1] / ROOM)
-    cell = max(target.radius / OUTLINE, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
+    margin = CONSTANTS.fill_margin
+    shares = np.clip(CONSTANTS.fill_shares, between[0] * margin, between[1] / margin)
+    cell = max(target.radius / CONSTANTS.outline_cells, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
     wanted, least, reach = (np.empty(len(outward)) for _ in range(3))
     for index, (right, down, direction) in enumerate(look_rotation(outward, vertical)):
         plane = np.stack((offsets @ right, offsets @ down), axis=1)
@@ -132,10 +115,10 @@ def _distances(
         # Distance at which an area fills a share of the picture: area · focal² / distance² = share · pixels.
         fills = [
             focal * math.sqrt(area / (share * width * height))
-            for share in (shares[index % len(shares)], LARGEST_SHARE, THIN_SHARE)
+            for share in (shares[index % len(shares)], CONSTANTS.max_fill_share, CONSTANTS.thin_fill_share)
         ]
         wide, high = np.abs(plane).max(axis=0)
-        framed = 2 * focal / FILLED * max(wide / width, high / height)
+        framed = 2 * focal / CONSTANTS.framed_share * max(wide / width, high / height)
         wanted[index] = reach[index] + max(fills[0], min(framed, fills[2]))
         least[index] = reach[index] + fills[1]
     return wanted, least, reach

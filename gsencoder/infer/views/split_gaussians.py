@@ -8,16 +8,8 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 
 from gsencoder.geometry import rotmats_from_quats
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.types import Gaussians
-
-SIGMAS = 2.0
-"""A surface ends so many standard deviations from a Gaussian's center."""
-WHOLE = 2.0
-"""What is no longer than so many edges stays whole."""
-MOST_OF_ONE = 4096
-"""A Gaussian is cut into so many patches at most; a larger one into larger patches."""
-MOST = 1 << 21
-"""So many patches stand for a splat at most, as far as one for each Gaussian allows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,15 +28,16 @@ class Patches:
 
 
 def patches(gaussians: Gaussians, edge: float) -> Patches:
-    """A splat as patches. Where a Gaussian, up to `SIGMAS` standard deviations, is longer than `WHOLE` edges, it is cut
-    along that axis into equal parts of an edge at most; those are kept whose middles lie in its ellipsoid.
+    """A splat as patches. Where a Gaussian, up to its surface, is longer than `ViewConstants.max_uncut_edges` edges, it
+    is cut along that axis into equal parts of an edge at most; those are kept whose middles lie in its ellipsoid.
 
     Args:
         gaussians: whole ones that are small enough stay as they are.
         edge: world units, > 0.
     """
-    parts, most = _parts(gaussians, edge, MOST_OF_ONE), MOST_OF_ONE
-    while parts.prod(axis=1).sum() > max(MOST, len(gaussians)) and most > 1:
+    most = CONSTANTS.max_patches_per_gaussian
+    parts = _parts(gaussians, edge, most)
+    while parts.prod(axis=1).sum() > max(CONSTANTS.max_patches, len(gaussians)) and most > 1:
         most //= 2
         parts = _parts(gaussians, edge, most)
     large = np.flatnonzero(parts.prod(axis=1) > 1)
@@ -58,7 +51,7 @@ def patches(gaussians: Gaussians, edge: float) -> Patches:
         offsets = _middles(kind)
         means = gaussians.means[chosen].astype(np.float64)
         if len(offsets) > 1:
-            reach = SIGMAS * gaussians.scales[chosen].astype(np.float64)
+            reach = CONSTANTS.surface_sigmas * gaussians.scales[chosen].astype(np.float64)
             places = np.einsum("nij,nkj->nki", turns[turn_of[chosen]], offsets[None] * reach[:, None])
             means = (means[:, None] + places).reshape(-1, 3)
         centers.append(means)
@@ -69,8 +62,8 @@ def patches(gaussians: Gaussians, edge: float) -> Patches:
 
 def _parts(gaussians: Gaussians, edge: float, most: int) -> Int64[np.ndarray, "N 3"]:
     """Into how many parts each axis is cut."""
-    length = 2 * SIGMAS * gaussians.scales.astype(np.float64) / edge
-    wanted = np.where(length > WHOLE, np.ceil(length), 1)
+    length = 2 * CONSTANTS.surface_sigmas * gaussians.scales.astype(np.float64) / edge
+    wanted = np.where(length > CONSTANTS.max_uncut_edges, np.ceil(length), 1)
     axes = np.maximum((wanted > 1).sum(axis=1), 1)
     shrink = np.minimum((most / wanted.prod(axis=1)) ** (1 / axes), 1)
     return np.maximum(wanted * shrink[:, None], 1).astype(np.int64)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Integer
 
 from gsencoder.core.errors import InputError
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.types import Box, Gaussians, Localization
 
 
@@ -38,7 +39,7 @@ def target_of(name: str, gaussians: Gaussians, rows: Integer[np.ndarray, " n"]) 
     means = gaussians.means[rows].astype(np.float64)
     center = (means.min(axis=0) + means.max(axis=0)) / 2
     # A single Gaussian is as large as it is drawn.
-    least = 2 * float(np.median(gaussians.scales[rows].max(axis=1)))
+    least = CONSTANTS.point_radius_scales * float(np.median(gaussians.scales[rows].max(axis=1)))
     radius = max(float(np.linalg.norm(means - center, axis=1).max()), least)
     return Target(name=name, rows=np.asarray(rows), center=center, radius=radius)
 

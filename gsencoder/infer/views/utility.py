@@ -10,20 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.scores import Looks, coverage, directions
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras
-
-BLURRED = 0.04
-"""Gaussians of this standard deviation, as a share of the picture's longer side, halve what a view is worth."""
-LEAST_BEST = 0.1
-"""Views count as good in comparison with the best of them, if that is worth so much."""
-NOTHING = 0.004
-"""A view adds nothing if it adds less than this share of what the first one shows; small things are worth little in all
-of them …"""
-LEAST_GAIN = 1e-4
-"""… nor does one that adds less than a view that is worth so much by itself: not a pixel of the target."""
 
 
 def worth(looks: Looks, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
@@ -31,14 +22,15 @@ def worth(looks: Looks, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
 
     Half comes from filling at least `least_share` of the picture, in proportion below it, half from filling up to half
     of `most_share`; a target that fills more than `most_share` counts less. All of it is scaled by how much of the
-    target is in the picture and not hidden, by the opacity around it, and by its sharpness: Gaussians of `BLURRED`
-    halve it.
+    target is in the picture and not hidden, by the opacity around it, and by its sharpness: Gaussians of
+    `ViewConstants.half_blur` halve it.
     """
     share = looks.share
     size = np.minimum(share / config.least_share, 1) * (0.5 + 0.5 * np.minimum(share / (config.most_share / 2), 1))
     size *= np.clip((1 - share) / (1 - config.most_share), 0, 1)
-    sharp = 1 / (1 + (looks.blur / BLURRED) ** 2)
-    return np.asarray(size * sharp * looks.visible * (0.5 + 0.5 * looks.inside) * np.clip(looks.alpha / 0.9, 0, 1) ** 2)
+    alpha = np.clip(looks.alpha / CONSTANTS.full_alpha, 0, 1)
+    sharp = 1 / (1 + (looks.blur / CONSTANTS.half_blur) ** 2)
+    return np.asarray(size * sharp * looks.visible * (0.5 + 0.5 * looks.inside) * alpha**2)
 
 
 class Values:
@@ -53,7 +45,7 @@ class Values:
         self._kept = []
         for target, each, value in zip(targets, looks, self.worths, strict=True):
             # How well a view sees something counts as far as it is a good view.
-            good = (value / max(float(value.max(initial=0)), LEAST_BEST))[:, None]
+            good = (value / max(float(value.max(initial=0)), CONSTANTS.min_best_utility))[:, None]
             away = directions(cameras, target)
             towards = np.clip(away @ away.T, 0, 1)
             self._kept.append((coverage(each.target) * good, coverage(each.context) * good, towards * good))
@@ -90,7 +82,7 @@ class Values:
                         gain += weight / len(self._kept) * np.maximum(part - level, 0).mean(axis=1)
             gain[order] = -np.inf
             view = int(gain.argmax())
-            if order and gain[view] <= max(NOTHING * gains[0], LEAST_GAIN / self._count):
+            if order and gain[view] <= max(CONSTANTS.min_relative_gain * gains[0], CONSTANTS.min_gain / self._count):
                 break
             order.append(view)
             gains.append(float(gain[view]))

@@ -27,7 +27,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
 from gsencoder.infer.ask import ask as ask_module
 from gsencoder.infer.ask.ask import KEPT_PICTURES, Asker, Question
-from gsencoder.infer.ask.question_words import words_in
+from gsencoder.infer.ask.question_words import WordRules, words_in
 from gsencoder.infer.ask.questions import read_answers, read_questions
 from gsencoder.infer.views.pictures import view_pictures
 from gsencoder.infer.views.selection import ViewsConfig
@@ -190,6 +190,13 @@ def test_words_that_only_look_like_names_are_not_looked_for() -> None:
         ("\u0915\u0941\u0930\u094d\u0938\u0940 ?", ("\u0915\u0941\u0930\u094d\u0938\u0940",)),
     ):
         assert words_in(text, table) == words, text
+
+
+def test_questions_in_another_language_have_its_words() -> None:
+    table = make_text_table(["Stuhl", "Flieder"], np.eye(2, dtype=np.float32), "t")
+    german = WordRules(pronouns=frozenset({"ich", "du"}), auxiliaries=frozenset(), colors=frozenset({"flieder"}))
+    assert words_in("Wo steht der Flieder Stuhl?", table) == ("Flieder", "Stuhl")
+    assert words_in("Wo steht der Flieder Stuhl?", table, german) == ("Stuhl",)
 
 
 @pytest.mark.parametrize(
