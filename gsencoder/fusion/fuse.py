@@ -7,8 +7,9 @@ of views or with the teacher's width.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import evenly
-from gsencoder.core.runtime.clock import Clock
+from gsencoder.core.runtime.clock import Clock, timed
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
@@ -107,39 +108,31 @@ def fuse(
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))
     rows = tuple(int(view) for view in evenly(len(views), config.views or len(views)))
     checkpoint = _checkpoint(work, gaussians, views, teacher, config, rows, basis)
-    clock = Clock()
-    maps = _timed_maps(teacher if checkpoint is None else checkpoint.cached(teacher), views, clock)
+    maps = timed("teacher")(partial((teacher if checkpoint is None else checkpoint.cached(teacher)).feature_map, views))
 
-    if basis is not None:
-        subspace = Subspace.of_basis(basis)
-    else:
-        subspace = find_subspace(teacher, maps, rows, config, clock, track, one_pass=checkpoint is None)
-    columns = subspace.basis.rank if subspace.basis is not None else teacher.space.channels
-    sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table)
-    if checkpoint is not None:
-        sums.restore(checkpoint)
-    # Where the mean alone is unknown, it is computed along the way; never in a run that may start in the middle.
-    moments = Moments(teacher.space.channels, second=False) if subspace.mean is None else None
-
-    for view in track(rows[sums.views :], "lifting views"):
-        feature_map = maps(view)
-        matrix = view_matrix(
-            gaussians,
-            views,
-            view,
-            feature_map,
-            clock,
-            lift=config.lift,
-            visibility=config.visibility,
-            config=config.blend,
-        )
-        with clock("lift"):
+    with Clock().running() as clock:
+        if basis is not None:
+            subspace = Subspace.of_basis(basis)
+        else:
+            subspace = find_subspace(teacher, maps, rows, config, track, one_pass=checkpoint is None)
+        # Where the mean alone is unknown, it is computed along the way; never in a run that may start in the middle.
+        moments = Moments(teacher.space.channels, second=False) if subspace.mean is None else None
+        columns = subspace.basis.rank if subspace.basis is not None else teacher.space.channels
+        sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table)
+        for view in remaining_views(rows, sums, checkpoint, track):
+            feature_map = maps(view)
+            matrix = view_matrix(
+                gaussians,
+                views,
+                view,
+                feature_map,
+                lift=config.lift,
+                visibility=config.visibility,
+                config=config.blend,
+            )
             sums.add(matrix, feature_map, views.masks[view] if views.masks is not None else None)
-        if moments is not None:
-            _add_cells(moments, feature_map, clock)
-        if checkpoint is not None and checkpoint.due():
-            checkpoint.save_sums(sums.views, sums.sums, sums.weights)
-    with clock("lift"):
+            if moments is not None:
+                _add_cells(moments, feature_map)
         features, weights = sums.finish()
     if not (weights > 0).any():
         raise InputError(f"fuse: none of {len(rows)} views of {scene.name} sees any Gaussian; check poses and units")
@@ -196,12 +189,23 @@ def _scene_digests(gaussians: Gaussians, views: Views) -> dict[str, str]:
     return {"gaussians": fingerprint(gaussians)[:16], "views": digest.hexdigest()[:16]}
 
 
-def _timed_maps(teacher: Teacher, views: Views, clock: Clock) -> Callable[[int], FeatureMap]:
-    def maps(view: int) -> FeatureMap:
-        with clock("teacher"):
-            return teacher.feature_map(views, view)
+def remaining_views(
+    rows: tuple[int, ...], sums: FeatureSums, checkpoint: FusionCheckpoint | None, track: Track
+) -> Iterator[int]:
+    """The views that are not in the sums yet. Between two of them the sums are saved, when that is due.
 
-    return maps
+    Args:
+        rows: of all views, in the order in which they are added.
+        sums: to which the caller adds each view before it takes the next; those of an interrupted run are put in first.
+        checkpoint: where sums are saved; None = nowhere.
+        track: wraps the loop to show progress.
+    """
+    if checkpoint is not None:
+        sums.restore(checkpoint)
+    for view in track(rows[sums.views :], "lifting views"):
+        yield view
+        if checkpoint is not None and checkpoint.due():
+            checkpoint.save_sums(sums.views, sums.sums, sums.weights)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -229,7 +233,6 @@ def find_subspace(
     maps: Callable[[int], FeatureMap],
     rows: tuple[int, ...],
     config: FuseConfig,
-    clock: Clock,
     track: Track,
     *,
     one_pass: bool,
@@ -241,7 +244,6 @@ def find_subspace(
         maps: the map of a view.
         rows: of the views.
         config: see there.
-        clock: counts the seconds of the step "basis".
         track: progress.
         one_pass: whether the mean may be left to the pass that lifts, where nothing else is missing.
     """
@@ -257,20 +259,21 @@ def find_subspace(
         return Subspace(mean=teacher.mean)
     moments = Moments(space.channels, second=needs_basis)
     for view in track(rows, "finding the basis"):
-        _add_cells(moments, maps(view), clock)
+        _add_cells(moments, maps(view))
     if not needs_basis:
         return Subspace(mean=moments.mean.astype(np.float32))
-    with clock("basis"):
-        basis = fit_basis(moments.mean, moments.covariance(), space, energy=config.energy, max_rank=config.max_rank)
+    basis = timed("basis")(fit_basis)(
+        moments.mean, moments.covariance(), space, energy=config.energy, max_rank=config.max_rank
+    )
     subspace = Subspace.of_basis(basis)
     return subspace if teacher.mean is None else replace(subspace, mean=teacher.mean)
 
 
-def _add_cells(moments: Moments, feature_map: FeatureMap, clock: Clock) -> None:
+@timed("basis")
+def _add_cells(moments: Moments, feature_map: FeatureMap) -> None:
     """Adds the cells of a map that have features."""
     rows = map_rows(feature_map)
-    with clock("basis"):
-        moments.add(rows[np.isfinite(rows[:, 0])])
+    moments.add(rows[np.isfinite(rows[:, 0])])
 
 
 def _truncation(basis: FeatureBasis, table: Float32[np.ndarray, "C D"]) -> float:

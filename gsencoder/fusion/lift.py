@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 
-from gsencoder.core.runtime.clock import Clock
+from gsencoder.core.runtime.clock import timed
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.checkpoint import FusionCheckpoint
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
@@ -60,6 +60,7 @@ class FeatureSums:
         if earlier is not None:
             self.views, self.sums, self.weights = earlier
 
+    @timed("lift")
     def add(self, b: Blend, feature_map: FeatureMap, mask: Bool[np.ndarray, "H W"] | None) -> None:
         """Adds a view: sums += Bᵀ @ (share · maps), weights += Bᵀ @ share, with the share of each row in the mask."""
         self.views += 1
@@ -83,6 +84,7 @@ class FeatureSums:
         b.lift_into(torch.from_numpy(maps), torch.from_numpy(self.sums))
         b.lift_into(torch.from_numpy(scale[:, None]), torch.from_numpy(self.weights[:, None]))
 
+    @timed("lift")
     def finish(self) -> tuple[Float32[np.ndarray, "N columns"], Float32[np.ndarray, " N"]]:
         """Divides, once: (features, weights); rows without weight are zero."""
         if self.table is None:
@@ -101,7 +103,6 @@ def view_matrix(
     views: Views,
     view: int,
     feature_map: FeatureMap,
-    clock: Clock,
     *,
     lift: Literal["blend", "center"],
     visibility: VisibilityConfig,
@@ -114,21 +115,24 @@ def view_matrix(
         views: cameras, and sensor depth where it is tested against.
         view: which of them.
         feature_map: its cells are the rows.
-        clock: takes the seconds of each step.
         lift: blend or center.
         visibility: what hides an entry, resolved (`visibility.resolve`).
         config: knobs of B.
     """
     if lift == "center":
-        with clock("blend"):
-            depths = _depth_maps(gaussians, views, view, visibility, config, None)
-        with clock("lift"):
-            return center_matrix(gaussians, views, view, feature_map, depths, visibility, config)
-    with clock("blend"):
-        b = blend(gaussians, views.cameras, view, like=feature_map, config=capped(config, feature_map))
-    with clock("visibility"):
-        for depth in _depth_maps(gaussians, views, view, visibility, config, b):
-            b = keep_visible(b, depth, visibility)
+        depths = timed("blend")(_depth_maps)(gaussians, views, view, visibility, config, None)
+        return timed("lift")(center_matrix)(gaussians, views, view, feature_map, depths, visibility, config)
+    b = timed("blend")(blend)(gaussians, views.cameras, view, like=feature_map, config=capped(config, feature_map))
+    return _without_hidden(b, gaussians, views, view, visibility, config)
+
+
+@timed("visibility")
+def _without_hidden(
+    b: Blend, gaussians: Gaussians, views: Views, view: int, visibility: VisibilityConfig, config: BlendConfig
+) -> Blend:
+    """The matrix without the entries of Gaussians that a depth map hides."""
+    for depth in _depth_maps(gaussians, views, view, visibility, config, b):
+        b = keep_visible(b, depth, visibility)
     return b
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gsencoder.core.runtime.clock import Clock
+from gsencoder.core.runtime.clock import Clock, timed
 
 
 def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -13,3 +13,20 @@ def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatc
         with clock(step):
             pass
     assert clock.seconds == {"blend": 5.0, "lift": 2.5}
+
+
+def test_marked_functions_count_on_the_clock_that_runs_and_on_none_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([0.0, 1.0, 10.0, 12.0, 20.0, 24.0, 30.0, 31.0])
+    monkeypatch.setattr("gsencoder.core.runtime.clock.time.perf_counter", lambda: next(times))
+    double = timed("lift")(lambda number: 2 * number)
+    assert double(1) == 2
+    with Clock().running() as outer:
+        assert double(2) == 4
+        with Clock().running() as inner:
+            assert double(3) == 6
+        assert double(4) == 8
+        with pytest.raises(TypeError, match="missing"):
+            double()
+    assert double(5) == 10
+    assert outer.seconds == {"lift": 5.0}
+    assert inner.seconds == {"lift": 2.0}

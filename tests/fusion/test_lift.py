@@ -5,7 +5,6 @@ import pytest
 import torch
 from splats import front_camera, random_gaussians
 
-from gsencoder.core.runtime.clock import Clock
 from gsencoder.fusion.lift import FeatureSums, capped, center_matrix, map_rows, view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import BlendConfig, blend
@@ -44,7 +43,7 @@ def test_rendered_depth_is_that_of_pixels_whatever_cells_are_lifted() -> None:
     gaussians, config = random_gaussians(200, log_scale=-1.5), BlendConfig(rays_per_patch=1)
     feature_map = map_of(np.zeros((HEIGHT // STRIDE, WIDTH // STRIDE, 2), np.float32))
     visibility = VisibilityConfig(against=("rendered",), relative=0.1)
-    b = view_matrix(gaussians, VIEWS, 0, feature_map, Clock(), lift="blend", visibility=visibility, config=config)
+    b = view_matrix(gaussians, VIEWS, 0, feature_map, lift="blend", visibility=visibility, config=config)
     plain = blend(gaussians, CAMERA, like=feature_map, config=config)
     assert plain.lattice.side == 1
     expected = keep_visible(plain, depth_image(blend(gaussians, CAMERA, config=config)), visibility)
