@@ -81,10 +81,9 @@ def depth_range(cameras: Cameras, view: int, points: Float32[np.ndarray, "P 3"])
     return 0.85 * float(near), 1.3 * float(far)
 
 
-def _pixel_rays(shot: Shot) -> Float[Tensor, "h w 3"]:
-    """Directions of z = 1 through the pixel centers, in camera axes."""
-    centers = torch.from_numpy(pixel_centers(shot.width, shot.height)).float()
-    return unproject_points(centers, torch.ones_like(centers[..., 0]), shot.K)
+def _points_at(depth: Float[Tensor, "h w"], shot: Shot) -> Float[Tensor, "h w 3"]:
+    """Points on the rays through the pixel centers at depths z, in camera axes."""
+    return unproject_points(torch.from_numpy(pixel_centers(shot.width, shot.height)).float(), depth, shot.K)
 
 
 def _planes(
@@ -122,7 +121,7 @@ def sweep(
         near: smallest depth, world units.
         far: largest depth.
     """
-    rays = _pixel_rays(reference)
+    rays = _points_at(torch.ones(reference.height, reference.width), reference)
     relative = [other @ invert_rigid(pose) for other in source_poses]
     depths = _planes(rays, relative, sources, near, far)
     windows = _Windows(reference.image.mean(dim=-1)[None, None])
@@ -247,4 +246,4 @@ def agreeing(
 
 def world_points(depth: Float[Tensor, "h w"], shot: Shot, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "h w 3"]:
     """Where the pixels' surfaces lie in the world."""
-    return transform(invert_rigid(pose), _pixel_rays(shot) * depth.unsqueeze(-1))
+    return transform(invert_rigid(pose), _points_at(depth, shot))

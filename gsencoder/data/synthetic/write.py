@@ -55,6 +55,8 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
     cameras, frames = views.cameras, []
     if (cameras.Ks != cameras.Ks[0]).any() or len(set(zip(cameras.widths, cameras.heights, strict=True))) > 1:
         raise InputError(f"{folder}: the views of a room to write must share one camera")
+    world_from_cam = cameras.world_from_cam
+    world_from_cam[:, :3, 3] += scene.origin
     for view in range(len(views)):
         stem = f"{view:03d}.png"
         millimetres = np.rint(views.depths[view].astype(np.float64) * (1000 * float(scene.metres_per_unit or 1)))
@@ -63,14 +65,12 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
         Image.fromarray(views.images[view]).save(folder / "images" / stem)
         Image.fromarray(millimetres.astype(np.uint16)).save(folder / "depth" / stem)
         Image.fromarray(views.instances[view].astype(np.uint16)).save(folder / "instance" / stem)
-        world_from_cam = cameras.world_from_cam[view]
-        world_from_cam[:3, 3] += scene.origin
         frames.append(
             {
                 "file_path": f"images/{stem}",
                 "depth_file_path": f"depth/{stem}",
                 "instance_file_path": f"instance/{stem}",
-                "transform_matrix": (world_from_cam @ OPENCV_FROM_OPENGL).tolist(),
+                "transform_matrix": (world_from_cam[view] @ OPENCV_FROM_OPENGL).tolist(),
             }
         )
     K = cameras.Ks[0].astype(float)
