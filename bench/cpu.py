@@ -23,7 +23,7 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.runtime.heap import keep_heap
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
-from gsencoder.models.grid.cells import cells_of
+from gsencoder.models.grid.cells import grid_coords
 from gsencoder.models.grid.neighbors import NeighborConv, neighbor_table
 from gsencoder.models.grid.plan import join_plans
 from gsencoder.models.grid.serialize import morton_codes
@@ -83,7 +83,7 @@ def attention(dtype: torch.dtype) -> Callable[[], None]:
 
 def convolution(gaussians: int, *, shuffled: bool) -> Callable[[], torch.Tensor]:
     """The 3³ convolution of 64 channels over the tokens of a surface."""
-    cells = torch.unique(cells_of(torch.from_numpy(surface(gaussians).means), 0.02), dim=0)
+    cells = torch.unique(grid_coords(torch.from_numpy(surface(gaussians).means), 0.02), dim=0)
     order = torch.randperm(len(cells)) if shuffled else torch.argsort(morton_codes(cells))
     cells = cells[order]
     layer, x, table = NeighborConv(64, 64), torch.randn(len(cells), 64), neighbor_table(cells)

@@ -30,9 +30,16 @@ from tempfile import TemporaryDirectory
 
 ROOT = Path(__file__).parents[1]
 MODULES = (
-    *("geometry", "fusion/lift", "fusion/basis", "fusion/visibility", "infer/boxes", "infer/relevancy"),
-    *("infer/view_worth", "train/losses", "train/samples", "models/serialize", "models/plan"),
-    *("data/seeds_depth", "data/transforms_json", "reconstruct/prune"),
+    *(
+        "geometry",
+        "fusion/lift",
+        "fusion/basis",
+        "fusion/visibility",
+        "infer/localize/boxes",
+        "infer/localize/relevancy",
+    ),
+    *("infer/views/utility", "train/losses", "train/samples", "models/grid/serialize", "models/grid/plan"),
+    *("data/seeding/depth", "data/readers/transforms_json", "reconstruct/prune"),
 )
 FOLDERS = {"geometry": ("tests/test_geometry.py", "tests/render", "tests/data")}
 NOT_COPIED = shutil.ignore_patterns(".git", ".venv", "outputs", "dist", "build", ".*_cache")

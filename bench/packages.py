@@ -9,8 +9,8 @@ from tempfile import TemporaryDirectory
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask, scores
-from gsencoder.evaluate.sources import fused, with_features
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
+from gsencoder.evaluate.sources import fusion_source, with_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, open_package, save_package
 from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -30,8 +30,8 @@ def main() -> None:
     shares = {budget: list[float]() for budget in hits}
     errors = {budget: list[float]() for budget in hits}
     for path in chosen.scenes:
-        scene, features, _ = with_features(load_scene(path), fused(teacher, words), SeedConfig())
-        hits[0.0] += ask(scene, features, words, protocol, localization)[0]
+        scene, features, _ = with_features(load_scene(path), fusion_source(teacher, words), SeedConfig())
+        hits[0.0] += score_queries(scene, features, words, protocol, localization)[0]
         for budget in list(hits)[1:]:
             with TemporaryDirectory() as name:
                 file = Path(name) / PACKAGE_FILE
@@ -39,7 +39,7 @@ def main() -> None:
                 packed = open_package(file)
                 shares[budget].append(2 * features.space.channels * len(features) / file.stat().st_size)
                 errors[budget].append(packed.error)
-                hits[budget] += ask(scene, packed.features(), words, protocol, localization)[0]
+                hits[budget] += score_queries(scene, packed.features(), words, protocol, localization)[0]
     for budget, found in hits.items():
         told = scores(found)
         print(

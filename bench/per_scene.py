@@ -23,9 +23,9 @@ from gsencoder.core.runtime.heap import keep_heap
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import seed
 from gsencoder.evaluate.boxes import Hit, accuracy
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask
-from gsencoder.evaluate.protocols.naming import SceneNames, compare_names, naming_scores
-from gsencoder.evaluate.sources import encoded
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries
+from gsencoder.evaluate.protocols.naming import NamingCounts, compare_names, naming_scores
+from gsencoder.evaluate.sources import encoder_source
 from gsencoder.fusion.basis import encode
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.labels import LabelsTeacher
@@ -94,10 +94,10 @@ def optimize(
 
 def quality(
     scene: Scene, truth: GaussianFeatures, features: GaussianFeatures, teacher: LabelsTeacher, words: TextTable
-) -> tuple[SceneNames, list[Hit]]:
+) -> tuple[NamingCounts, list[Hit]]:
     """Names told right, and boxes of the placed objects."""
     names = compare_names(scene.name, truth, features, teacher, {})
-    return names, ask(scene, features, words, LocalizationProtocol(), LocalizeConfig())[0]
+    return names, score_queries(scene, features, words, LocalizationProtocol(), LocalizeConfig())[0]
 
 
 def labeled(path: str, words: TextTable) -> tuple[Scene, LabelsTeacher]:
@@ -119,7 +119,7 @@ def main() -> None:
     keep_heap()
     words = load_text_table(find_file(chosen.words, "words"))
     encoder = TorchEncoder(chosen.weights)
-    table: dict[str, list[tuple[SceneNames, list[Hit], float]]] = {}
+    table: dict[str, list[tuple[NamingCounts, list[Hit], float]]] = {}
     for path in chosen.scenes:
         scene, teacher = labeled(path, words)
         start = time.perf_counter()
@@ -129,7 +129,7 @@ def main() -> None:
             start = time.perf_counter()
             features = optimize(scene, teacher, truth, chosen.stride, rounds)
             found[f"optimized, {rounds} rounds"] = (features, time.perf_counter() - start)
-        features, spent = encoded(encoder)(scene)
+        features, spent = encoder_source(encoder)(scene)
         found["encoded"] = (features, sum(spent.values()))
         for name, (features, seconds) in found.items():
             table.setdefault(name, []).append((*quality(scene, truth, features, teacher, words), seconds))

@@ -18,7 +18,7 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask, scores
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.infer.localize.localize import LocalizeConfig
@@ -75,7 +75,7 @@ def main() -> None:
         known = tuple(one for one in scene.objects if one.name in table.names)
         scene = dataclasses.replace(scene, objects=known)
         for level in THRESHOLDS:
-            found, _ = ask(
+            found, _ = score_queries(
                 scene, features, table, LocalizationProtocol(), LocalizeConfig(threshold=ThresholdConfig(fixed=level))
             )
             hits[level] += found

@@ -17,7 +17,7 @@ from PIL import Image
 from gsencoder import encode, load_scene, load_weights, localize
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.infer.draw.pictures import contact_sheet, draw_boxes, fit_pca_colors, pca_picture
-from gsencoder.models.weights import SHIPPED
+from gsencoder.models.weights import SHIPPED_WEIGHTS
 from gsencoder.render import blend
 from gsencoder.text.table import load_text_table
 
@@ -36,7 +36,7 @@ def main() -> None:
     assert scene.views.images is not None
     encoder, outputs, _ = load_weights("house_cpu")
     features = encode(scene.gaussians, encoder, outputs)
-    table = load_text_table(SHIPPED / "house_cpu" / "words.safetensors")
+    table = load_text_table(SHIPPED_WEIGHTS / "house_cpu" / "words.safetensors")
     found = localize(replace(scene, features={features.space.name: features}), given.words.split(","), table)
 
     view, cameras = given.view, scene.views.cameras

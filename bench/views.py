@@ -20,7 +20,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.model_files import find_file
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.boxes import asked_objects
+from gsencoder.evaluate.boxes import queryable_objects
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -58,7 +58,7 @@ def objects_of(path: str, large: bool) -> tuple[Scene, list[tuple[Target, SceneO
     assert scene.gaussians is not None
     features = fuse(scene, build_teacher(LabelsConfig(words=WORDS), scene, words)).features
     scene = replace(scene, features={features.space.name: features})
-    asked = furniture(scene.objects) if large else asked_objects(scene.objects)
+    asked = furniture(scene.objects) if large else queryable_objects(scene.objects)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)
         found = localize(scene, list(dict.fromkeys(one.name for one in asked if one.name)), words)

@@ -17,7 +17,7 @@ from gsencoder.core.files.csv_text import csv_text
 from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask, scores
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -71,7 +71,7 @@ def main() -> None:
                     seen.setdefault((voxel, lift, name), []).append(float(features.seen.mean()))
                     for level in thresholds:
                         asked = LocalizeConfig(threshold=ThresholdConfig(fixed=level))
-                        found, _ = ask(scene, features, words, LocalizationProtocol(), asked)
+                        found, _ = score_queries(scene, features, words, LocalizationProtocol(), asked)
                         hits.setdefault((voxel, lift, name, level), []).extend(found)
         print(f"{path.name}: {time.perf_counter() - start:.0f} s", flush=True)
         rows = [

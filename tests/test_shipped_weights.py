@@ -11,12 +11,12 @@ from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder
-from gsencoder.models.weights import SHIPPED, load_weights
+from gsencoder.models.weights import SHIPPED_WEIGHTS, load_weights
 from gsencoder.text.table import load_text_table
 
 pytestmark = pytest.mark.slow
 
-FOLDER = SHIPPED / "house_cpu"
+FOLDER = SHIPPED_WEIGHTS / "house_cpu"
 
 
 def test_they_take_less_than_ten_megabytes_and_say_how_they_were_made() -> None:

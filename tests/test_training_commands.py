@@ -214,7 +214,7 @@ def test_preparing_alone_trains_nothing(rooms: Path, tmp_path: Path) -> None:
         (["holdout=room_*"], "matches every scene"),
         (["train.steps=0"], "train.steps: expected 1 or more"),
         (["loss.min_kept=2.0"], "loss.min_kept"),
-        (["model.transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry a level"),
+        (["model.transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry per level"),
         (["teacher=radio"], "teacher.model= is missing"),
         (["device=cuda"], "no GPU"),
         (["experiment=kitchen"], "experiment: expected one of"),

@@ -1,4 +1,4 @@
-"""Acc@k: how often the best box for a word overlaps the object of that name (ScanRefer's protocol, axis-aligned)."""
+"""Acc@k: the share of objects whose name's best box overlaps them (ScanRefer's metric, with axis-aligned boxes)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,13 +11,14 @@ from gsencoder.types import Box, Localization, Scene, SceneObject
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hit:
-    """One object that was asked for by its name.
+    """The result of querying the name of one object.
 
     Attributes:
-        scene: its scene.
-        name: its name.
-        iou: of the top box of that name with the nearest object of that name; 0 if there is no box.
-        oracle_iou: the best over all boxes of that name: the paper's protocol, which no user can follow.
+        scene: name of the scene.
+        name: name of the object.
+        iou: largest IoU of the first box for the name with any object of that name; 0 if there is no box.
+        oracle_iou: the largest of these over all boxes for the name, as the paper has it; a user cannot know which box
+            that is.
     """
 
     scene: str
@@ -38,22 +39,28 @@ def aabb_iou(
     return float(overlap / union) if union > 0 else 0.0
 
 
-def asked_objects(objects: Sequence[SceneObject], *, min_views: int = 5, min_pixels: int = 60) -> list[SceneObject]:
-    """The small objects that have a name and were seen well enough to be asked for."""
+def queryable_objects(objects: Sequence[SceneObject], *, min_views: int = 5, min_pixels: int = 60) -> list[SceneObject]:
+    """Selects the objects to query: small objects that have a name and are seen well enough.
+
+    Args:
+        objects: all objects of a scene.
+        min_views: smallest number of views in which an object is seen.
+        min_pixels: smallest number of pixels that an object has in the view that shows it best.
+    """
     return [o for o in objects if o.placed and o.name and o.views >= min_views and o.max_pixels >= min_pixels]
 
 
-def score_boxes(scene: Scene, localization: Localization, asked: Sequence[SceneObject]) -> list[Hit]:
-    """Holds the boxes of each asked name against all objects of that name."""
+def score_boxes(scene: Scene, localization: Localization, targets: Sequence[SceneObject]) -> list[Hit]:
+    """Compares the boxes for each target's name with all objects of that name; one hit per target."""
     boxes: dict[str, list[Box]] = {}
     for box in localization.boxes:
         boxes.setdefault(box.query, []).append(box)
     hits = []
-    for target in asked:
+    for target in targets:
         assert target.name is not None
         same = [o for o in scene.objects if o.name == target.name]
-        found = sorted(boxes.get(target.name, []), key=lambda box: box.rank)
-        ious = [max(aabb_iou(b.aabb_min, b.aabb_max, o.aabb_min, o.aabb_max) for o in same) for b in found]
+        ranked = sorted(boxes.get(target.name, []), key=lambda box: box.rank)
+        ious = [max(aabb_iou(b.aabb_min, b.aabb_max, o.aabb_min, o.aabb_max) for o in same) for b in ranked]
         hits.append(
             Hit(scene=scene.name, name=target.name, iou=ious[0] if ious else 0.0, oracle_iou=max(ious, default=0.0))
         )
@@ -61,6 +68,6 @@ def score_boxes(scene: Scene, localization: Localization, asked: Sequence[SceneO
 
 
 def accuracy(hits: Iterable[Hit], threshold: float, *, oracle: bool = False) -> float:
-    """Share of hits whose IoU is at least `threshold`; NaN for none."""
+    """The share of hits whose IoU is at least `threshold`; NaN without hits."""
     ious = [hit.oracle_iou if oracle else hit.iou for hit in hits]
     return float(np.mean([iou >= threshold for iou in ious])) if ious else float("nan")

@@ -1,4 +1,4 @@
-"""Where the features that are judged come from: a teacher's fused maps, or an encoder."""
+"""Sources of the features to evaluate: fusion of a teacher's maps, or an encoder."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,22 +15,28 @@ from gsencoder.infer.load_encoder import Encoder
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
-Source = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
-"""From a scene with Gaussians to their features, and the seconds of each step."""
+FeatureSource = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
+"""A function from a scene with Gaussians to their features and the seconds of each step."""
 
 
-def fused(teacher: TeacherConfig, words: TextTable | None, config: FuseConfig = FuseConfig()) -> Source:
-    """Features that a teacher's maps are fused into."""
+def fusion_source(teacher: TeacherConfig, words: TextTable | None, config: FuseConfig = FuseConfig()) -> FeatureSource:
+    """A source that fuses a teacher's maps.
+
+    Args:
+        teacher: configuration of the teacher.
+        words: text table of the teacher; None if it has none.
+        config: settings of fusion.
+    """
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
-        found = fuse(scene, build_teacher(teacher, scene, words), config)
-        return found.features, found.seconds
+        fusion = fuse(scene, build_teacher(teacher, scene, words), config)
+        return fusion.features, fusion.seconds
 
     return source
 
 
-def encoded(encoder: Encoder, config: EncodeConfig = EncodeConfig()) -> Source:
-    """Features that an encoder predicts."""
+def encoder_source(encoder: Encoder, config: EncodeConfig = EncodeConfig()) -> FeatureSource:
+    """A source that runs an encoder."""
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         assert scene.gaussians is not None
@@ -41,19 +47,22 @@ def encoded(encoder: Encoder, config: EncodeConfig = EncodeConfig()) -> Source:
     return source
 
 
-def opened(
+def load_scenes(
     paths: Sequence[str | Path], data: SceneConfig = SceneConfig(), splat: str = "", track: Track = untracked
 ) -> Iterator[tuple[Scene, float]]:
-    """Scenes one by one, each with the seconds that reading it took; one is in memory at a time.
+    """Loads scenes one by one, so that one is in memory at a time.
 
     Args:
-        paths: of the scenes.
-        data: how they are read.
-        splat: Gaussians of each, relative to its folder; empty = none but the scene's own.
+        paths: folders or files of the scenes.
+        data: how scenes are read.
+        splat: file of the Gaussians of each scene, relative to its folder; empty = those that the scene has.
         track: wraps the loop to show progress.
 
+    Yields:
+        Each scene, and the seconds that loading took.
+
     Raises:
-        InputError: whatever is wrong with a scene.
+        InputError: a scene cannot be read.
     """
     for path in track([Path(path) for path in paths], "scenes"):
         start = time.perf_counter()
@@ -61,10 +70,16 @@ def opened(
         yield scene, time.perf_counter() - start
 
 
-def with_features(scene: Scene, source: Source, seeds: SeedConfig) -> tuple[Scene, GaussianFeatures, dict[str, float]]:
-    """A scene with Gaussians, seeds where it had none, their features, and the seconds of each step."""
+def with_features(
+    scene: Scene, source: FeatureSource, seeds: SeedConfig
+) -> tuple[Scene, GaussianFeatures, dict[str, float]]:
+    """Computes the features of a scene, after making seeds if it has no Gaussians.
+
+    Returns:
+        The scene with Gaussians, their features, and the seconds of each step.
+    """
     start = time.perf_counter()
     scene = with_gaussians(scene, seeds)
     seconds = {"seeds": time.perf_counter() - start}
-    features, spent = source(scene)
-    return scene, features, seconds | spent
+    features, source_seconds = source(scene)
+    return scene, features, seconds | source_seconds

@@ -1,8 +1,8 @@
-"""Speed against accuracy: one scene fused with many settings, in one run.
+"""Speed against accuracy of fusion: scenes fused with many settings in one run.
 
-Each setting is held against a reference that is as exact as the knobs go. Teacher maps are made once and kept, so that
-what is timed is what the knobs change: blending, visibility, basis and lift. Rounds alternate between the settings
-(A B C, A B C), so that whatever else the machine does falls on all of them alike.
+Each setting is compared with a reference fused at the most exact settings. Teacher maps are computed once and cached,
+so that only what the settings change is timed: blending, visibility, basis and lift. Rounds alternate between the
+settings (A B C, A B C), so that other load on the machine affects all of them equally.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit, accuracy
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol, ask
+from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries
 from gsencoder.fusion.feature_error import FieldError, field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teacher_maps import CachedTeacher
@@ -31,23 +31,29 @@ from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
 REFERENCE = "reference"
-"""The label of what all others are held against; it is neither on the front nor picked."""
+"""Label of the reference, which is neither on the Pareto front nor picked."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepConfig:
-    """Which values each knob takes. Every value is tried with the others at their defaults, or all with all."""
+    """The values that each setting takes: one setting changed at a time, or all combinations with grid=true."""
 
-    rays_per_patch: tuple[int, ...] = field(default=(1, 4, 16), metadata={"help": "rays averaged into one patch"})
-    min_weight: tuple[float, ...] = field(default=(0.001, 0.01, 0.1), metadata={"help": "smallest weight kept"})
-    stop_transmittance: tuple[float, ...] = field(
-        default=(0.001, 0.01, 0.1), metadata={"help": "transmittance at which a ray ends"}
+    rays_per_patch: tuple[int, ...] = field(default=(1, 4, 16), metadata={"help": "numbers of rays per patch to try"})
+    min_weight: tuple[float, ...] = field(
+        default=(0.001, 0.01, 0.1), metadata={"help": "smallest blending weights to try"}
     )
-    energy: tuple[float, ...] = field(default=(0.9, 0.95, 0.99), metadata={"help": "share of energy a basis keeps"})
-    max_rank: tuple[int, ...] = field(default=(8, 16, 32, 64), metadata={"help": "largest rank of the basis"})
-    views: tuple[int, ...] = field(default=(4, 8, 16), metadata={"help": "views used, evenly spaced"})
-    grid: bool = field(default=False, metadata={"help": "try all combinations, not one knob at a time"})
-    rounds: int = field(default=3, metadata={"help": "timed runs of each setting; the median counts"})
+    stop_transmittance: tuple[float, ...] = field(
+        default=(0.001, 0.01, 0.1), metadata={"help": "transmittances at which a ray ends, to try"}
+    )
+    energy: tuple[float, ...] = field(
+        default=(0.9, 0.95, 0.99), metadata={"help": "shares of the energy that the basis keeps, to try"}
+    )
+    max_rank: tuple[int, ...] = field(default=(8, 16, 32, 64), metadata={"help": "largest ranks of the basis to try"})
+    views: tuple[int, ...] = field(default=(4, 8, 16), metadata={"help": "numbers of evenly spaced views to try"})
+    grid: bool = field(
+        default=False, metadata={"help": "try all combinations instead of changing one setting at a time"}
+    )
+    rounds: int = field(default=3, metadata={"help": "timed runs of each setting, of which the median is reported"})
     reference_rays: int = field(default=196, metadata={"help": "rays per patch of the reference"})
 
     def __post_init__(self) -> None:
@@ -57,27 +63,32 @@ class SweepConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BudgetConfig:
-    """What may be spent; the cheapest setting that keeps to all of it is named."""
+    """Limits of time and error; the best setting within them is reported."""
 
-    seconds: float | None = field(default=None, metadata={"help": "for fusing one scene, without the teacher"})
-    error: float | None = field(default=None, metadata={"help": "centered cosine error against the reference"})
+    seconds: float | None = field(
+        default=None, metadata={"help": "largest time for fusing one scene without the teacher, seconds"}
+    )
+    error: float | None = field(
+        default=None, metadata={"help": "largest error against the reference, 1 − centered cosine"}
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trade:
-    """One setting, over all scenes.
+class SettingResult:
+    """Measurements of one setting over all scenes.
 
     Attributes:
-        label: what differs from the defaults, in words.
-        knobs: the same as values; empty for the defaults and the reference.
-        seconds: a scene, median over rounds, mean over scenes.
-        mib: growth of the process's peak memory, the largest over scenes.
+        label: the changes from the defaults as text.
+        knobs: the changes as values by name; empty for the defaults and the reference.
+        seconds: time per scene, median over rounds and mean over scenes.
+        mib: growth of the process's peak memory in MiB, largest over scenes.
         rank: columns of the features, mean over scenes.
-        error: 1 − centered cosine to the reference over what it saw, mean over scenes; what was missed counts as 1.
-        raw_error: the same without centering, over what both saw.
-        covered: share of what the reference saw that this saw too.
-        hits: objects asked for; empty where the teacher has no words or the scenes no objects.
-        on_front: whether no other setting is both as fast and as exact.
+        error: 1 − centered cosine to the reference over the Gaussians that it saw, mean over scenes; a Gaussian that
+            this setting did not see counts as 1.
+        raw_error: the same without centering, over the Gaussians that both saw.
+        covered: share of the Gaussians seen by the reference that this setting saw too.
+        hits: one for each queried object; empty if the teacher has no words or the scenes have no objects.
+        on_front: whether the setting is on the Pareto front of seconds and error.
     """
 
     label: str
@@ -92,13 +103,13 @@ class Trade:
     on_front: bool = False
 
 
-def settings_of(sweep: SweepConfig, base: FuseConfig) -> list[tuple[dict[str, Any], FuseConfig]]:
-    """The defaults first, then every setting of the sweep, each once, with what it changes.
+def sweep_settings(sweep: SweepConfig, base: FuseConfig) -> list[tuple[dict[str, Any], FuseConfig]]:
+    """Expands a sweep: the defaults, then every other setting once, each with its changes from the defaults.
 
     Raises:
-        InputError: a knob out of range.
+        InputError: a value is out of range.
     """
-    now = {
+    defaults = {
         "rays_per_patch": base.blend.rays_per_patch,
         "min_weight": base.blend.min_weight,
         "stop_transmittance": base.blend.stop_transmittance,
@@ -106,21 +117,24 @@ def settings_of(sweep: SweepConfig, base: FuseConfig) -> list[tuple[dict[str, An
         "max_rank": base.max_rank,
         "views": base.views,
     }
-    lists = {name: list(dict.fromkeys((now[name], *getattr(sweep, name)))) for name in now}
+    values_of = {name: list(dict.fromkeys((defaults[name], *getattr(sweep, name)))) for name in defaults}
     if sweep.grid:
-        tried = [dict(zip(lists, values, strict=True)) for values in itertools.product(*lists.values())]
+        settings = [dict(zip(values_of, values, strict=True)) for values in itertools.product(*values_of.values())]
     else:
-        tried = [now, *({**now, name: value} for name, values in lists.items() for value in values[1:])]
-    return [({k: v for k, v in knobs.items() if v != now[k]}, _with(base, knobs)) for knobs in tried]
+        settings = [
+            defaults,
+            *({**defaults, name: value} for name, values in values_of.items() for value in values[1:]),
+        ]
+    return [({k: v for k, v in knobs.items() if v != defaults[k]}, _with_knobs(base, knobs)) for knobs in settings]
 
 
-def _with(base: FuseConfig, knobs: dict[str, Any]) -> FuseConfig:
+def _with_knobs(base: FuseConfig, knobs: dict[str, Any]) -> FuseConfig:
     blend = {name: knobs[name] for name in ("rays_per_patch", "min_weight", "stop_transmittance")}
-    rest = {name: knobs[name] for name in ("energy", "max_rank", "views")}
-    return replace(base, blend=replace(base.blend, **blend), **rest)
+    fusion = {name: knobs[name] for name in ("energy", "max_rank", "views")}
+    return replace(base, blend=replace(base.blend, **blend), **fusion)
 
 
-def trade_off(
+def measure_tradeoff(
     paths: Sequence[str | Path],
     *,
     teacher: TeacherConfig,
@@ -131,41 +145,47 @@ def trade_off(
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
     track: Track = untracked,
-) -> list[Trade]:
-    """Measures every setting of a sweep on every scene: the reference, the defaults, then the rest.
+) -> list[SettingResult]:
+    """Measures every setting of a sweep on every scene.
 
     Args:
-        paths: scenes.
-        teacher: what is fused; with words and labeled objects there are accuracies too.
-        sweep: the values of the knobs.
-        base: the defaults that the knobs leave.
-        protocol: which objects are asked for.
+        paths: folders of the scenes.
+        teacher: the teacher whose maps are fused. If it has words and scenes have labeled objects, localization is
+            measured too.
+        sweep: the values to try.
+        base: settings of fusion that the sweep does not change, and the defaults of those that it does.
+        protocol: which objects are queried.
         data: how scenes are read.
         seeds: how Gaussians are made for scenes without.
-        localization: how words become boxes.
+        localization: settings of `localize`.
         track: wraps the loops to show progress.
 
+    Returns:
+        Results of the reference, of the defaults, and of the other settings, with the Pareto front marked.
+
     Raises:
-        InputError: a knob out of range, or whatever is wrong with a scene.
+        InputError: a value is out of range, or a scene cannot be used.
     """
-    settings = settings_of(sweep, base)
+    settings = sweep_settings(sweep, base)
     exact = replace(base.blend, rays_per_patch=sweep.reference_rays, min_weight=0.0, stop_transmittance=1e-6)
     reference: tuple[dict[str, Any], FuseConfig] = ({}, replace(base, blend=exact, basis=False, views=0))
     words = text_table_of(teacher)
-    per_scene: list[list[Trade]] = []
+    per_scene: list[list[SettingResult]] = []
     for path in track(list(paths), "scenes"):
         scene = load_scene(path, options=data)
         if scene.gaussians is None:
             scene = replace(scene, gaussians=seed(scene, seeds))
         with tempfile.TemporaryDirectory(prefix="gsencoder_maps_") as maps:
             cached = CachedTeacher(build_teacher(teacher, scene, words), Path(maps))
-            measured = _measure(scene, cached, [reference, *settings], words, protocol, localization, sweep, track)
-        per_scene.append(measured)
-    reference_trade, *trades = [_over_scenes([one[place] for one in per_scene]) for place in range(len(settings) + 1)]
-    return [replace(reference_trade, label=REFERENCE), *mark_front(trades)]
+            scene_results = _measure_scene(
+                scene, cached, [reference, *settings], words, protocol, localization, sweep, track
+            )
+        per_scene.append(scene_results)
+    reference_result, *results = [_average_over_scenes([row[i] for row in per_scene]) for i in range(len(settings) + 1)]
+    return [replace(reference_result, label=REFERENCE), *mark_pareto_front(results)]
 
 
-def _measure(
+def _measure_scene(
     scene: Scene,
     teacher: Teacher,
     settings: list[tuple[dict[str, Any], FuseConfig]],
@@ -174,23 +194,25 @@ def _measure(
     localization: LocalizeConfig,
     sweep: SweepConfig,
     track: Track,
-) -> list[Trade]:
-    """The first setting is the reference."""
+) -> list[SettingResult]:
+    """Results of all settings on one scene; the first setting is the reference."""
     seconds: list[list[float]] = [[] for _ in settings]
-    done: list[tuple[float, int, FieldError, tuple[Hit, ...]]] = []
+    measured: list[tuple[float, int, FieldError, tuple[Hit, ...]]] = []
     reference: GaussianFeatures | None = None
     for round_number in track(range(sweep.rounds), "rounds"):
-        for place, (_, config) in enumerate(track(settings, "settings")):
+        for number, (_, config) in enumerate(track(settings, "settings")):
             with memory_growth() as growth:
                 fusion = fuse(scene, teacher, config)
-            seconds[place].append(sum(value for step, value in fusion.seconds.items() if step != "teacher"))
+            seconds[number].append(sum(value for step, value in fusion.seconds.items() if step != "teacher"))
             reference = fusion.features if reference is None else reference
             if round_number == 0:
                 error = field_error(fusion.features, reference)
-                hits = ask(scene, fusion.features, words, protocol, localization)[0] if words is not None else []
-                done.append((growth.mib, fusion.features.features.shape[1], error, tuple(hits)))
+                hits = (
+                    score_queries(scene, fusion.features, words, protocol, localization)[0] if words is not None else []
+                )
+                measured.append((growth.mib, fusion.features.features.shape[1], error, tuple(hits)))
     return [
-        Trade(
+        SettingResult(
             label=", ".join(f"{name}={value}" for name, value in knobs.items()) or "defaults",
             knobs=knobs,
             seconds=float(np.median(times)),
@@ -201,19 +223,19 @@ def _measure(
             covered=error.covered,
             hits=hits,
         )
-        for (knobs, _), times, (mib, rank, error, hits) in zip(settings, seconds, done, strict=True)
+        for (knobs, _), times, (mib, rank, error, hits) in zip(settings, seconds, measured, strict=True)
     ]
 
 
-def _over_scenes(trades: list[Trade]) -> Trade:
+def _average_over_scenes(results: list[SettingResult]) -> SettingResult:
     def mean(name: str) -> float:
-        return float(np.mean([getattr(trade, name) for trade in trades]))
+        return float(np.mean([getattr(result, name) for result in results]))
 
-    return Trade(
-        label=trades[0].label,
-        knobs=trades[0].knobs,
-        mib=max(trade.mib for trade in trades),
-        hits=tuple(hit for trade in trades for hit in trade.hits),
+    return SettingResult(
+        label=results[0].label,
+        knobs=results[0].knobs,
+        mib=max(result.mib for result in results),
+        hits=tuple(hit for result in results for hit in result.hits),
         seconds=mean("seconds"),
         rank=mean("rank"),
         error=mean("error"),
@@ -222,56 +244,58 @@ def _over_scenes(trades: list[Trade]) -> Trade:
     )
 
 
-def mark_front(trades: Sequence[Trade]) -> list[Trade]:
-    """The same trades, with those marked that no other one beats in seconds or error without losing in the other."""
+def mark_pareto_front(results: Sequence[SettingResult]) -> list[SettingResult]:
+    """Marks the results that no other result dominates in seconds and error."""
 
-    def beaten(one: Trade) -> bool:
+    def is_dominated(result: SettingResult) -> bool:
         return any(
-            other.seconds <= one.seconds
-            and other.error <= one.error
-            and (other.seconds < one.seconds or other.error < one.error)
-            for other in trades
+            other.seconds <= result.seconds
+            and other.error <= result.error
+            and (other.seconds < result.seconds or other.error < result.error)
+            for other in results
         )
 
-    return [replace(one, on_front=not beaten(one)) for one in trades]
+    return [replace(result, on_front=not is_dominated(result)) for result in results]
 
 
-def pick(trades: Sequence[Trade], budget: BudgetConfig) -> Trade:
-    """The fastest setting within a budget of error, or, with a budget of seconds alone, the most exact one within it.
+def pick_within_budget(results: Sequence[SettingResult], budget: BudgetConfig) -> SettingResult:
+    """Picks the fastest setting within a budget of error, or with a budget of seconds alone the most exact within it.
 
     Raises:
-        InputError: no setting keeps to the budget; the nearest is named.
+        InputError: no setting is within the budget; the fastest and the most exact are named.
     """
-    trades = [one for one in trades if one.label != REFERENCE]
-    fitting = [
-        one
-        for one in trades
-        if (budget.seconds is None or one.seconds <= budget.seconds)
-        and (budget.error is None or one.error <= budget.error)
+    results = [result for result in results if result.label != REFERENCE]
+    affordable = [
+        result
+        for result in results
+        if (budget.seconds is None or result.seconds <= budget.seconds)
+        and (budget.error is None or result.error <= budget.error)
     ]
-    if not fitting:
-        fast, good = min(trades, key=lambda one: one.seconds), min(trades, key=lambda one: one.error)
+    if not affordable:
+        fastest = min(results, key=lambda result: result.seconds)
+        most_exact = min(results, key=lambda result: result.error)
         raise InputError(
-            f"budget: no setting keeps to it; the fastest ({fast.label}) takes {fast.seconds:.3g} s at an error of "
-            f"{fast.error:.3g}, the most exact ({good.label}) {good.seconds:.3g} s at {good.error:.3g}"
+            f"budget: no setting is within it; the fastest ({fastest.label}) takes {fastest.seconds:.3g} s at an error "
+            f"of {fastest.error:.3g}, the most exact ({most_exact.label}) {most_exact.seconds:.3g} s at "
+            f"{most_exact.error:.3g}"
         )
     if budget.error is None:
-        return min(fitting, key=lambda one: (one.error, one.seconds))
-    return min(fitting, key=lambda one: (one.seconds, one.error))
+        return min(affordable, key=lambda result: (result.error, result.seconds))
+    return min(affordable, key=lambda result: (result.seconds, result.error))
 
 
-def row_of(trade: Trade) -> dict[str, Any]:
-    """A trade as a line of a table; accuracies are NaN where nothing was asked for."""
+def table_row(result: SettingResult) -> dict[str, Any]:
+    """The result as a row of the table; accuracies are NaN if no object was queried."""
     return {
-        "setting": trade.label,
-        "seconds": trade.seconds,
-        "mib": trade.mib,
-        "rank": trade.rank,
-        "error": trade.error,
-        "raw_error": trade.raw_error,
-        "covered": trade.covered,
-        "acc_25": accuracy(trade.hits, 0.25),
-        "acc_50": accuracy(trade.hits, 0.5),
-        "objects": len(trade.hits),
-        "on_front": trade.on_front,
+        "setting": result.label,
+        "seconds": result.seconds,
+        "mib": result.mib,
+        "rank": result.rank,
+        "error": result.error,
+        "raw_error": result.raw_error,
+        "covered": result.covered,
+        "acc_25": accuracy(result.hits, 0.25),
+        "acc_50": accuracy(result.hits, 0.5),
+        "objects": len(result.hits),
+        "on_front": result.on_front,
     }

@@ -1,8 +1,9 @@
-"""How well an encoder does on prepared scenes while it is trained: is the kind of its feature that of the fused one?
+"""Validation of an encoder on prepared scenes during training: accuracy of classifying its features like their targets.
 
-Kinds are what occurs in the training scenes: the vectors of a labels teacher, clusters of another's features. For
-every scene the choices are the kinds of its targets, and scores are averaged over kinds, so that a floor counts no more
-than a spoon. A name that no training scene has is counted as the nearest that one has; `naming` knows better.
+The classes come from the training scenes: the vectors of a coded teacher's table, or clusters of a dense teacher's
+features. In each scene only the classes of its own targets are choices, and the score is averaged over classes, so that
+a floor counts no more than a spoon. A name that is in no training scene counts as the nearest one that is; the naming
+protocol (`protocols.naming`) does not have this limit.
 """
 
 from collections.abc import Sequence
@@ -25,43 +26,46 @@ from gsencoder.train.class_balance import nearest_codes
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.trainer import Validated
 
-SHOWN_SCENES = 3
-"""Held-out scenes of which a view is drawn at every validation of a training."""
+PICTURED_SCENES = 3
+"""Held-out scenes of which a view is drawn at each validation during training."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KindAccuracy:
-    """Gaussians by the kind of their target, over some scenes.
+class ClassAccuracy:
+    """Classification accuracy of Gaussians by the class of their target, over several scenes.
 
     Attributes:
-        right: for each row of the codebook, Gaussians that were told right.
-        total: for each row, Gaussians that have this target.
-        cosine_named: mean cosine of predicted and fused features, about the space's mean, over named Gaussians: those
-            whose target is at least half a typical distance from it.
-        sheet: for the first scenes one view in color, its fused and its predicted features; None where not asked for.
+        correct: for each row of the codebook, the Gaussians with this target that are classified correctly.
+        total: for each row of the codebook, the Gaussians with this target.
+        cosine_named: mean cosine of predicted and target features about the mean of the space, over named Gaussians:
+            those whose target is at least half the root mean square distance from the mean.
+        sheet: for each of the first scenes, one view in color and its target and predicted features in false colors;
+            None if no scene is drawn.
     """
 
-    right: Float64[np.ndarray, " C"]
+    correct: Float64[np.ndarray, " C"]
     total: Float64[np.ndarray, " C"]
     cosine_named: float
     sheet: UInt8[np.ndarray, "H W 3"] | None = None
 
     def accuracies(self) -> Float64[np.ndarray, " C"]:
-        """Share told right of each kind; NaN where there is none."""
+        """The accuracy of each class; NaN for classes that do not occur."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(self.right / self.total)
+            return np.asarray(self.correct / self.total)
 
     @property
     def score(self) -> float:
-        """The mean over kinds that occur."""
+        """The accuracy averaged over the classes that occur."""
         return float(np.nanmean(self.accuracies()))
 
 
-def nearest_names(
+def nearest_classes(
     outputs: Float32[np.ndarray, "n channels"], codebook: Float32[np.ndarray, "C channels"], choices: np.ndarray
 ) -> Int64[np.ndarray, " n"]:
-    """The row of the codebook, among `choices`, that is nearest to each output; for unit vectors the one of largest
-    cosine, whatever mean was taken off."""
+    """For each output the nearest row of the codebook among the rows `choices`.
+
+    If the codebook's vectors had unit length before they were standardized, that is the row of largest cosine.
+    """
     return np.asarray(choices[nearest_codes(codebook[choices], outputs)])
 
 
@@ -72,39 +76,39 @@ def validate_encoder(
     codebook: Float32[np.ndarray, "C channels"],
     config: EncodeConfig = EncodeConfig(),
     *,
-    shown: int = 0,
+    pictured: int = 0,
     track: Track = untracked,
-) -> KindAccuracy:
-    """Encodes prepared scenes and counts.
+) -> ClassAccuracy:
+    """Encodes prepared scenes and classifies the predicted features.
 
     Args:
-        scenes: with fused targets.
-        encoder: to judge.
-        outputs: what its numbers mean.
-        codebook: the kinds of target, in standard units.
-        config: how scenes are encoded.
-        shown: scenes of which a view is drawn.
+        scenes: prepared scenes.
+        encoder: the encoder to validate.
+        outputs: its output space.
+        codebook: the target classes, in standard units.
+        config: settings of encoding.
+        pictured: number of scenes of which a view is drawn.
         track: wraps the loop over scenes to show progress.
     """
     pictures: list[np.ndarray] = []
     titles: list[str] = []
-    right, total = np.zeros(len(codebook)), np.zeros(len(codebook))
+    correct, total = np.zeros(len(codebook)), np.zeros(len(codebook))
     cosines, count = 0.0, 0
     for scene in track(scenes, "validation"):
         seen = np.flatnonzero(scene.weights)
-        everything = scene.gaussians(np.arange(len(scene)))
+        gaussians = scene.gaussians(np.arange(len(scene)))
         with about(f"scene {scene.name}"):
-            found = encode(everything, encoder, outputs, config, metres_per_unit=scene.metres_per_unit or 1.0)
-        predicted = outputs.standardize(found.features[seen])
+            encoded = encode(gaussians, encoder, outputs, config, metres_per_unit=scene.metres_per_unit or 1.0)
+        predicted = outputs.standardize(encoded.features[seen])
         targets = scene.targets(seen)
-        if len(pictures) < 3 * shown:
-            pictures += view_pictures(scene, seen, targets, predicted)
-            titles += [f"{scene.name}: {what}" for what in ("colours", "fused", "predicted")]
-        truth = nearest_codes(codebook, targets)
-        choices = np.unique(truth)
-        guess = nearest_names(predicted, codebook, choices)
-        right += np.bincount(truth, weights=guess == truth, minlength=len(codebook))
-        total += np.bincount(truth, minlength=len(codebook))
+        if len(pictures) < 3 * pictured:
+            pictures += draw_middle_view(scene, seen, targets, predicted)
+            titles += [f"{scene.name}: {content}" for content in ("colors", "fused", "predicted")]
+        true_codes = nearest_codes(codebook, targets)
+        choices = np.unique(true_codes)
+        predicted_codes = nearest_classes(predicted, codebook, choices)
+        correct += np.bincount(true_codes, weights=predicted_codes == true_codes, minlength=len(codebook))
+        total += np.bincount(true_codes, minlength=len(codebook))
         lengths = np.sqrt(np.square(targets).sum(axis=1))
         named = lengths >= 0.5 * outputs.channels**0.5
         dots = (targets[named] * predicted[named]).sum(axis=1)
@@ -113,7 +117,7 @@ def validate_encoder(
         count += int(named.sum())
         scene.close()
     sheet = contact_sheet(pictures, titles, columns=3, width=400) if pictures else None
-    return KindAccuracy(right=right, total=total, cosine_named=cosines / max(count, 1), sheet=sheet)
+    return ClassAccuracy(correct=correct, total=total, cosine_named=cosines / max(count, 1), sheet=sheet)
 
 
 def validate_names(
@@ -123,29 +127,32 @@ def validate_names(
     codebook: Float32[np.ndarray, "C channels"],
     config: EncodeConfig = EncodeConfig(),
 ) -> Validated:
-    """The scores of `validate_encoder` in the form that `gsencoder.train.train` takes: the mean accuracy over kinds as
-    "names", the mean cosine over named Gaussians as "cosine_named", and the sheet of pictures as "features"."""
-    accuracy = validate_encoder(scenes, encoder, outputs, codebook, config, shown=SHOWN_SCENES)
+    """Runs `validate_encoder` in the form that `gsencoder.train.train` expects.
+
+    Its scores are "names", the accuracy averaged over classes, and "cosine_named", the mean cosine over named
+    Gaussians; its picture "features" is the sheet of the first scenes.
+    """
+    accuracy = validate_encoder(scenes, encoder, outputs, codebook, config, pictured=PICTURED_SCENES)
     pictures = {} if accuracy.sheet is None else {"features": accuracy.sheet}
     return Validated({"names": accuracy.score, "cosine_named": accuracy.cosine_named}, pictures)
 
 
-def view_pictures(
+def draw_middle_view(
     scene: PreparedScene,
     rows: Int64[np.ndarray, " n"],
     targets: Float32[np.ndarray, "n channels"],
     predicted: Float32[np.ndarray, "n channels"],
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
-    """The middle view of a scene: its colors, its targets, and what was predicted, in the same false colors."""
+    """Draws the middle view of a scene: in color, and its targets and predictions in the same false colors."""
     gaussians = scene.gaussians(rows)
     view = len(scene.cameras) // 2
     b = blend(gaussians, scene.cameras, view)
     colors = fit_pca_colors(targets)
-    # Rendering is linear: three columns are rendered, not all channels, and colors are read off them as they are.
-    plain = replace(colors, mean=np.zeros(3), axes=np.eye(3))
-    found = [render_image(gaussians, scene.cameras, view, blended=b)]
+    # Rendering is linear, so features are projected to three color columns first, and these are rendered.
+    identity = replace(colors, mean=np.zeros(3), axes=np.eye(3))
+    pictures = [render_image(gaussians, scene.cameras, view, blended=b)]
     for features in (targets, predicted):
         columns = ((features - colors.mean) @ colors.axes).astype(np.float32)
         rendered = b.render(torch.from_numpy(columns)).numpy()
-        found.append(pca_picture(rendered.reshape(*b.shape, 3), plain, b.alpha.reshape(b.shape).numpy()))
-    return found
+        pictures.append(pca_picture(rendered.reshape(*b.shape, 3), identity, b.alpha.reshape(b.shape).numpy()))
+    return pictures

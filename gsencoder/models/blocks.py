@@ -1,4 +1,4 @@
-"""The parts of the point transformer: patch attention, block, pooling and unpooling (PTv3, Wu et al. 2024, sec. 4)."""
+"""Layers of the point transformer: patch attention, block, pooling and unpooling (PTv3, Wu et al. 2024, sec. 4)."""
 
 import torch
 from jaxtyping import Bool, Float, Int64, Integer
@@ -7,8 +7,8 @@ from torch.nn import functional
 
 from gsencoder.models.grid.neighbors import NeighborConv
 
-UNSEEN = -3e4
-"""Added to the score of what is masked; half precision holds it."""
+MASKED_SCORE = -3e4
+"""Added to attention scores of masked slots in an exported graph; finite in half precision."""
 
 
 class PatchAttention(nn.Module):
@@ -23,67 +23,70 @@ class PatchAttention(nn.Module):
     def forward(
         self,
         x: Float[Tensor, "T C"],
-        gather: Int64[Tensor, " places"],
-        scatter: Int64[Tensor, " T"],
+        gather_index: Int64[Tensor, " slots"],
+        scatter_index: Int64[Tensor, " T"],
         attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
-        width: int,
+        patch_width: int,
     ) -> Float[Tensor, "T C"]:
-        """Tokens are put into patches, attend within them, and are put back; see `plan.Level`."""
+        """Gathers tokens into patches, attends within each patch, and scatters the results back; see `plan.Level`."""
         channels = x.shape[1]
         if torch.compiler.is_exporting():
-            return self._exported(x.index_select(0, gather), scatter, attn_mask, width)
-        placed = self.qkv(x.index_select(0, gather))
-        # torch's backward of attention in bfloat16 on a CPU is five times slower than in float32.
-        slow = placed.device.type == "cpu" and placed.dtype == torch.bfloat16 and torch.is_grad_enabled()
-        qkv = (placed.float() if slow else placed).view(-1, width, 3, self.heads, channels // self.heads)
+            return self._forward_exported(x.index_select(0, gather_index), scatter_index, attn_mask, patch_width)
+        gathered = self.qkv(x.index_select(0, gather_index))
+        # On a CPU torch's backward pass of attention is five times slower in bfloat16 than in float32.
+        upcast = gathered.device.type == "cpu" and gathered.dtype == torch.bfloat16 and torch.is_grad_enabled()
+        qkv = (gathered.float() if upcast else gathered).view(-1, patch_width, 3, self.heads, channels // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
-        with torch.autocast(placed.device.type, enabled=False):
+        with torch.autocast(gathered.device.type, enabled=False):
             attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
         flat = attended.transpose(1, 2).reshape(-1, channels)
-        out: Tensor = self.project(flat.index_select(0, scatter))
+        out: Tensor = self.project(flat.index_select(0, scatter_index))
         return out
 
-    def _exported(
+    def _forward_exported(
         self,
-        placed: Float[Tensor, "places C"],
-        scatter: Int64[Tensor, " T"],
+        gathered: Float[Tensor, "slots C"],
+        scatter_index: Int64[Tensor, " T"],
         attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
-        width: int,
+        patch_width: int,
     ) -> Float[Tensor, "T C"]:
-        """The same in plain operators, for ONNX: queries, keys and values from products of their own, which need not be
-        taken apart again. No patch is masked altogether."""
-        channels = placed.shape[1]
-        rows = [slice(part * channels, (part + 1) * channels) for part in range(3)]
+        """The same in operators that ONNX has. Queries, keys and values come from separate products, so that the graph
+        need not split them; every patch has a slot that is not masked, so that the softmax is defined."""
+        channels = gathered.shape[1]
+        row_slices = [slice(i * channels, (i + 1) * channels) for i in range(3)]
         q, k, v = (
-            functional.linear(placed, self.qkv.weight[part], self.qkv.bias[part])
-            .view(-1, width, self.heads, channels // self.heads)
+            functional.linear(gathered, self.qkv.weight[rows], self.qkv.bias[rows])
+            .view(-1, patch_width, self.heads, channels // self.heads)
             .transpose(1, 2)
-            for part in rows
+            for rows in row_slices
         )
         scores = (q * q.shape[3] ** -0.5) @ k.transpose(2, 3)
         if attn_mask is not None:
-            scores = scores + torch.where(attn_mask, 0.0, UNSEEN).to(scores.dtype)
+            scores = scores + torch.where(attn_mask, 0.0, MASKED_SCORE).to(scores.dtype)
         attended = scores.softmax(dim=3) @ v
-        out: Tensor = self.project(attended.transpose(1, 2).reshape(-1, channels).index_select(0, scatter))
+        out: Tensor = self.project(attended.transpose(1, 2).reshape(-1, channels).index_select(0, scatter_index))
         return out
 
 
 class DropPath(nn.Module):
-    """Leaves out a residual branch for a random share of tokens in training, and scales up the others."""
+    """Stochastic depth: in training, drops a residual branch for random tokens and scales it up for the others."""
 
-    def __init__(self, share: float) -> None:
+    def __init__(self, drop_prob: float) -> None:
         super().__init__()
-        self.share = share
+        self.drop_prob = drop_prob
 
     def forward(self, x: Float[Tensor, "T C"]) -> Float[Tensor, "T C"]:
-        if not self.training or self.share == 0:
+        if not self.training or self.drop_prob == 0:
             return x
-        kept = torch.rand(len(x), 1, device=x.device) >= self.share
-        return x * (kept / (1 - self.share)).to(x.dtype)
+        keep_mask = torch.rand(len(x), 1, device=x.device) >= self.drop_prob
+        return x * (keep_mask / (1 - self.drop_prob)).to(x.dtype)
 
 
 class Block(nn.Module):
-    """x + position; x + attention(norm x); x + mlp(norm x), the position encoding being a 3³ convolution."""
+    """A transformer block: x + position(x); x + attention(norm(x)); x + mlp(norm(x)).
+
+    The conditional position encoding is a 3³ sparse convolution, a linear layer and a norm.
+    """
 
     def __init__(self, channels: int, heads: int, *, mlp_ratio: float, drop_path: float) -> None:
         super().__init__()
@@ -102,20 +105,22 @@ class Block(nn.Module):
         self,
         x: Float[Tensor, "T C"],
         neighbors: Integer[Tensor, "T 27"],
-        gather: Int64[Tensor, " places"],
-        scatter: Int64[Tensor, " T"],
+        gather_index: Int64[Tensor, " slots"],
+        scatter_index: Int64[Tensor, " T"],
         attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
-        width: int,
+        patch_width: int,
     ) -> Float[Tensor, "T C"]:
         x = x + self.norm_position(self.mix(self.position(x, neighbors)))
-        x = x + self.drop_path(self.attention(self.norm_attention(x), gather, scatter, attn_mask, width))
+        x = x + self.drop_path(
+            self.attention(self.norm_attention(x), gather_index, scatter_index, attn_mask, patch_width)
+        )
         hidden = functional.gelu(self.expand(self.norm_mlp(x)))
         out: Tensor = x + self.drop_path(self.contract(hidden))
         return out
 
 
 class Pool(nn.Module):
-    """Tokens of a cell twice as large become one: the largest of each projected channel."""
+    """Pooling to the next coarser level: a linear layer, the maximum over the tokens of a coarser cell, and a norm."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
@@ -129,7 +134,7 @@ class Pool(nn.Module):
 
 
 class Unpool(nn.Module):
-    """Each token takes what its parent found out and adds what it knew itself."""
+    """Unpooling to the next finer level: the features of each token's parent plus its own skip connection."""
 
     def __init__(self, channels_in: int, channels_skip: int, channels_out: int) -> None:
         super().__init__()
@@ -141,5 +146,5 @@ class Unpool(nn.Module):
     def forward(
         self, x: Float[Tensor, "M C"], skip: Float[Tensor, "T S"], parents: Int64[Tensor, " T"]
     ) -> Float[Tensor, "T D"]:
-        down = functional.gelu(self.norm(self.project(x)))
-        return functional.gelu(self.norm_skip(self.project_skip(skip))) + down.index_select(0, parents)
+        from_parents = functional.gelu(self.norm(self.project(x)))
+        return functional.gelu(self.norm_skip(self.project_skip(skip))) + from_parents.index_select(0, parents)

@@ -1,10 +1,10 @@
-"""Gaussian attributes as input channels: what does not change when the scene is moved, and no sign or order that the
-file happened to choose.
+"""Input channels of the encoder, computed from Gaussian attributes.
 
-A rotation is given as a quaternion and an order of axes, and the same ellipsoid has 48 such descriptions; a network
-would have to learn that they are one. The logarithm of the covariance has one value for each ellipsoid, is linear in
-log-scales, and stays within a few units where scales run from 1e-9 to 1e4. `rotation` is the part of it that has a
-direction; `scale` the sorted log-scales themselves, so that either can be left out.
+The channels do not depend on where the scene lies, nor on the sign and the axis order that a file chose. A quaternion
+and three scales describe the same ellipsoid in 48 ways, and a network would have to learn that they are equal. The
+logarithm of the covariance has one value for each ellipsoid, is linear in log-scales, and stays within a few units for
+scales from 1e-9 to 1e4. `rotation` is its trace-free part and `scale` the sorted log-scales, so that either can be left
+out.
 """
 
 import math
@@ -19,15 +19,16 @@ from gsencoder.types import SH_C0
 
 Attribute = Literal["offset", "color", "opacity", "scale", "rotation"]
 
-CHANNELS: dict[Attribute, int] = {"offset": 3, "color": 3, "opacity": 1, "scale": 3, "rotation": 6}
+ATTRIBUTE_CHANNELS: dict[Attribute, int] = {"offset": 3, "color": 3, "opacity": 1, "scale": 3, "rotation": 6}
 
-LOG_LIMIT = 12.0
-"""Log-scales, counted from the voxel's edge, are cut off here: e^±12 voxels is dust or a continent."""
+MAX_ABS_LOG_SCALE = 12.0
+"""Limit to which log-scales relative to the voxel are clamped: no useful Gaussian is smaller or larger than e^±12
+voxels."""
 
 
-def channels_of(attributes: tuple[Attribute, ...]) -> int:
-    """How many channels the chosen attributes have."""
-    return sum(CHANNELS[name] for name in attributes)
+def input_channels(attributes: tuple[Attribute, ...]) -> int:
+    """The number of channels that attributes have in total."""
+    return sum(ATTRIBUTE_CHANNELS[name] for name in attributes)
 
 
 def embed(
@@ -40,12 +41,12 @@ def embed(
     voxel: float | Float[Tensor, ""],
     attributes: tuple[Attribute, ...],
 ) -> Float[Tensor, "N C"]:
-    """Input channels, each of order one.
+    """Computes the input channels, all of order one.
 
-    offset: where in its voxel the center lies, −1 to 1. color: the degree-0 color, black −1, white 1, clipped at ±2.
-    opacity: −1 to 1. scale: log standard deviations over the voxel's edge, largest first, a quarter of them. rotation:
-    the six entries of R diag(log s − mean log s) Rᵀ, a quarter of them, the off-diagonal ones times √2, so that a
-    distance between inputs is one between matrices.
+    offset: position of the center in its voxel, −1 to 1. color: degree-0 color, −1 for black to 1 for white, clamped to
+    ±2. opacity: −1 to 1. scale: ¼ of log(scale / voxel), largest first. rotation: ¼ of the six distinct entries of
+    R diag(log s − mean log s) Rᵀ, the off-diagonal ones times √2, so that distances between inputs are Frobenius
+    distances between matrices.
 
     Args:
         means: world units.
@@ -53,30 +54,30 @@ def embed(
         scales: standard deviations > 0, world units.
         opacities: in [0, 1].
         sh_dc: degree-0 spherical-harmonic coefficients.
-        voxel: edge of the token grid, world units; a tensor where it is known only when an exported graph runs.
-        attributes: which of them, in this order.
+        voxel: edge length of the token grid's cells, world units; a tensor in an exported graph, where it is an input.
+        attributes: the attributes to embed; their channels are concatenated in this order.
     """
-    parts: list[Tensor] = []
-    logs = torch.log(scales.double() / voxel).clamp(-LOG_LIMIT, LOG_LIMIT).to(means.dtype)
+    channels: list[Tensor] = []
+    log_scales = torch.log(scales.double() / voxel).clamp(-MAX_ABS_LOG_SCALE, MAX_ABS_LOG_SCALE).to(means.dtype)
     for name in attributes:
         if name == "offset":
-            place = means.double() / voxel
-            parts.append((2 * (place - torch.floor(place)) - 1).to(means.dtype))
+            scaled = means.double() / voxel
+            channels.append((2 * (scaled - torch.floor(scaled)) - 1).to(means.dtype))
         elif name == "color":
-            parts.append((2 * SH_C0 * sh_dc).clamp(-2, 2))
+            channels.append((2 * SH_C0 * sh_dc).clamp(-2, 2))
         elif name == "opacity":
-            parts.append(2 * opacities.unsqueeze(1) - 1)
+            channels.append(2 * opacities.unsqueeze(1) - 1)
         elif name == "scale":
-            parts.append(logs.sort(dim=1, descending=True).values / 4)
+            channels.append(log_scales.sort(dim=1, descending=True).values / 4)
         else:
-            parts.append(_direction(quats, logs - logs.mean(dim=1, keepdim=True)) / 4)
-    return torch.cat(parts, dim=1)
+            channels.append(_symmetric_matrix(quats, log_scales - log_scales.mean(dim=1, keepdim=True)) / 4)
+    return torch.cat(channels, dim=1)
 
 
-def _direction(quats: Float[Tensor, "N 4"], logs: Float[Tensor, "N 3"]) -> Float[Tensor, "N 6"]:
-    """xx, yy, zz, √2·xy, √2·xz, √2·yz of R diag(logs) Rᵀ."""
+def _symmetric_matrix(quats: Float[Tensor, "N 4"], eigenvalues: Float[Tensor, "N 3"]) -> Float[Tensor, "N 6"]:
+    """The entries xx, yy, zz, √2·xy, √2·xz, √2·yz of R diag(eigenvalues) Rᵀ."""
     rotation = rotmats_from_quats(quats)
     x, y, z = rotation.unbind(dim=1)
     root = math.sqrt(2)
-    rows = (x * x, y * y, z * z, root * x * y, root * x * z, root * y * z)
-    return torch.stack([(row * logs).sum(dim=1) for row in rows], dim=1)
+    entries = (x * x, y * y, z * z, root * x * y, root * x * z, root * y * z)
+    return torch.stack([(entry * eigenvalues).sum(dim=1) for entry in entries], dim=1)

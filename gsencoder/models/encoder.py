@@ -1,4 +1,4 @@
-"""The Gaussian encoder: raw attributes of a splat in, one feature a Gaussian out (SplatDistill sec. 3.3)."""
+"""The Gaussian encoder: a network from raw Gaussian attributes to one feature per Gaussian (SplatDistill sec. 3.3)."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,71 +10,75 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
-from gsencoder.models.embed import CHANNELS, Attribute, channels_of, embed
-from gsencoder.models.grid.curves import Curves
+from gsencoder.models.embed import ATTRIBUTE_CHANNELS, Attribute, embed, input_channels
+from gsencoder.models.grid.curves import SceneCurves
 from gsencoder.models.grid.neighbors import NeighborConv
 from gsencoder.models.grid.plan import CloudPlan, Plan, join_plans, plan_cloud
 from gsencoder.models.point_transformer import PointTransformer, TransformerConfig
 from gsencoder.types import Gaussians
 
-FAINT = 1e-3
-"""A Gaussian of no opacity counts this much within its token, so that a token of such Gaussians has a mean."""
+MIN_MERGE_WEIGHT = 1e-3
+"""Smallest weight of a Gaussian within its token, so that a token of invisible Gaussians has a mean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncoderConfig:
-    """What goes in, what happens to it."""
+    """Inputs, token grid and network of an encoder."""
 
-    voxel: float = field(default=0.02, metadata={"help": "edge of the finest grid in metres; its cells are the tokens"})
+    voxel: float = field(default=0.02, metadata={"help": "edge length of the token grid's cells, metres"})
     inputs: tuple[Attribute, ...] = field(
-        default=("offset", "color", "opacity", "scale", "rotation"), metadata={"help": "attributes that are looked at"}
+        default=("offset", "color", "opacity", "scale", "rotation"),
+        metadata={"help": "Gaussian attributes that the encoder sees"},
     )
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
 
     def __post_init__(self) -> None:
         if not 0 < self.voxel < math.inf:
             raise InputError(f"voxel: expected a positive length in metres, got {self.voxel}")
-        unknown = [name for name in self.inputs if name not in CHANNELS]
+        unknown = [name for name in self.inputs if name not in ATTRIBUTE_CHANNELS]
         if not self.inputs or unknown or len(set(self.inputs)) < len(self.inputs):
-            raise InputError(f"inputs: expected some of {', '.join(CHANNELS)}, each once, got {', '.join(self.inputs)}")
+            raise InputError(
+                f"inputs: expected one or more of {', '.join(ATTRIBUTE_CHANNELS)}, each once, "
+                f"got {', '.join(self.inputs)}"
+            )
 
 
 class GaussianEncoder(nn.Module):
-    """Merges Gaussians into tokens, runs the transformer, and gives each Gaussian what its token found."""
+    """Merges Gaussians into tokens, runs the point transformer, and gives each Gaussian the feature of its token."""
 
     def __init__(self, config: EncoderConfig, channels: int) -> None:
         """Args:
-        config: see there.
-        channels: of the output: R coordinates in a basis, or all D of the space.
+        config: inputs, token grid and network.
+        channels: columns of the output: rank R of a basis, or all D channels of the space.
         """
         super().__init__()
         self.config, self.channels = config, channels
         width, out = config.transformer.encoder_channels[0], config.transformer.channels_out
-        self.stem = NeighborConv(channels_of(config.inputs), width)
+        self.stem = NeighborConv(input_channels(config.inputs), width)
         self.stem_norm = nn.LayerNorm(width)
         self.transformer = PointTransformer(config.transformer)
         self.head_norm = nn.LayerNorm(out)
         self.head = nn.Linear(out, channels)
 
     def join(self, clouds: list[CloudPlan]) -> Plan:
-        """The plan of a batch; see `plan.join_plans`."""
+        """Joins plans of clouds to that of a batch; see `plan.join_plans`."""
         return join_plans(clouds, self.config.transformer.patch)
 
     def forward(
         self, attributes: Float[Tensor, "N A"], opacities: Float[Tensor, " N"], plan: Plan
     ) -> Float[Tensor, "N channels"]:
-        """Features in standard units (see `OutputSpace`), at least float32 whatever the network computed in.
+        """Predicts features in standard units (see `OutputSpace`), in float32 or wider even under autocast.
 
         Args:
-            attributes: of `embed`, with the configuration's inputs.
-            opacities: how much each Gaussian counts within its token.
-            plan: of these Gaussians, in this order.
+            attributes: input channels from `embed`, with the inputs of the configuration.
+            opacities: weights of the Gaussians within their tokens.
+            plan: the plan of these Gaussians, in this order.
         """
-        tokens = merge(attributes, opacities.clamp(min=FAINT), plan)
+        tokens = merge(attributes, opacities.clamp(min=MIN_MERGE_WEIGHT), plan)
         if not torch.compiler.is_exporting():
-            # Levels may end in tokens that stand for nothing.
+            # Levels may end in unused tokens.
             tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
-        # An encoder in half precision takes tokens that were merged in single.
+        # Tokens are merged in float32, also for an encoder in half precision.
         tokens = tokens.to(self.head.weight.dtype)
         x = functional.gelu(self.stem_norm(self.stem(tokens, plan.levels[0].neighbors)))
         x = self.transformer(x, plan)
@@ -84,10 +88,10 @@ class GaussianEncoder(nn.Module):
 
 
 def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan) -> Float[Tensor, "T A"]:
-    """The weighted mean (weights > 0) of each token's members, summed in the members' order, without atomics."""
+    """Merges Gaussians into tokens: the mean of each token's members with weights > 0, summed in a fixed order."""
     weighted = torch.cat((attributes * weights.unsqueeze(1), weights.unsqueeze(1)), dim=1)
     if torch.compiler.is_exporting():
-        # ONNX has no reduction of segments, and onnxruntime's scattered sums lose terms where two threads meet.
+        # ONNX has no segment reduction, and scatter-add of onnxruntime loses terms when two threads add to one row.
         ends = plan.counts.cumsum(0)
         running = functional.pad(weighted.index_select(0, plan.members).double().cumsum(0), (0, 0, 1, 0))
         sums = running.index_select(0, ends) - running.index_select(0, ends - plan.counts)
@@ -105,16 +109,17 @@ def encoder_inputs(
     voxel: float,
     device: str | torch.device = "cpu",
     *,
-    whole: Curves | None = None,
+    scene_curves: SceneCurves | None = None,
 ) -> tuple[Float[Tensor, "N A"], Float[Tensor, " N"], CloudPlan]:
-    """What an encoder takes of one cloud: attributes, opacities, and its plan.
+    """Computes the inputs of an encoder for one cloud: attributes, opacities and plan.
 
     Args:
         gaussians: the cloud.
-        config: of the encoder.
-        voxel: edge of the finest grid in the cloud's own units (`config.voxel` is in metres).
-        device: where the tensors are to be.
-        whole: of the scene that the cloud is a part of (`curves.curves_of`); None = it is all of it.
+        config: configuration of the encoder.
+        voxel: edge length of the token grid's cells in units of the cloud (`config.voxel` is in metres).
+        device: the device of the tensors.
+        scene_curves: patch boundaries of the full scene if the cloud is a part of one (`curves.cut_scene_curves`);
+            None = the cloud is the full scene.
 
     Raises:
         InputError: the cloud spreads over too many cells.
@@ -133,6 +138,6 @@ def encoder_inputs(
         voxel=voxel,
         attributes=config.inputs,
     )
-    shape = config.transformer
-    plan = plan_cloud(means, voxel, levels=shape.levels, orders=shape.orders, whole=whole)
+    network = config.transformer
+    plan = plan_cloud(means, voxel, levels=network.levels, orders=network.orders, scene_curves=scene_curves)
     return attributes, opacities, plan

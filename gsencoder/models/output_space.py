@@ -1,9 +1,9 @@
-"""What an encoder's numbers mean: standard units about the mean of a feature space, and the way back.
+"""The output space of an encoder: features standardized about the mean of a feature space, and the inverse.
 
-CLIP-like spaces are narrow cones: vectors are nearly alike, and what tells names apart is what is left when the mean is
-taken off. A network therefore learns (feature − mean) / unit, in the coordinates of a basis where there is one, with
-the unit chosen so that each channel has a mean square of about one. Nothing is lost: magnitudes come back, as a
-teacher's own heads need them.
+CLIP-like spaces are narrow cones: all vectors are nearly parallel, and names differ only in what remains after the mean
+is subtracted. A network therefore predicts (feature − mean) / unit, in the coordinates of a basis if there is one, with
+the unit chosen so that the mean square of a channel is about one. The inverse restores magnitudes, which the adapter
+heads of a teacher need.
 """
 
 import math
@@ -21,13 +21,13 @@ from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OutputSpace:
-    """The space that an encoder's outputs live in.
+    """The space of an encoder's outputs.
 
     Attributes:
-        space: what decoded features are.
-        mean: the space's mean, which is taken off.
+        space: the feature space of restored and decoded features.
+        mean: mean of the space, which is subtracted.
         scale: root mean square distance of features from the mean.
-        basis: outputs are coordinates in it; None where they are all D channels.
+        basis: the basis in which outputs are coordinates; None if they are all D channels.
     """
 
     space: FeatureSpace
@@ -45,26 +45,26 @@ class OutputSpace:
 
     @property
     def channels(self) -> int:
-        """Columns of the outputs: R or D."""
+        """Columns of the outputs: rank R of the basis, or D."""
         return self.basis.rank if self.basis is not None else self.space.channels
 
     @property
     def unit(self) -> float:
-        """One standard unit, in the space's own."""
+        """The length of one standard unit in units of the space."""
         return self.scale / math.sqrt(self.channels)
 
     def standardize(self, features: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
-        """Coordinates in the basis, or vectors of the space, as an encoder should give them."""
+        """Converts coordinates in the basis, or vectors of the space, to standard units."""
         centered = features if self.basis is not None else features - self.mean
         return np.asarray(centered / np.float32(self.unit), dtype=np.float32)
 
     def restore(self, outputs: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
-        """The inverse of `standardize`."""
+        """Converts standard units back to coordinates or vectors; the inverse of `standardize`."""
         scaled = outputs * np.float32(self.unit)
         return np.asarray(scaled if self.basis is not None else scaled + self.mean, dtype=np.float32)
 
     def features(self, restored: Float32[np.ndarray, "N channels"]) -> GaussianFeatures:
-        """Restored outputs of every Gaussian as features, all with weight 1."""
+        """Wraps restored outputs of all Gaussians as features, all with weight 1."""
         return GaussianFeatures(
             features=restored,
             weights=np.ones(len(restored), np.float32),
@@ -74,17 +74,17 @@ class OutputSpace:
         )
 
 
-def write_outputs(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the header values that hold an output space in a file."""
+def output_space_parts(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and header values that represent an output space in a file."""
     arrays, header = space_parts(outputs.space, outputs.mean, outputs.basis)
     return arrays, {**header, "scale": outputs.scale}
 
 
-def read_outputs(file: Archive) -> OutputSpace:
-    """The output space that a file holds.
+def read_output_space(file: Archive) -> OutputSpace:
+    """Reads an output space from a file.
 
     Raises:
-        InputError: damaged, or from another program.
+        InputError: the file is damaged, or was not written by gsencoder.
     """
     space, mean, basis = read_space(file)
     return OutputSpace(space=space, mean=mean, scale=file.value("scale", float, int), basis=basis)

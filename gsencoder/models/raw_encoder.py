@@ -1,7 +1,7 @@
-"""The encoder from raw Gaussians on, grid, curves, patches and neighbors included, in operators that ONNX has.
+"""The encoder from raw Gaussians on, with its grid, curves, patches and neighbors, in operators that ONNX has.
 
-What `plan.plan_cloud` and `plan.join_plans` work out for a cloud is worked out here again, for one cloud whose size is
-known only when it comes: without searches for duplicates, segments or sizes that Python has to see.
+It computes the same plan as `plan.plan_cloud` and `plan.join_plans`, for one cloud of dynamic size: without unique,
+segment operations, or sizes that Python would have to read.
 """
 
 from typing import NamedTuple
@@ -12,34 +12,42 @@ from torch import Tensor, nn
 
 from gsencoder.models.embed import embed
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.grid.neighbors import AHEAD
+from gsencoder.models.grid.neighbors import FORWARD_COLUMNS
 from gsencoder.models.grid.plan import Level, Plan
-from gsencoder.models.grid.serialize import ALIGN, MOST_LEVELS, NEVER, Order, hilbert_from_morton, morton_codes, swapped
+from gsencoder.models.grid.serialize import (
+    ALIGN,
+    INVALID_CODE,
+    MAX_LEVELS,
+    Order,
+    hilbert_from_morton,
+    morton_codes,
+    swap_xy,
+)
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.point_transformer import TransformerConfig
 
 
-class Tokens(NamedTuple):
+class TokenLevel(NamedTuple):
     """The tokens of one level, in Morton order.
 
     Attributes:
-        cells: of the grid.
-        morton: their codes.
-        along: their codes along each order.
+        cells: grid coordinates.
+        morton: Morton codes.
+        curve_codes: codes along each order.
     """
 
     cells: Int64[Tensor, "T 3"]
     morton: Int64[Tensor, " T"]
-    along: dict[Order, Int64[Tensor, " T"]]
+    curve_codes: dict[Order, Int64[Tensor, " T"]]
 
-    def coarser(self, first: Int64[Tensor, " M"]) -> "Tokens":
-        """The level below, of which these rows are the first children."""
-        along = {order: codes.index_select(0, first) >> 3 for order, codes in self.along.items()}
-        return Tokens(self.cells.index_select(0, first) >> 1, self.morton.index_select(0, first) >> 3, along)
+    def coarser(self, first: Int64[Tensor, " M"]) -> "TokenLevel":
+        """The next coarser level, given the rows of the first child of each of its tokens."""
+        curve_codes = {order: codes.index_select(0, first) >> 3 for order, codes in self.curve_codes.items()}
+        return TokenLevel(self.cells.index_select(0, first) >> 1, self.morton.index_select(0, first) >> 3, curve_codes)
 
 
 class RawEncoder(nn.Module):
-    """`GaussianEncoder` with everything that comes before it and `OutputSpace.restore` after it."""
+    """`GaussianEncoder` with the computation of its inputs before it and `OutputSpace.restore` after it."""
 
     def __init__(self, encoder: GaussianEncoder, outputs: OutputSpace) -> None:
         super().__init__()
@@ -58,7 +66,7 @@ class RawEncoder(nn.Module):
         corner: Float32[Tensor, "3"],
         starts: Int64[Tensor, "rows P"],
     ) -> Float32[Tensor, "N channels"]:
-        """Features of a cloud of one Gaussian or more: coordinates in the basis, or vectors of the space.
+        """Predicts features of a cloud of one or more Gaussians: coordinates in the basis, or vectors of the space.
 
         Args:
             means: centers, world units.
@@ -66,47 +74,48 @@ class RawEncoder(nn.Module):
             scales: standard deviations > 0, world units.
             opacities: in [0, 1].
             sh_dc: degree-0 spherical-harmonic coefficients.
-            voxel: edge of the finest grid, world units. An input, since the exporter rounds constants to float32, and
-                a Gaussian at the border of a cell would fall into another.
-            corner: of the scene that the cloud is a part of (`Curves.corner`); +inf where it is all of it.
-            starts: of that scene, a row for each order of each level in turn (`Curves.starts`), filled up with `NEVER`;
-                negative where the cloud is all of it.
+            voxel: edge length of the finest grid's cells, world units. An input, since the exporter would round a
+                constant to float32, which moves Gaussians near a border to another cell.
+            corner: lowest corner of the full scene if the cloud is a part of one (`SceneCurves.corner`), else +inf.
+            starts: first codes of the patches of the full scene (`SceneCurves.starts`), a row for each order of each
+                level in turn, padded with `INVALID_CODE`; negative if the cloud is the full scene.
         """
         config = self.encoder.config
         attributes = embed(means, quats, scales, opacities, sh_dc, voxel=voxel, attributes=config.inputs)
-        plan = _plan(means, voxel, corner, starts, config.transformer)
-        found: Tensor = self.encoder(attributes, opacities, plan)
-        return found * self.unit + self.get_buffer("space_mean")
+        plan = _plan_cloud(means, voxel, corner, starts, config.transformer)
+        standard: Tensor = self.encoder(attributes, opacities, plan)
+        return standard * self.unit + self.get_buffer("space_mean")
 
 
-def _plan(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, config: TransformerConfig) -> Plan:
+def _plan_cloud(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, config: TransformerConfig) -> Plan:
+    """The twin of `plan.plan_cloud` and `plan.join_plans`."""
     scaled = torch.floor(means.double() / voxel)
     low = torch.minimum(scaled.amin(dim=0), torch.floor(corner.double() / voxel))
     cells = (scaled - torch.floor(low / ALIGN) * ALIGN).long()
     codes, members = torch.sort(morton_codes(cells), stable=True)
     first, token_of_member = _runs(codes)
     morton = codes.index_select(0, first)
-    along = {order: _along(morton, order) for order in config.orders}
-    tokens = Tokens(cells.index_select(0, members.index_select(0, first)), morton, along)
+    curve_codes = {order: _curve_codes(morton, order) for order in config.orders}
+    tokens = TokenLevel(cells.index_select(0, members.index_select(0, first)), morton, curve_codes)
     levels = []
     for level in range(config.levels):
         neighbors = _neighbor_table(tokens.cells)
         cut = {
-            number: _patches(
-                tokens.along[config.orders[number]], starts[level * len(config.orders) + number], config.patch
+            number: _cut_patches(
+                tokens.curve_codes[config.orders[number]], starts[level * len(config.orders) + number], config.patch
             )
             for number in sorted(config.orders_followed[level])
         }
-        # Orders that no block follows here stand for nothing.
+        # Orders that no block of this level follows get any patches; they are never read.
         patches = [cut.get(number, next(iter(cut.values()))) for number in range(len(config.orders)) if cut]
         first_child, parents = _runs(tokens.morton >> 3)
         levels.append(
             Level(
                 neighbors=neighbors,
-                gathers=tuple(each.gather for each in patches),
-                scatters=tuple(each.scatter for each in patches),
-                attn_mask=tuple(each.mask for each in patches),
-                width=config.patch,
+                gather_index=tuple(index.gather for index in patches),
+                scatter_index=tuple(index.scatter for index in patches),
+                attn_mask=tuple(index.mask for index in patches),
+                patch_width=config.patch,
                 parents=parents,
                 children=_children(first_child, parents.shape[0]),
             )
@@ -116,22 +125,22 @@ def _plan(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, config: 
     return Plan(
         token_of=torch.empty_like(members).scatter(0, members, token_of_member),
         members=members,
-        counts=_lengths(first, members.shape[0]),
+        counts=_run_lengths(first, members.shape[0]),
         levels=tuple(levels),
     )
 
 
-def _along(morton: Int64[Tensor, " T"], order: Order) -> Int64[Tensor, " T"]:
-    """As `serialize.encode_morton`."""
-    turned = swapped(morton, order)
-    return hilbert(turned) if order.startswith("hilbert") else turned
+def _curve_codes(morton: Int64[Tensor, " T"], order: Order) -> Int64[Tensor, " T"]:
+    """The twin of `serialize.curve_from_morton`."""
+    swapped = swap_xy(morton, order)
+    return hilbert(swapped) if order.startswith("hilbert") else swapped
 
 
 @torch.library.custom_op("gsencoder::hilbert", mutates_args=())
 def hilbert(morton: Tensor) -> Tensor:
-    """Hilbert's curve as one operator, since how far it has to look is known only when a graph runs."""
-    found: Tensor = hilbert_from_morton(morton, MOST_LEVELS)
-    return found
+    """Codes along Hilbert's curve as one operator, since the number of levels is known only when a graph runs."""
+    codes: Tensor = hilbert_from_morton(morton, MAX_LEVELS)
+    return codes
 
 
 @hilbert.register_fake
@@ -140,81 +149,83 @@ def _(morton: Tensor) -> Tensor:
 
 
 def _runs(codes: Int64[Tensor, " N"]) -> tuple[Int64[Tensor, " T"], Int64[Tensor, " N"]]:
-    """The first row of each run of equal codes, and each row's run."""
+    """The first row of each run of equal codes, and the number of the run of each row."""
     begins = (codes != codes.roll(1)) | (torch.arange(codes.shape[0], device=codes.device) == 0)
     return torch.nonzero(begins).squeeze(1), begins.long().cumsum(0) - 1
 
 
-def _lengths(first: Int64[Tensor, " T"], total: int) -> Int64[Tensor, " T"]:
-    """How many rows each run has."""
+def _run_lengths(first: Int64[Tensor, " T"], total: int) -> Int64[Tensor, " T"]:
+    """The numbers of rows of runs, given their first rows."""
     return torch.cat((first[1:], first[:1] + total)) - first
 
 
 def _children(first: Int64[Tensor, " M"], total: int) -> Int64[Tensor, "M 8"]:
-    """See `plan.Level`; siblings follow one another."""
+    """The children of each token as in `plan.Level`; siblings follow one another."""
     step = torch.arange(8, device=first.device)
-    return first[:, None] + torch.where(step < _lengths(first, total)[:, None], step, 0)
+    return first[:, None] + torch.where(step < _run_lengths(first, total)[:, None], step, 0)
 
 
 def _neighbor_table(cells: Int64[Tensor, "T 3"]) -> Int32[Tensor, "T 27"]:
-    """As `neighbors.neighbor_table`, without strides that Python has to see."""
+    """The twin of `neighbors.neighbor_table`, without strides that Python would have to read."""
     count = cells.shape[0]
     low, high = cells.amin(dim=0), cells.amax(dim=0)
     sizes = high - low + 3
     strides = torch.stack((sizes[1] * sizes[2], sizes[2], torch.ones_like(sizes[0])))
     keys, order = torch.sort(((cells - low + 1) * strides).sum(dim=1), stable=True)
-    own = torch.arange(count, device=cells.device, dtype=torch.int32)
-    ahead = torch.tensor([[dx, dy, -1] for dx, dy in AHEAD], device=cells.device)
-    wanted = keys + (ahead * strides).sum(dim=1, keepdim=True)
-    place = torch.searchsorted(keys, wanted).int()
-    padded = torch.cat((keys, keys.new_full((3,), NEVER)))
-    after = []
+    positions = torch.arange(count, device=cells.device, dtype=torch.int32)
+    steps = torch.tensor([[dx, dy, -1] for dx, dy in FORWARD_COLUMNS], device=cells.device)
+    target_keys = keys + (steps * strides).sum(dim=1, keepdim=True)
+    position = torch.searchsorted(keys, target_keys).int()
+    padded = torch.cat((keys, keys.new_full((3,), INVALID_CODE)))
+    matches = []
     for _ in range(3):
-        hit = _take(padded, place) == wanted
-        after.append(torch.where(hit, place, count))
-        place, wanted = place + hit.int(), wanted + 1
-    # Cells 15 to 26, which face 11 to 0.
-    facing = torch.stack(after, dim=1).view(12, -1)
-    nobody = torch.full_like(facing[:, :1], count)
-    before = torch.cat((torch.full_like(facing, count), nobody), dim=1).scatter(1, facing.long(), own.expand(12, -1))
-    beyond = torch.where(_take(padded, own + 1) == keys + 1, own + 1, count)
-    previous = torch.where(keys.roll(1) == keys - 1, own - 1, count)
-    found = torch.cat((before[:, :-1].flip(0), torch.stack((previous, own, beyond)), facing))
-    rows = _take(torch.cat((order.int(), torch.full_like(own[:1], count))), found)
-    return rows.T.index_select(0, torch.empty_like(own).scatter(0, order, own))
+        hit = _take(padded, position) == target_keys
+        matches.append(torch.where(hit, position, count))
+        position, target_keys = position + hit.int(), target_keys + 1
+    # Cells 15 to 26 of the neighborhood; cells 11 to 0 are opposite them.
+    forward = torch.stack(matches, dim=1).view(12, -1)
+    missing = torch.full_like(forward[:, :1], count)
+    opposite = torch.cat((torch.full_like(forward, count), missing), dim=1).scatter(
+        1, forward.long(), positions.expand(12, -1)
+    )
+    next_cell = torch.where(_take(padded, positions + 1) == keys + 1, positions + 1, count)
+    previous_cell = torch.where(keys.roll(1) == keys - 1, positions - 1, count)
+    table = torch.cat((opposite[:, :-1].flip(0), torch.stack((previous_cell, positions, next_cell)), forward))
+    rows = _take(torch.cat((order.int(), torch.full_like(positions[:1], count))), table)
+    return rows.T.index_select(0, torch.empty_like(positions).scatter(0, order, positions))
 
 
-def _take(values: Integer[Tensor, " n"], places: Int32[Tensor, "..."]) -> Integer[Tensor, "..."]:
-    return values.index_select(0, places.flatten()).view(places.shape)
+def _take(values: Integer[Tensor, " n"], indices: Int32[Tensor, "..."]) -> Integer[Tensor, "..."]:
+    return values.index_select(0, indices.flatten()).view(indices.shape)
 
 
-class Patches(NamedTuple):
-    """How one order cuts one level; see `plan.Level`, whose fields for one order these are."""
+class PatchIndex(NamedTuple):
+    """The patches of one level along one order: gather and scatter index and mask as in `plan.Level`."""
 
-    gather: Int64[Tensor, " places"]
+    gather: Int64[Tensor, " slots"]
     scatter: Int64[Tensor, " T"]
     mask: Tensor
 
 
-def _patches(codes: Int64[Tensor, " T"], starts: Int64[Tensor, " P"], patch: int) -> Patches:
-    """Patches of at most `patch` tokens, each padded to that many places.
+def _cut_patches(codes: Int64[Tensor, " T"], starts: Int64[Tensor, " P"], patch: int) -> PatchIndex:
+    """Cuts tokens into patches, each padded to `patch` slots.
 
     Args:
-        codes: along the order, of the tokens.
-        starts: of the whole scene's patches; negative where this is all of it.
-        patch: most tokens in a patch.
+        codes: codes of the tokens along the order.
+        starts: first codes of the patches of the full scene; negative if the cloud is the full scene.
+        patch: largest number of tokens in a patch.
     """
     count = codes.shape[0]
     codes, rows = torch.sort(codes, stable=True)
     rank = torch.arange(count, device=codes.device)
-    number = ((rank + 1) * ((count + patch - 1) // patch) - 1) // count
-    number = torch.where(starts[:1] < 0, number, torch.searchsorted(starts, codes, right=True) - 1)
-    first, run = _runs(number)
+    patch_number = ((rank + 1) * ((count + patch - 1) // patch) - 1) // count
+    patch_number = torch.where(starts[:1] < 0, patch_number, torch.searchsorted(starts, codes, right=True) - 1)
+    first, run = _runs(patch_number)
     slots = run * patch + rank - first.index_select(0, run)
-    places = rank.new_zeros(first.shape[0] * patch)
-    used = torch.zeros_like(places, dtype=torch.bool).scatter(0, slots, torch.ones_like(rank, dtype=torch.bool))
-    return Patches(
-        gather=places.scatter(0, slots, rows),
+    empty_slots = rank.new_zeros(first.shape[0] * patch)
+    used = torch.zeros_like(empty_slots, dtype=torch.bool).scatter(0, slots, torch.ones_like(rank, dtype=torch.bool))
+    return PatchIndex(
+        gather=empty_slots.scatter(0, slots, rows),
         scatter=torch.empty_like(rows).scatter(0, rows, slots),
         mask=used.view(-1, 1, 1, patch),
     )

@@ -1,4 +1,4 @@
-"""An encoder on disk: one safetensors file that says what network it is for and what its outputs mean."""
+"""Encoder weights on disk: one safetensors file with parameters, configuration of the network and output space."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -12,36 +12,36 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.model_files import find_file
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
-from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
+from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 
 WEIGHTS_FILE = "encoder.safetensors"
-SHIPPED = Path(__file__).resolve().parent.parent / "weights"
-"""Encoders that come with the package, a folder each."""
+SHIPPED_WEIGHTS = Path(__file__).resolve().parent.parent / "weights"
+"""Folder of the encoders that come with the package, one folder each."""
 
 
-def find_weights(given: str) -> Path:
-    """The weights that a user means: the folder that `train` wrote, a file, or the name of some that come with the
-    package; files are also looked for in GSENCODER_MODELS.
+def find_weights(source: str) -> Path:
+    """Finds the file of weights: in a folder that `train` wrote, at a path, or by the name of an encoder that comes
+    with the package. Relative paths are also looked up in GSENCODER_MODELS.
 
     Raises:
-        InputError: there are none.
+        InputError: there is no such file.
     """
-    names = sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS_FILE}"))
+    names = sorted(path.parent.name for path in SHIPPED_WEIGHTS.glob(f"*/{WEIGHTS_FILE}"))
     try:
-        own = Path(given) / WEIGHTS_FILE
-        if given and own.is_file():
-            return own
-        if given in names:
-            return SHIPPED / given / WEIGHTS_FILE
-        if given and Path(given).is_dir():
-            exports = sorted(path.name for path in Path(given).glob("*.onnx"))
+        in_folder = Path(source) / WEIGHTS_FILE
+        if source and in_folder.is_file():
+            return in_folder
+        if source in names:
+            return SHIPPED_WEIGHTS / source / WEIGHTS_FILE
+        if source and Path(source).is_dir():
+            exports = sorted(path.name for path in Path(source).glob("*.onnx"))
             hint = f"; give its {', '.join(exports)} by its full path" if exports else ""
-            raise InputError(f"weights: the folder {given} holds no {WEIGHTS_FILE}{hint}")
-        return find_file(given, "weights")
+            raise InputError(f"weights: the folder {source} holds no {WEIGHTS_FILE}{hint}")
+        return find_file(source, "weights")
     except InputError as error:
-        raise InputError(f"{error}; gsencoder comes with {', '.join(names)}") from error
+        raise InputError(f"{error}; encoders that come with gsencoder: {', '.join(names)}") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"weights: {given[:200]!r} is not a path ({type(error).__name__})") from error
+        raise InputError(f"weights: {source[:200]!r} is not a path ({type(error).__name__})") from error
 
 
 def save_weights(
@@ -52,42 +52,47 @@ def save_weights(
     *,
     dtype: Literal["float32", "float16"] = "float32",
 ) -> None:
-    """Writes parameters, configuration and output space; what had the name stays until the new file is whole.
+    """Writes parameters, configuration and output space; an existing file is replaced only by a complete new one.
 
     Args:
         path: the file.
-        encoder: whose parameters are stored.
-        outputs: what its numbers mean.
+        encoder: the encoder to save.
+        outputs: its output space.
         made_by: settings and results of the training, as JSON values.
-        dtype: float16 halves the file; parameters are a few units at most, and lose 3 digits.
+        dtype: type of the stored parameters. float16 halves the file and keeps 3 decimal digits of the parameters,
+            which are small numbers.
 
     Raises:
-        InputError: parameters that are not finite, or the disk is full.
+        InputError: a parameter is not finite, or the disk is full.
     """
-    arrays, header = write_outputs(outputs)
+    arrays, header = output_space_parts(outputs)
     for name, value in encoder.state_dict().items():
         with np.errstate(over="ignore"):
             stored = value.detach().cpu().numpy().astype(dtype)
         if not np.isfinite(stored).all():
-            wide = f" in {dtype}; take store=float32, or a lower learning rate" if torch.isfinite(value).all() else ""
-            raise InputError(f"save_weights: parameter {name} is not finite{wide}")
+            remedy = f" in {dtype}; use store=float32 or a lower learning rate" if torch.isfinite(value).all() else ""
+            raise InputError(f"save_weights: parameter {name} is not finite{remedy}")
         arrays[f"encoder.{name}"] = stored
     header |= {"encoder": asdict(encoder.config), "dtype": dtype, "made_by": dict(made_by)}
     write_archive(path, arrays, header)
 
 
-def load_weights(given: str | Path) -> tuple[GaussianEncoder, OutputSpace, dict[str, Any]]:
-    """The encoder, in evaluation mode, its output space, and what made it.
+def load_weights(source: str | Path) -> tuple[GaussianEncoder, OutputSpace, dict[str, Any]]:
+    """Loads an encoder.
 
     Args:
-        given: a file, a folder of `train`, or a name; see `find_weights`.
+        source: a file, a folder that `train` wrote, or the name of an encoder that comes with the package; see
+            `find_weights`.
+
+    Returns:
+        The encoder in evaluation mode, its output space, and settings and results of its training.
 
     Raises:
-        InputError: missing, damaged, of another version, or not the parameters that its configuration needs.
+        InputError: the file is missing, damaged or of another version, or its parameters do not fit its configuration.
     """
-    with open_archive(find_weights(str(given))) as file:
-        config = _config(file.value("encoder", dict))
-        outputs = read_outputs(file)
+    with open_archive(find_weights(str(source))) as file:
+        config = _read_config(file.value("encoder", dict))
+        outputs = read_output_space(file)
         dtype = file.value("dtype", str)
         if dtype not in ("float32", "float16"):
             raise InputError(f"expected parameters of float32 or float16, got {dtype[:20]!r}")
@@ -102,10 +107,10 @@ def load_weights(given: str | Path) -> tuple[GaussianEncoder, OutputSpace, dict[
     return encoder.eval(), outputs, made_by
 
 
-def _config(values: dict[str, Any]) -> EncoderConfig:
+def _read_config(values: dict[str, Any]) -> EncoderConfig:
     import dacite
 
     try:
         return dacite.from_dict(EncoderConfig, values, dacite.Config(strict=True, cast=[tuple]))
     except (dacite.DaciteError, TypeError) as error:
-        raise InputError(f"the encoder's configuration is not one of this version: {error}") from error
+        raise InputError(f"the encoder's configuration does not fit this version of gsencoder: {error}") from error

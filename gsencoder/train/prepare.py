@@ -23,7 +23,7 @@ from gsencoder.fusion.lift import capped
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
-from gsencoder.models.output_space import OutputSpace, read_outputs, write_outputs
+from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 from gsencoder.render import blend
 from gsencoder.train.class_balance import Rarity, cluster_targets, count_targets
 from gsencoder.train.dataset_space import dataset_space
@@ -113,7 +113,7 @@ class PreparedDataset:
                 "another folder as prepared="
             )
         outputs, codebook = dataset_space(scenes, open_scene, config.fusion, views=config.basis_views)
-        arrays, header = write_outputs(outputs)
+        arrays, header = output_space_parts(outputs)
         if codebook is not None:
             arrays["codebook"] = codebook
         write_archive(self.folder / SPACE_FILE, arrays, header)
@@ -129,7 +129,7 @@ class PreparedDataset:
             InputError: missing or damaged.
         """
         with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
-            outputs = read_outputs(file)
+            outputs = read_output_space(file)
             codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
         return outputs, codebook
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.protocols.naming import NamingProtocol, SceneNames, naming_scores, nearest_words
-from gsencoder.evaluate.validation import nearest_names
+from gsencoder.evaluate.protocols.naming import NamingCounts, NamingProtocol, naming_scores, nearest_words
+from gsencoder.evaluate.validation import nearest_classes
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 
-def outcome(scene: str, total: dict[str, int], right: dict[str, int]) -> SceneNames:
-    return SceneNames(scene=scene, total=total, right=right, cosine=0.5, seconds={})
+def outcome(scene: str, total: dict[str, int], correct: dict[str, int]) -> NamingCounts:
+    return NamingCounts(scene=scene, total=total, correct=correct, cosine=0.5, seconds={})
 
 
 def test_every_name_counts_the_same_over_all_scenes_together() -> None:
@@ -50,5 +50,5 @@ def test_the_nearest_word_is_that_of_the_largest_cosine_with_a_basis_or_without(
     assert np.array_equal(nearest_words(plain, rows, vectors), expected)
     assert np.array_equal(nearest_words(in_basis, rows, vectors), expected)
     # In standard units the nearest unit vector is the one of largest cosine, whatever was taken off and divided out.
-    told = nearest_names((features - mean) / 3, (vectors - mean) / 3, np.arange(5))
+    told = nearest_classes((features - mean) / 3, (vectors - mean) / 3, np.arange(5))
     assert np.array_equal(told, expected)

@@ -8,7 +8,7 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.runtime.peak_memory import memory_growth
-from gsencoder.evaluate.boxes import Hit, aabb_iou, accuracy, asked_objects, score_boxes
+from gsencoder.evaluate.boxes import Hit, aabb_iou, accuracy, queryable_objects, score_boxes
 from gsencoder.evaluate.protocols.localization import scores, scores_by_name
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.types import Box, FeatureBasis, FeatureSpace, GaussianFeatures, Localization, Scene, SceneObject
@@ -62,8 +62,8 @@ def test_only_small_named_objects_that_were_seen_are_asked_for() -> None:
         thing(4, "fork", 0, 1, placed=True, views=4, max_pixels=900),
         thing(5, "pen", 0, 1, placed=True, views=9, max_pixels=59),
     ]
-    assert [one.id for one in asked_objects(objects)] == [1]
-    assert [one.id for one in asked_objects(objects, min_views=4, min_pixels=59)] == [1, 4, 5]
+    assert [one.id for one in queryable_objects(objects)] == [1]
+    assert [one.id for one in queryable_objects(objects, min_views=4, min_pixels=59)] == [1, 4, 5]
 
 
 def test_the_first_box_counts_and_any_object_of_its_name_may_be_the_one_found() -> None:

@@ -11,7 +11,14 @@ from PIL import Image
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic.room import make_room, write_room
-from gsencoder.evaluate.tradeoff import BudgetConfig, SweepConfig, Trade, mark_front, pick, settings_of
+from gsencoder.evaluate.tradeoff import (
+    BudgetConfig,
+    SettingResult,
+    SweepConfig,
+    mark_pareto_front,
+    pick_within_budget,
+    sweep_settings,
+)
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.text.table import make_text_table, save_text_table
 
@@ -22,16 +29,16 @@ SMALL = SweepConfig(
 )
 
 
-def trade(label: str, seconds: float, error: float) -> Trade:
+def trade(label: str, seconds: float, error: float) -> SettingResult:
     knobs = {"views": len(label)}
-    return Trade(
+    return SettingResult(
         label=label, knobs=knobs, seconds=seconds, mib=1.0, rank=1.0, error=error, raw_error=0.0, covered=1.0, hits=()
     )
 
 
 def test_one_knob_is_changed_at_a_time_and_the_defaults_come_first() -> None:
     base = FuseConfig()
-    settings = settings_of(SMALL, base)
+    settings = sweep_settings(SMALL, base)
     assert settings[0] == ({}, base)
     assert [knobs for knobs, _ in settings[1:]] == [
         {"rays_per_patch": 1}, {"rays_per_patch": 4}, {"stop_transmittance": 0.1}, {"max_rank": 2}, {"views": 3},
@@ -50,30 +57,32 @@ def test_a_value_that_is_the_default_is_not_tried_twice() -> None:
         max_rank=(),
         views=(),
     )
-    assert len(settings_of(sweep, base)) == 1
+    assert len(sweep_settings(sweep, base)) == 1
 
 
 def test_a_grid_tries_all_with_all() -> None:
     sweep = SweepConfig(
         rays_per_patch=(1,), min_weight=(0.1,), stop_transmittance=(), energy=(), max_rank=(), views=(2, 3), grid=True
     )
-    settings = settings_of(sweep, FuseConfig())
+    settings = sweep_settings(sweep, FuseConfig())
     assert len(settings) == 2 * 2 * 3
     assert len({json.dumps(knobs) for knobs, _ in settings}) == len(settings)
 
 
 def test_the_front_holds_what_nothing_beats() -> None:
-    trades = mark_front([trade("a", 1.0, 0.3), trade("b", 2.0, 0.2), trade("c", 3.0, 0.25), trade("d", 2.0, 0.2)])
+    trades = mark_pareto_front(
+        [trade("a", 1.0, 0.3), trade("b", 2.0, 0.2), trade("c", 3.0, 0.25), trade("d", 2.0, 0.2)]
+    )
     assert [one.on_front for one in trades] == [True, True, False, True]
 
 
 def test_a_budget_of_error_takes_the_fastest_and_one_of_seconds_the_most_exact() -> None:
     trades = [trade("reference", 0.1, 0.0), trade("slow", 3.0, 0.1), trade("mid", 2.0, 0.2), trade("fast", 1.0, 0.3)]
-    assert pick(trades, BudgetConfig(error=0.25)).label == "mid"
-    assert pick(trades, BudgetConfig(seconds=2.5)).label == "mid"
-    assert pick(trades, BudgetConfig(seconds=5.0, error=0.3)).label == "fast"
+    assert pick_within_budget(trades, BudgetConfig(error=0.25)).label == "mid"
+    assert pick_within_budget(trades, BudgetConfig(seconds=2.5)).label == "mid"
+    assert pick_within_budget(trades, BudgetConfig(seconds=5.0, error=0.3)).label == "fast"
     with pytest.raises(InputError, match=r"fastest \(fast\).*most exact \(slow\)"):
-        pick(trades, BudgetConfig(seconds=0.5))
+        pick_within_budget(trades, BudgetConfig(seconds=0.5))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 from training_scenes import prepared, small_encoder
 
 from gsencoder.evaluate import validation
-from gsencoder.evaluate.validation import KindAccuracy, nearest_names, validate_encoder
+from gsencoder.evaluate.validation import ClassAccuracy, nearest_classes, validate_encoder
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.train.prepared_scene import PreparedScene
@@ -14,7 +14,7 @@ from gsencoder.types import GaussianFeatures
 
 def test_choices_are_those_that_occur_in_the_scene() -> None:
     codebook = np.eye(3, dtype=np.float32)
-    assert nearest_names(codebook, codebook, np.array([0, 2])).tolist()[::2] == [0, 2]
+    assert nearest_classes(codebook, codebook, np.array([0, 2])).tolist()[::2] == [0, 2]
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[PreparedScene]
 
 def judged(
     walls: tuple[list[PreparedScene], OutputSpace, np.ndarray], monkeypatch: pytest.MonkeyPatch, answers: object
-) -> KindAccuracy:
+) -> ClassAccuracy:
     """Validation of an encoder that answers with what a function makes of the targets of each scene in turn."""
     scenes, outputs, codebook = walls
     turn = iter(scenes)
@@ -70,7 +70,7 @@ def test_an_encoder_is_drawn_beside_the_truth(
     walls: tuple[list[PreparedScene], OutputSpace, np.ndarray],
 ) -> None:
     scenes, outputs, codebook = walls
-    found = validate_encoder(scenes, small_encoder(), outputs, codebook, EncodeConfig(precision="float32"), shown=1)
+    found = validate_encoder(scenes, small_encoder(), outputs, codebook, EncodeConfig(precision="float32"), pictured=1)
     assert found.sheet is not None
     assert found.sheet.shape[2] == 3
     assert len(np.unique(found.sheet.reshape(-1, 3), axis=0)) > 10

@@ -8,7 +8,7 @@ import torch
 
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import rotmats_from_quats
-from gsencoder.models.embed import CHANNELS, channels_of, embed
+from gsencoder.models.embed import ATTRIBUTE_CHANNELS, embed, input_channels
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, encoder_inputs, merge
 from gsencoder.models.grid.plan import join_plans, plan_cloud
 from gsencoder.models.point_transformer import TransformerConfig
@@ -86,7 +86,7 @@ def test_one_ellipsoid_has_one_embedding_however_it_is_written() -> None:
     tensors = [torch.from_numpy(getattr(one, name)) for name in ("means", "quats", "scales", "opacities")]
     means, quats, scales, opacities = tensors
     sh = torch.from_numpy(one.sh[:, 0])
-    names = tuple(CHANNELS)
+    names = tuple(ATTRIBUTE_CHANNELS)
     plain = embed(means, quats, scales, opacities, sh, voxel=0.1, attributes=names)
     # Turning the Gaussian's own frame by a third of a turn about its diagonal renames x, y, z as y, z, x.
     third = torch.tensor([0.5, 0.5, 0.5, 0.5])
@@ -120,9 +120,9 @@ def test_embeddings_stay_small_at_the_ends_of_what_a_splat_may_hold() -> None:
         torch.tensor([0.0, 1.0, 0.5]),
         torch.tensor([[1e30, -1e30, 0]] * 3),
         voxel=0.02,
-        attributes=tuple(CHANNELS),
+        attributes=tuple(ATTRIBUTE_CHANNELS),
     )
-    assert channels.shape == (3, channels_of(tuple(CHANNELS)))
+    assert channels.shape == (3, input_channels(tuple(ATTRIBUTE_CHANNELS)))
     assert channels.abs().max() <= 9
 
 
@@ -226,13 +226,13 @@ def test_thousands_of_coincident_gaussians_are_one_token() -> None:
     ("change", "message"),
     [
         ({"decoder_depths": (1,)}, "decoder_depths: expected 2 entries"),
-        ({"encoder_channels": (16, 32)}, "encoder_channels: expected one entry a level"),
+        ({"encoder_channels": (16, 32)}, "encoder_channels: expected one entry per level"),
         ({"head_channels": 12}, "multiples of head_channels"),
         ({"patch": 0}, "patch"),
         ({"orders": ()}, "orders"),
         ({"drop_path": 1.0}, "drop_path"),
         ({"encoder_depths": (1, -1, 1)}, "encoder_depths"),
-        ({"encoder_depths": ()}, "encoder_depths: expected one entry a level"),
+        ({"encoder_depths": ()}, "encoder_depths: expected one entry per level"),
         ({"encoder_depths": (1,) * 8}, "1 to 7 levels, got 8"),
         ({"head_channels": 0}, "head_channels and patch"),
     ],

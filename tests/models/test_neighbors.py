@@ -58,11 +58,11 @@ def test_extents_of_a_million_cells_do_not_overflow() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 5, 300])
-@pytest.mark.parametrize("rows_at_once", [64, 8192])
+@pytest.mark.parametrize("block_rows", [64, 8192])
 def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(
-    count: int, rows_at_once: int, monkeypatch: pytest.MonkeyPatch
+    count: int, block_rows: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(neighbors, "ROWS_AT_ONCE", rows_at_once)
+    monkeypatch.setattr(neighbors, "CPU_BLOCK_ROWS", block_rows)
     table = neighbor_table(distinct_cells(count, 8))
     layer = NeighborConv(3, 5).double()
     x = torch.randn(len(table), 3, dtype=torch.float64, requires_grad=True)

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.models.grid.curves import curves_of
-from gsencoder.models.grid.plan import ORDERS, Level, Plan, _rounded, join_plans, plan_cloud
+from gsencoder.models.grid.curves import cut_scene_curves
+from gsencoder.models.grid.plan import ORDERS, Level, Plan, _round_up_size, join_plans, plan_cloud
 
 VOXEL = 0.1
 
@@ -29,8 +29,8 @@ def check(plan: Plan, gaussians: int) -> None:
     assert torch.equal(plan.token_of[plan.members], torch.repeat_interleave(plan.counts))
     for level in plan.levels:
         tokens = len(level.neighbors)
-        for gather, scatter in zip(level.gathers, level.scatters, strict=True):
-            assert gather.numel() % level.width == 0
+        for gather, scatter in zip(level.gather_index, level.scatter_index, strict=True):
+            assert gather.numel() % level.patch_width == 0
             assert int(gather.max()) < tokens
             assert int(scatter.max()) < gather.numel()
 
@@ -42,12 +42,12 @@ def test_every_plan_holds_together(count: int, levels: int, patch: int, round_up
     check(plan, count)
     real = len(plan.counts)
     for number, level in enumerate(plan.levels):
-        for order, (gather, scatter) in enumerate(zip(level.gathers, level.scatters, strict=True)):
+        for order, (gather, scatter) in enumerate(zip(level.gather_index, level.scatter_index, strict=True)):
             # Each token stands in exactly one place that attention looks at, and finds itself there.
             assert torch.equal(gather[scatter[:real]], torch.arange(real))
             used = torch.ones_like(gather, dtype=torch.bool) if level.attn_mask is None else level.attn_mask[order]
             patches = -(-real // patch)
-            assert int(used.reshape(-1, level.width)[:patches].sum()) == real
+            assert int(used.reshape(-1, level.patch_width)[:patches].sum()) == real
         if number + 1 < levels:
             coarser = len(torch.unique(level.parents[:real]))
             assert torch.equal(torch.unique(level.parents[:real]), torch.arange(coarser))
@@ -70,9 +70,9 @@ def test_patches_of_a_cloud_differ_by_one_token_at_most() -> None:
     plan = make_plan(cloud(1000), VOXEL, levels=1, patch=64)
     level = plan.levels[0]
     assert level.attn_mask is not None
-    sizes = level.attn_mask.reshape(-1, level.width).sum(dim=1)
+    sizes = level.attn_mask.reshape(-1, level.patch_width).sum(dim=1)
     assert sizes.max() - sizes.min() <= 1
-    assert level.width <= 64
+    assert level.patch_width <= 64
 
 
 def test_patches_are_compact_in_space() -> None:
@@ -83,13 +83,13 @@ def test_patches_are_compact_in_space() -> None:
     first = plan.members[plan.counts.cumsum(0) - plan.counts]
     centers = points[first]
     for order in range(len(ORDERS)):
-        placed = centers[level.gathers[order]].view(-1, level.width, 3)
+        placed = centers[level.gather_index[order]].view(-1, level.patch_width, 3)
         assert placed.std(dim=1).mean() < 0.5 * centers.std(dim=0).mean()
 
 
 def patch_of(level: Level, order: int, tokens: int) -> torch.Tensor:
     """The patch of each token."""
-    return level.scatters[order, :tokens] // level.width
+    return level.scatter_index[order, :tokens] // level.patch_width
 
 
 @given(st.integers(30, 400), st.integers(1, 3), st.integers(2, 40), st.integers(0, 5))
@@ -101,12 +101,12 @@ def test_tokens_of_a_part_share_a_patch_exactly_where_they_do_in_the_whole(
     part = torch.nonzero(points[:, 0] > 0.7).flatten()
     if not len(part):
         return
-    curves = curves_of(points.numpy(), VOXEL, levels=levels, orders=ORDERS, patch=patch)
+    curves = cut_scene_curves(points.numpy(), VOXEL, levels=levels, orders=ORDERS, patch=patch)
     whole = join_plans([plan_cloud(points, VOXEL, levels=levels)], patch)
-    plan = join_plans([plan_cloud(points[part], VOXEL, levels=levels, whole=curves)], patch)
+    plan = join_plans([plan_cloud(points[part], VOXEL, levels=levels, scene_curves=curves)], patch)
     theirs, ours = whole.token_of[part], plan.token_of
     for there, here in zip(whole.levels, plan.levels, strict=True):
-        assert here.width <= patch
+        assert here.patch_width <= patch
         for order in range(4):
             a = patch_of(there, order, int(theirs.max()) + 1)[theirs]
             b = patch_of(here, order, int(ours.max()) + 1)[ours]
@@ -119,12 +119,12 @@ def test_tokens_of_a_part_share_a_patch_exactly_where_they_do_in_the_whole(
 
 def test_the_whole_as_a_part_of_itself_has_the_plan_that_it_has() -> None:
     points = cloud(500)
-    curves = curves_of(points.numpy(), VOXEL, levels=3, orders=ORDERS, patch=48)
+    curves = cut_scene_curves(points.numpy(), VOXEL, levels=3, orders=ORDERS, patch=48)
     plain = join_plans([plan_cloud(points, VOXEL, levels=3)], 48)
-    again = join_plans([plan_cloud(points, VOXEL, levels=3, whole=curves)], 48)
+    again = join_plans([plan_cloud(points, VOXEL, levels=3, scene_curves=curves)], 48)
     for one, other in zip(plain.levels, again.levels, strict=True):
-        assert torch.equal(one.gathers, other.gathers)
-        assert torch.equal(one.scatters, other.scatters)
+        assert torch.equal(one.gather_index, other.gather_index)
+        assert torch.equal(one.scatter_index, other.scatter_index)
 
 
 def test_clouds_side_by_side_have_the_plans_that_they_have_alone() -> None:
@@ -140,21 +140,21 @@ def test_clouds_side_by_side_have_the_plans_that_they_have_alone() -> None:
         moved = torch.where(second.neighbors == len(second.neighbors), total, second.neighbors + n)
         assert torch.equal(joined.neighbors[n:], moved.int())
         # No patch holds tokens of both.
-        for gather in joined.gathers:
-            sides = (gather.view(-1, joined.width) < n).float().mean(dim=1)
+        for gather in joined.gather_index:
+            sides = (gather.view(-1, joined.patch_width) < n).float().mean(dim=1)
             assert ((sides == 0) | (sides == 1)).all()
 
 
 def test_sizes_are_rounded_up_by_an_eighth_at_most_and_to_few() -> None:
     counts = range(64, 5000)
-    rounded = [_rounded(count) for count in counts]
+    rounded = [_round_up_size(count) for count in counts]
     assert all(count <= size <= 1.125 * count for count, size in zip(counts, rounded, strict=True))
     for power in (64, 256, 1024):
         # Sixteenths of the next power of two; none is rounded further.
         octave = {size for count, size in zip(counts, rounded, strict=True) if power <= count < 2 * power}
         assert len(octave) <= 9
-        assert {_rounded(size) for size in octave} == octave
-    assert [_rounded(count) for count in (0, 1, 8, 9)] == [0, 8, 8, 16]
+        assert {_round_up_size(size) for size in octave} == octave
+    assert [_round_up_size(count) for count in (0, 1, 8, 9)] == [0, 8, 8, 16]
 
 
 def test_rounding_up_makes_few_sizes() -> None:

@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.models.grid.cells import cells_of
+from gsencoder.models.grid.cells import grid_coords
 from gsencoder.models.grid.serialize import (
     ALIGN,
-    LARGEST_EXTENT,
-    NEVER,
-    bits_of,
+    INVALID_CODE,
+    MAX_EXTENT,
     check_extent,
+    coordinate_bits,
     encode_cells,
     hilbert_from_morton,
     morton_codes,
@@ -82,7 +82,7 @@ def test_codes_are_distinct_at_the_far_end_of_twenty_bits() -> None:
     far = 2**20 + ALIGN - 1
     cells = torch.tensor(list(itertools.product((0, 1, far - 1, far), repeat=3)))
     for order in ORDERS:
-        codes = encode_cells(cells, order, bits_of(cells))
+        codes = encode_cells(cells, order, coordinate_bits(cells))
         assert len(codes.unique()) == 64
         assert (codes >= 0).all()
 
@@ -97,42 +97,42 @@ def test_a_part_counted_from_the_corner_of_the_whole_has_the_codes_of_the_whole(
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 20 - 7
     part = points[points[:, 0] > 5]
     corner = points.amin(dim=0)
-    whole, alone = cells_of(points, 0.02), cells_of(part, 0.02, corner)
+    whole, alone = grid_coords(points, 0.02), grid_coords(part, 0.02, corner)
     assert torch.equal(alone, whole[points[:, 0] > 5])
-    assert not torch.equal(cells_of(part, 0.02), alone)
+    assert not torch.equal(grid_coords(part, 0.02), alone)
     # A corner that lies within the part, by rounding, is no reason for cells below zero.
-    assert (cells_of(part, 0.02, part.amax(dim=0)) >= 0).all()
+    assert (grid_coords(part, 0.02, part.amax(dim=0)) >= 0).all()
 
 
 def test_cells_are_anchored_so_that_a_part_falls_into_the_cells_of_the_whole() -> None:
     points = torch.from_numpy(np.random.default_rng(0).uniform(-5, 5, (1000, 3)).astype(np.float32))
-    whole, part = cells_of(points, 0.02), cells_of(points[:100], 0.02)
+    whole, part = grid_coords(points, 0.02), grid_coords(points[:100], 0.02)
     shift = whole[:100] - part
     assert (shift == shift[0]).all()
     assert (shift[0] % ALIGN == 0).all()
 
 
 def test_a_cloud_may_spread_over_almost_a_million_cells_but_no_further() -> None:
-    ends = torch.tensor([[0.0, 0, 0], [LARGEST_EXTENT - 1.5, 0, 0]])
-    assert cells_of(ends, 1.0).max() < LARGEST_EXTENT + ALIGN
+    ends = torch.tensor([[0.0, 0, 0], [MAX_EXTENT - 1.5, 0, 0]])
+    assert grid_coords(ends, 1.0).max() < MAX_EXTENT + ALIGN
     with pytest.raises(InputError, match="check the unit"):
-        cells_of(torch.tensor([[0.0, 0, 0], [LARGEST_EXTENT + 0.0, 0, 0]]), 1.0)
+        grid_coords(torch.tensor([[0.0, 0, 0], [MAX_EXTENT + 0.0, 0, 0]]), 1.0)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 def test_positions_that_are_not_finite_are_counted_and_refused(bad: float) -> None:
     with pytest.raises(InputError, match="1 of 2 positions are not finite"):
-        cells_of(torch.tensor([[0.0, 0, 0], [0, bad, 0]]), 1.0)
+        grid_coords(torch.tensor([[0.0, 0, 0], [0, bad, 0]]), 1.0)
 
 
 def test_no_points_have_no_cells() -> None:
-    assert cells_of(torch.zeros(0, 3), 0.1).shape == (0, 3)
-    assert bits_of(torch.zeros(0, 3, dtype=torch.int64)) == 1
+    assert grid_coords(torch.zeros(0, 3), 0.1).shape == (0, 3)
+    assert coordinate_bits(torch.zeros(0, 3, dtype=torch.int64)) == 1
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_arrays_and_tensors_have_the_same_codes(order: str) -> None:
-    cells = np.random.default_rng(0).integers(0, LARGEST_EXTENT, (500, 3))
+    cells = np.random.default_rng(0).integers(0, MAX_EXTENT, (500, 3))
     codes = encode_cells(cells, order, 20)
     assert isinstance(codes, np.ndarray)
     np.testing.assert_array_equal(encode_cells(torch.from_numpy(cells), order, 20).numpy(), codes)
@@ -140,12 +140,12 @@ def test_arrays_and_tensors_have_the_same_codes(order: str) -> None:
 
 def test_bits_are_those_of_the_largest_coordinate() -> None:
     for largest, bits in ((0, 1), (1, 1), (2, 2), (3, 2), (4, 3), (2**20, 21)):
-        assert bits_of(torch.tensor([[0, largest, 0], [0, 0, 0]])) == bits
+        assert coordinate_bits(torch.tensor([[0, largest, 0], [0, 0, 0]])) == bits
 
 
 def test_an_extent_below_the_limit_is_let_through_and_no_other() -> None:
-    check_extent(LARGEST_EXTENT - 0.5, 0.1)
-    for extent in (float(LARGEST_EXTENT), float("inf"), float("nan")):
+    check_extent(MAX_EXTENT - 0.5, 0.1)
+    for extent in (float(MAX_EXTENT), float("inf"), float("nan")):
         with pytest.raises(InputError, match="cells of 0.1 units"):
             check_extent(extent, 0.1)
 
@@ -153,9 +153,9 @@ def test_an_extent_below_the_limit_is_let_through_and_no_other() -> None:
 @pytest.mark.parametrize("order", ORDERS)
 def test_no_cell_has_the_code_that_none_has(order: str) -> None:
     """Coordinates have 21 bits with the room for alignment, and three of them fill an int64 to its last bit."""
-    far = LARGEST_EXTENT + ALIGN - 1
+    far = MAX_EXTENT + ALIGN - 1
     cells = torch.tensor(list(itertools.product((0, far), repeat=3)))
-    codes = encode_cells(cells, order, bits_of(cells))
+    codes = encode_cells(cells, order, coordinate_bits(cells))
     assert (codes >= 0).all()
-    assert (codes < NEVER).all()
-    assert np.iinfo(np.int64).max == NEVER
+    assert (codes < INVALID_CODE).all()
+    assert np.iinfo(np.int64).max == INVALID_CODE

@@ -73,7 +73,7 @@ def with_header(path: Path, change: dict) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"encoder": {"voxel": 0.1, "depth": 3}}, "configuration is not one of this version"),
+        ({"encoder": {"voxel": 0.1, "depth": 3}}, "configuration does not fit this version"),
         ({"encoder": {"voxel": -1.0}}, "voxel: expected a positive length"),
         ({"encoder": None}, "expected encoder"),
         ({"scale": 0.0}, "scale"),

@@ -25,7 +25,7 @@ from gsencoder.evaluate.protocols.localization import (
     scores_by_name,
 )
 from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming, naming_scores
-from gsencoder.evaluate.sources import Source, encoded, fused, opened
+from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, load_scenes
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -68,9 +68,9 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
         )
     if config.weights:
         keep_heap()
-        source = encoded(load_encoder(config.weights, config.encode.device), config.encode)
+        source = encoder_source(load_encoder(config.weights, config.encode.device), config.encode)
     else:
-        source = fused(config.teacher, words, config.fusion)
+        source = fusion_source(config.teacher, words, config.fusion)
     out = config.out or Path("outputs") / "evaluate" / config.protocol.name
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         if isinstance(config.protocol, NamingProtocol):
@@ -83,13 +83,13 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
 
 
 def _scenes(config: EvaluateConfig) -> Iterator[tuple[Scene, float]]:
-    return opened(find_scenes(config.paths), config.data, config.splat, Progress(quiet=config.quiet))
+    return load_scenes(find_scenes(config.paths), config.data, config.splat, Progress(quiet=config.quiet))
 
 
 def _localization(
     config: EvaluateConfig,
     protocol: LocalizationProtocol,
-    source: Source,
+    source: FeatureSource,
     words: TextTable,
     folder: Path,
     summary: Summary,
@@ -108,7 +108,7 @@ def _localization(
 def _naming(
     config: EvaluateConfig,
     protocol: NamingProtocol,
-    source: Source,
+    source: FeatureSource,
     words: TextTable,
     folder: Path,
     summary: Summary,

@@ -15,8 +15,16 @@ from gsencoder.core.files.json_values import write_bytes
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
-from gsencoder.evaluate.tradeoff import BudgetConfig, SweepConfig, Trade, pick, row_of, settings_of, trade_off
-from gsencoder.evaluate.tradeoff_plot import plot_trades
+from gsencoder.evaluate.tradeoff import (
+    BudgetConfig,
+    SettingResult,
+    SweepConfig,
+    measure_tradeoff,
+    pick_within_budget,
+    sweep_settings,
+    table_row,
+)
+from gsencoder.evaluate.tradeoff_plot import plot_tradeoff
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -42,11 +50,11 @@ class TradeoffConfig(CommonConfig):
 
 def run(config: TradeoffConfig, summary: Summary) -> None:
     """Sweeps, prints the table, writes it with a plot, and names the setting that a budget asks for."""
-    settings_of(config.sweep, config.fusion)  # A knob out of range is refused before hours of work.
+    sweep_settings(config.sweep, config.fusion)  # A knob out of range is refused before hours of work.
     out = config.out or Path("outputs") / "tradeoff"
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         with summary.step("sweep"):
-            trades = trade_off(
+            trades = measure_tradeoff(
                 find_scenes(config.paths),
                 teacher=config.teacher,
                 sweep=config.sweep,
@@ -57,10 +65,10 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
                 localization=config.localize,
                 track=Progress(quiet=config.quiet),
             )
-        rows = [row_of(trade) for trade in trades]
+        rows = [table_row(trade) for trade in trades]
         write_bytes(folder / "tradeoff.csv", csv_text(rows).encode())
         with summary.step("plot"):
-            write_bytes(folder / "tradeoff.png", plot_trades(trades))
+            write_bytes(folder / "tradeoff.png", plot_tradeoff(trades))
         summary.results.update(settings=rows, table="tradeoff.csv", plot="tradeoff.png")
         summary.results["picked"] = advice = _advice(trades, config.budget)
     screen = console(config.quiet)
@@ -70,12 +78,12 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
     screen.print(f"{out}: tradeoff.csv and tradeoff.png")
 
 
-def _advice(trades: list[Trade], budget: BudgetConfig) -> str:
+def _advice(trades: list[SettingResult], budget: BudgetConfig) -> str:
     """What keeps to the budget, or that nothing does: measurements of an hour are not thrown away for that."""
     if budget.seconds is None and budget.error is None:
         return ""
     try:
-        chosen = pick(trades, budget)
+        chosen = pick_within_budget(trades, budget)
     except InputError as error:
         return str(error)
     options = " ".join(
@@ -85,12 +93,12 @@ def _advice(trades: list[Trade], budget: BudgetConfig) -> str:
     return f"budget: {options or 'the defaults'} ({chosen.seconds:.3g} s a scene, error {chosen.error:.3g})"
 
 
-def _table(trades: list[Trade]) -> Table:
+def _table(trades: list[SettingResult]) -> Table:
     table = Table(title="● = on the Pareto front of seconds and error", title_justify="left")
     table.add_column("setting")
     for title in ("seconds", "MiB", "rank", "error", "covered", "Acc@0.25", "Acc@0.5", ""):
         table.add_column(title, justify="right")
-    for row in map(row_of, trades):
+    for row in map(table_row, trades):
         found = (f"{row['acc_25']:.3f}", f"{row['acc_50']:.3f}") if row["objects"] else ("", "")
         figures = (f"{row['seconds']:.3f}", f"{row['mib']:.0f}", f"{row['rank']:.1f}", f"{row['error']:.5f}")
         table.add_row(row["setting"], *figures, f"{row['covered']:.4f}", *found, "●" if row["on_front"] else "")

@@ -1,8 +1,8 @@
-"""The localization protocol: labeled scenes in, share of objects whose box was found out.
+"""The localization protocol: the share of objects in labeled scenes whose name leads to a box around them.
 
-For every scene: Gaussians (seeds where it has none), features (fused or encoded), and one box search for the names of
-its small objects that are seen well enough. Settings are the same for all scenes; a name's first box is held against
-the nearest object of that name.
+For each scene it computes Gaussians (seeds if there are none) and features (fused or encoded), and localizes the names
+of all small objects that are seen well enough, with the same settings for all scenes. The first box for a name is
+compared with the object of that name that it overlaps most.
 """
 
 import math
@@ -16,23 +16,27 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.boxes import Hit, accuracy, asked_objects, score_boxes
-from gsencoder.evaluate.sources import Source, with_features
+from gsencoder.evaluate.boxes import Hit, accuracy, queryable_objects, score_boxes
+from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
-LEVELS = (0.25, 0.5)
-"""The IoU that a box needs to count as found."""
+IOU_THRESHOLDS = (0.25, 0.5)
+"""IoUs from which on an object counts as localized."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizationProtocol:
-    """Which objects are asked for."""
+    """Selection of the objects whose names are queried."""
 
     name: Literal["localization"] = "localization"
-    min_views: int = field(default=5, metadata={"help": "objects seen in fewer views are not asked for"})
-    min_pixels: int = field(default=60, metadata={"help": "nor those whose largest visible area is smaller, pixels"})
+    min_views: int = field(
+        default=5, metadata={"help": "smallest number of views in which an object must be seen to be queried"}
+    )
+    min_pixels: int = field(
+        default=60, metadata={"help": "smallest area in its best view that an object must have to be queried, pixels"}
+    )
 
     def __post_init__(self) -> None:
         for name in ("min_views", "min_pixels"):
@@ -42,16 +46,16 @@ class LocalizationProtocol:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneOutcome:
-    """What happened in one scene.
+    """The result of the protocol on one scene.
 
     Attributes:
-        scene: its name.
-        hits: one an object asked for.
-        gaussians: how many it has.
-        seen: how many have features.
+        scene: name of the scene.
+        hits: one for each queried object.
+        gaussians: number of Gaussians.
+        seen: number of Gaussians that have features.
         rank: columns of the features.
-        boxless: asked names without any box.
-        seconds: by step.
+        boxless: number of queried names without any box.
+        seconds: seconds of each step.
     """
 
     scene: str
@@ -65,7 +69,7 @@ class SceneOutcome:
 
 def evaluate_localization(
     scenes: Iterable[tuple[Scene, float]],
-    source: Source,
+    source: FeatureSource,
     words: TextTable,
     *,
     protocol: LocalizationProtocol = LocalizationProtocol(),
@@ -75,46 +79,49 @@ def evaluate_localization(
     """Runs the protocol scene by scene; one scene is in memory at a time.
 
     Args:
-        scenes: with labeled objects, as `opened` gives them.
-        source: what gives a scene its features.
-        words: lead into their space.
-        protocol: which objects are asked for.
+        scenes: scenes with labeled objects and the seconds of loading, as `load_scenes` yields them.
+        source: computes the features of a scene.
+        words: text table of the features' space.
+        protocol: which objects are queried.
         seeds: how Gaussians are made for scenes without.
-        localization: how words become boxes.
+        localization: settings of `localize`.
 
     Returns:
-        One outcome a scene, in order.
+        One outcome per scene, in order.
 
     Warns:
-        SceneWarning: asked names without a box, and scenes in which nothing is asked for; one counted warning each.
+        SceneWarning: queried names have no box, or scenes have no object to query; each is counted over all scenes.
 
     Raises:
-        InputError: no object to ask for in any scene, or whatever is wrong with a scene.
+        InputError: no scene has an object to query, or a scene cannot be used.
     """
     outcomes = []
-    for scene, loaded in scenes:
+    for scene, load_seconds in scenes:
         outcome = evaluate_scene(scene, source, words, protocol=protocol, seeds=seeds, localization=localization)
-        outcomes.append(replace(outcome, seconds={"load": loaded, **outcome.seconds}))
-    _warn_of_gaps(outcomes)
+        outcomes.append(replace(outcome, seconds={"load": load_seconds, **outcome.seconds}))
+    _warn_about_gaps(outcomes)
     return outcomes
 
 
 def evaluate_scene(
     scene: Scene,
-    source: Source,
+    source: FeatureSource,
     words: TextTable,
     *,
     protocol: LocalizationProtocol = LocalizationProtocol(),
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
 ) -> SceneOutcome:
-    """The protocol on one loaded scene; see `evaluate_localization`. Nothing is made where nothing is asked for."""
-    if not asked_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels):
+    """Runs the protocol on one loaded scene; see `evaluate_localization`.
+
+    A scene without objects to query gets neither seeds nor features.
+    """
+    if not queryable_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels):
         count = len(scene.gaussians) if scene.gaussians is not None else 0
         return SceneOutcome(scene=scene.name, hits=(), gaussians=count, seen=0, rank=0, boxless=0, seconds={})
     scene, features, seconds = with_features(scene, source, seeds)
     start = time.perf_counter()
-    hits, boxless = ask(scene, features, words, protocol, localization)
+    hits, boxless = score_queries(scene, features, words, protocol, localization)
     return SceneOutcome(
         scene=scene.name,
         hits=tuple(hits),
@@ -126,58 +133,63 @@ def evaluate_scene(
     )
 
 
-def ask(
+def score_queries(
     scene: Scene,
     features: GaussianFeatures,
     words: TextTable,
     protocol: LocalizationProtocol,
     localization: LocalizeConfig,
 ) -> tuple[list[Hit], int]:
-    """Asks for each object's name in features of the scene's Gaussians: the hits, and how many names have no box."""
-    asked = asked_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
-    names = list(dict.fromkeys(one.name for one in asked if one.name))
+    """Localizes the name of each queryable object in features of the scene's Gaussians.
+
+    Returns:
+        One hit for each object, and the number of names without a box.
+    """
+    targets = queryable_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
+    names = list(dict.fromkeys(target.name for target in targets if target.name))
     if not names:
         return [], 0
     with warnings.catch_warnings():
-        # The counts of all scenes are told once, at the end.
+        # `evaluate_localization` warns once, with the counts of all scenes.
         warnings.filterwarnings("ignore", ".*words have no box", SceneWarning)
-        found = localize(replace(scene, features={features.space.name: features}), names, words, localization)
-    return score_boxes(scene, found, asked), len(set(names) - {box.query for box in found.boxes})
+        result = localize(replace(scene, features={features.space.name: features}), names, words, localization)
+    return score_boxes(scene, result, targets), len(set(names) - {box.query for box in result.boxes})
 
 
-def _warn_of_gaps(outcomes: Sequence[SceneOutcome]) -> None:
+def _warn_about_gaps(outcomes: Sequence[SceneOutcome]) -> None:
     empty = [outcome.scene for outcome in outcomes if not outcome.hits]
     if len(empty) == len(outcomes):
         raise InputError(
-            f"evaluate: none of {len(outcomes)} scenes has an object to ask for; expected an objects.json with placed, "
-            "named objects that are seen well enough (protocol.min_views, protocol.min_pixels)"
+            f"evaluate: none of {len(outcomes)} scenes has an object to query; expected an objects.json with placed, "
+            "named objects that are seen well enough (see protocol.min_views and protocol.min_pixels)"
         )
     if empty:
         warnings.warn(
-            f"{len(empty)} of {len(outcomes)} scenes have no object to ask for (first: {empty[0]!r})",
+            f"{len(empty)} of {len(outcomes)} scenes have no object to query (first: {empty[0]!r})",
             SceneWarning,
             stacklevel=3,
         )
     if boxless := sum(outcome.boxless for outcome in outcomes):
-        asked = sum(len(outcome.hits) for outcome in outcomes)
-        warnings.warn(f"{boxless} names have no box ({asked} objects were asked for)", SceneWarning, stacklevel=3)
+        queried = sum(len(outcome.hits) for outcome in outcomes)
+        warnings.warn(f"{boxless} names have no box ({queried} objects were queried)", SceneWarning, stacklevel=3)
 
 
 def scores(hits: Sequence[Hit]) -> dict[str, Any]:
-    """The figures of the protocol: objects, accuracies at each level and mean IoU, of the first box and of the oracle.
-
-    The oracle takes the best of all boxes of a name, as SplatDistill's table does; no user can.
-    """
+    """The metrics of the protocol: number of objects, accuracy at each threshold, and mean IoU; for first boxes, and
+    with the prefix oracle_ for the best of all boxes of a name, as in SplatDistill's tables."""
     row: dict[str, Any] = {"objects": len(hits)}
     for prefix, oracle in (("", False), ("oracle_", True)):
-        row |= {f"{prefix}acc_{round(level * 100)}": accuracy(hits, level, oracle=oracle) for level in LEVELS}
+        row |= {
+            f"{prefix}acc_{round(threshold * 100)}": accuracy(hits, threshold, oracle=oracle)
+            for threshold in IOU_THRESHOLDS
+        }
         ious = [hit.oracle_iou if oracle else hit.iou for hit in hits]
         row[f"{prefix}mean_iou"] = float(np.mean(ious)) if ious else math.nan
     return row
 
 
 def scores_by_name(hits: Sequence[Hit]) -> dict[str, dict[str, Any]]:
-    """`scores` of each name on its own, worst mean IoU first."""
+    """`scores` of each name separately, in ascending order of mean IoU."""
     names: dict[str, list[Hit]] = {}
     for hit in hits:
         names.setdefault(hit.name, []).append(hit)

@@ -1,8 +1,8 @@
-"""The naming protocol on labeled scenes: is the nearest word of a Gaussian's feature the one that it was fused from?
+"""The naming protocol: the accuracy of classifying Gaussians of labeled scenes by the nearest word to their features.
 
-For every scene the choices are the names of its objects and "other", the normalized mean of the whole table. The truth
-is the nearest of them to the feature that the labels teacher's maps are fused into. Only Gaussians that were seen
-count, and every name counts the same, however many Gaussians it has.
+The classes of a scene are the names of its objects and "other", the normalized mean of the text table. The ground truth
+is the class nearest to the feature fused from the maps of the labels teacher. Only Gaussians that were seen count, and
+all names count equally, however many Gaussians they have.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.sources import Source, with_features
+from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import build_teacher
@@ -22,15 +22,18 @@ from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
-CHUNK = 16_384
+CHUNK_ROWS = 16_384
+"""Rows whose cosines with all words are computed at once."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NamingProtocol:
-    """Which names count."""
+    """Selection of the names that count."""
 
     name: Literal["naming"] = "naming"
-    min_gaussians: int = field(default=1, metadata={"help": "names with fewer Gaussians in all scenes are left out"})
+    min_gaussians: int = field(
+        default=1, metadata={"help": "smallest number of Gaussians, over all scenes, that a name must have to count"}
+    )
 
     def __post_init__(self) -> None:
         if self.min_gaussians < 1:
@@ -38,56 +41,60 @@ class NamingProtocol:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SceneNames:
-    """One scene: for each name the Gaussians that have it, and those among them that were told right.
+class NamingCounts:
+    """Numbers of Gaussians of each name in one scene, and of those classified correctly.
 
     Attributes:
-        scene: its name.
-        total: Gaussians by name, as fused.
-        right: of these, those whose feature is nearest to the same name.
-        cosine: mean cosine of the features with the fused ones, each about its mean.
-        seconds: by step.
+        scene: name of the scene.
+        total: for each name, the Gaussians whose fused feature is nearest to it.
+        correct: for each name, those of them whose evaluated feature is nearest to it too.
+        cosine: mean cosine of evaluated and fused features about the mean of the space; NaN between different spaces.
+        seconds: seconds of each step.
     """
 
     scene: str
     total: dict[str, int]
-    right: dict[str, int]
+    correct: dict[str, int]
     cosine: float
     seconds: dict[str, float]
 
 
 def evaluate_naming(
     scenes: Iterable[tuple[Scene, float]],
-    source: Source,
+    source: FeatureSource,
     words: TextTable,
     *,
     seeds: SeedConfig = SeedConfig(),
     fusion: FuseConfig = FuseConfig(),
-) -> list[SceneNames]:
+) -> list[NamingCounts]:
     """Runs the protocol scene by scene; one scene is in memory at a time.
 
     Args:
-        scenes: labeled, with instance maps, as `opened` gives them.
-        source: what gives a scene the features that are judged.
-        words: of the labels teacher.
+        scenes: labeled scenes with instance maps and the seconds of loading, as `load_scenes` yields them.
+        source: computes the features to evaluate.
+        words: text table of the labels teacher.
         seeds: how Gaussians are made for scenes without.
-        fusion: how the truth is fused.
+        fusion: how the ground truth is fused.
+
+    Returns:
+        One result per scene, in order.
 
     Raises:
-        InputError: whatever is wrong with a scene, or features of a space that the words do not lead into.
+        InputError: a scene cannot be used, or the features are of a space that the text table does not belong to.
     """
-    found = []
-    for bare, loaded in scenes:
-        scene, features, spent = with_features(bare, source, seeds)
+    results = []
+    for loaded_scene, load_seconds in scenes:
+        scene, features, seconds = with_features(loaded_scene, source, seeds)
         teacher = build_teacher(LabelsConfig(), scene, words)
         assert isinstance(teacher, LabelsTeacher)
         truth = fuse(scene, teacher, fusion).features
         if features.space.text_encoder != words.space.text_encoder:
             raise InputError(
-                f"naming: the features are of ({features.space.describe()}), the words of ({words.space.describe()})"
+                f"naming: the features are of the space ({features.space.describe()}), but the words of "
+                f"({words.space.describe()}); give words of the features' space"
             )
-        found.append(compare_names(scene.name, truth, features, teacher, {"load": loaded, **spent}))
-    return found
+        results.append(compare_names(scene.name, truth, features, teacher, {"load": load_seconds, **seconds}))
+    return results
 
 
 def compare_names(
@@ -96,25 +103,25 @@ def compare_names(
     features: GaussianFeatures,
     teacher: LabelsTeacher,
     seconds: dict[str, float],
-) -> SceneNames:
-    """Counts the nearest words of a scene's features against those of the fused ones.
+) -> NamingCounts:
+    """Counts for which Gaussians the nearest word to the feature is the nearest word to the fused feature.
 
     Args:
-        name: of the scene.
-        truth: fused from the teacher's maps; Gaussians that it has not seen do not count.
-        features: of the same Gaussians.
-        teacher: of the scene.
-        seconds: by step, to be kept with the result.
+        name: name of the scene.
+        truth: features fused from the teacher's maps; Gaussians not seen in them do not count.
+        features: features to evaluate, of the same Gaussians.
+        teacher: labels teacher of the scene.
+        seconds: seconds of each step, stored in the result.
     """
     rows = np.flatnonzero(truth.seen)
-    wanted, told = (nearest_words(one, rows, teacher.vectors) for one in (truth, features))
-    total = np.bincount(wanted, minlength=len(teacher.names))
-    right = np.bincount(wanted[told == wanted], minlength=len(teacher.names))
-    there = np.flatnonzero(total)
-    return SceneNames(
+    true_codes, predicted_codes = (nearest_words(values, rows, teacher.vectors) for values in (truth, features))
+    total = np.bincount(true_codes, minlength=len(teacher.names))
+    correct = np.bincount(true_codes[predicted_codes == true_codes], minlength=len(teacher.names))
+    present = np.flatnonzero(total)
+    return NamingCounts(
         scene=name,
-        total={teacher.names[code]: int(total[code]) for code in there},
-        right={teacher.names[code]: int(right[code]) for code in there},
+        total={teacher.names[code]: int(total[code]) for code in present},
+        correct={teacher.names[code]: int(correct[code]) for code in present},
         cosine=1 - field_error(features, truth).centered if features.space == truth.space else float("nan"),
         seconds=seconds,
     )
@@ -123,34 +130,40 @@ def compare_names(
 def nearest_words(
     features: GaussianFeatures, rows: Int64[np.ndarray, " n"], vectors: Float32[np.ndarray, "C D"]
 ) -> Int64[np.ndarray, " n"]:
-    """For each row the vector with which its feature has the largest cosine."""
+    """For each of the given rows, the index of the vector with the largest cosine to its feature."""
     directions = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    parts = [
-        (features.decode(rows[start : start + CHUNK]) @ directions.T).argmax(axis=1)
-        for start in range(0, len(rows), CHUNK)
+    codes = [
+        (features.decode(rows[start : start + CHUNK_ROWS]) @ directions.T).argmax(axis=1)
+        for start in range(0, len(rows), CHUNK_ROWS)
     ]
-    return np.concatenate(parts) if parts else np.zeros(0, np.int64)
+    return np.concatenate(codes) if codes else np.zeros(0, np.int64)
 
 
-def naming_scores(scenes: Sequence[SceneNames], protocol: NamingProtocol = NamingProtocol()) -> dict[str, Any]:
-    """The figures of the protocol: accuracy averaged over names ("other" is one), over objects' names alone, over
-    Gaussians, and of each name, worst first."""
+def naming_scores(scenes: Sequence[NamingCounts], protocol: NamingProtocol = NamingProtocol()) -> dict[str, Any]:
+    """The metrics of the protocol: accuracy averaged over names including "other", over names of objects, and over
+    Gaussians; mean cosine; and the accuracy of each name, in ascending order.
+
+    Raises:
+        InputError: no name has enough Gaussians.
+    """
     total: dict[str, int] = {}
-    right: dict[str, int] = {}
+    correct: dict[str, int] = {}
     for scene in scenes:
         for name, count in scene.total.items():
             total[name] = total.get(name, 0) + count
-            right[name] = right.get(name, 0) + scene.right[name]
-    each = {name: right[name] / count for name, count in total.items() if count >= protocol.min_gaussians}
-    if not each:
-        raise InputError(f"naming: no name has {protocol.min_gaussians} Gaussians")
-    named = [score for name, score in each.items() if name != "other"]
-    gaussians = sum(total[name] for name in each)
-    order = sorted(each, key=lambda name: (each[name], name))
+            correct[name] = correct.get(name, 0) + scene.correct[name]
+    accuracies = {name: correct[name] / count for name, count in total.items() if count >= protocol.min_gaussians}
+    if not accuracies:
+        raise InputError(
+            f"naming: no name has {protocol.min_gaussians} Gaussians or more; lower protocol.min_gaussians"
+        )
+    named = [accuracy for name, accuracy in accuracies.items() if name != "other"]
+    gaussians = sum(total[name] for name in accuracies)
+    order = sorted(accuracies, key=lambda name: (accuracies[name], name))
     return {
-        "accuracy": float(np.mean(list(each.values()))),
+        "accuracy": float(np.mean(list(accuracies.values()))),
         "accuracy_named": float(np.mean(named)) if named else float("nan"),
-        "accuracy_gaussians": sum(right[name] for name in each) / gaussians,
+        "accuracy_gaussians": sum(correct[name] for name in accuracies) / gaussians,
         "cosine": float(np.mean([scene.cosine for scene in scenes])),
-        "names": {name: {"gaussians": total[name], "accuracy": each[name]} for name in order},
+        "names": {name: {"gaussians": total[name], "accuracy": accuracies[name]} for name in order},
     }

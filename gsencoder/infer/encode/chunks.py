@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int64
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device_names import Device, Precision
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.models.grid.curves import Curves
+from gsencoder.models.grid.curves import SceneCurves
 from gsencoder.types import Gaussians
 
 
@@ -55,8 +55,8 @@ class Chunk:
 
 def encode_by_chunks(
     gaussians: Gaussians,
-    run: Callable[[Gaussians, Curves | None], Float32[np.ndarray, "n channels"]],
-    curves: Callable[[], Curves | None],
+    run: Callable[[Gaussians, SceneCurves | None], Float32[np.ndarray, "n channels"]],
+    curves: Callable[[], SceneCurves | None],
     config: EncodeConfig,
     *,
     metres_per_unit: float,

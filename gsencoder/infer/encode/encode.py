@@ -9,7 +9,7 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
-from gsencoder.models.grid.curves import Curves, curves_of
+from gsencoder.models.grid.curves import SceneCurves, cut_scene_curves
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import find_weights, load_weights
 from gsencoder.text.table import load_text_table
@@ -72,15 +72,17 @@ def encode(
     encoder = encoder.to(device).eval()
     shape, voxel = encoder.config.transformer, encoder.config.voxel / metres_per_unit
 
-    def run(subset: Gaussians, scene_curves: Curves | None) -> Float32[np.ndarray, "n channels"]:
+    def run(subset: Gaussians, scene_curves: SceneCurves | None) -> Float32[np.ndarray, "n channels"]:
         with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype is not None):
-            attributes, opacities, plan = encoder_inputs(subset, encoder.config, voxel, device, whole=scene_curves)
+            attributes, opacities, plan = encoder_inputs(
+                subset, encoder.config, voxel, device, scene_curves=scene_curves
+            )
             return outputs.restore(encoder(attributes, opacities, encoder.join([plan])).cpu().numpy())
 
     features = encode_by_chunks(
         gaussians,
         run,
-        lambda: curves_of(gaussians.means, voxel, levels=shape.levels, orders=shape.orders, patch=shape.patch),
+        lambda: cut_scene_curves(gaussians.means, voxel, levels=shape.levels, orders=shape.orders, patch=shape.patch),
         config,
         metres_per_unit=metres_per_unit,
         channels=outputs.channels,

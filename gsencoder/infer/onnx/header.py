@@ -21,7 +21,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.int8 import round_columns
 from gsencoder.core.runtime.device_names import Stored
 from gsencoder.models.grid.serialize import ALIGN, Order
-from gsencoder.models.output_space import OutputSpace, write_outputs
+from gsencoder.models.output_space import OutputSpace, output_space_parts
 from gsencoder.text.table import TextTable, unrounded
 from gsencoder.types import FeatureBasis, FeatureSpace
 
@@ -83,7 +83,7 @@ class OnnxHeader:
 def to_metadata(header: OnnxHeader) -> dict[str, str]:
     """The entries of text that hold a header."""
     words = header.words
-    arrays, values = write_outputs(header.outputs)
+    arrays, values = output_space_parts(header.outputs)
     values |= {
         "version": VERSION,
         "voxel": header.voxel,

@@ -17,7 +17,7 @@ from onnxscript.values import OnnxFunction, Opset
 
 import gsencoder.models.grid.neighbors
 import gsencoder.models.raw_encoder  # noqa: F401  these two define the operators that are translated
-from gsencoder.models.grid.serialize import MOST_LEVELS, hilbert_table, start_of
+from gsencoder.models.grid.serialize import MAX_LEVELS, hilbert_table, start_orientation
 
 OPSET = 20
 ROWS_AT_ONCE = 1024
@@ -121,9 +121,11 @@ def linear_int8(x: UINT8, step: FLOAT, zero: UINT8, weight: INT8, scale: FLOAT, 
 
 
 _TABLE = onnx.numpy_helper.from_array(hilbert_table().astype(np.uint64))
-_POWERS = onnx.numpy_helper.from_array(64 ** np.arange(1, (MOST_LEVELS + 1) // 2, dtype=np.int64))
+_POWERS = onnx.numpy_helper.from_array(64 ** np.arange(1, (MAX_LEVELS + 1) // 2, dtype=np.int64))
 _STARTS = onnx.numpy_helper.from_array(
-    np.array([start_of(min(2 * steps, MOST_LEVELS)) for steps in range(1, (MOST_LEVELS + 1) // 2 + 1)], np.uint64)
+    np.array(
+        [start_orientation(min(2 * steps, MAX_LEVELS)) for steps in range(1, (MAX_LEVELS + 1) // 2 + 1)], np.uint64
+    )
 )
 
 

@@ -13,8 +13,8 @@ from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.infer.onnx.header import FIELDS, OUTPUT, SETTINGS, SUM, OnnxHeader, check_sum, from_metadata
-from gsencoder.models.grid.curves import Curves, curves_of
-from gsencoder.models.grid.serialize import NEVER, check_extent
+from gsencoder.models.grid.curves import SceneCurves, cut_scene_curves
+from gsencoder.models.grid.serialize import INVALID_CODE, check_extent
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Gaussians, check_unit
 
@@ -110,13 +110,15 @@ class OnnxEncoder:
             )
         voxel = header.voxel / metres_per_unit
 
-        def run(part: Gaussians, whole: Curves | None) -> Float32[np.ndarray, "n channels"]:
+        def run(part: Gaussians, whole: SceneCurves | None) -> Float32[np.ndarray, "n channels"]:
             return self._run(part, whole, voxel)
 
         features = encode_by_chunks(
             gaussians,
             run,
-            lambda: curves_of(gaussians.means, voxel, levels=header.levels, orders=header.orders, patch=header.patch),
+            lambda: cut_scene_curves(
+                gaussians.means, voxel, levels=header.levels, orders=header.orders, patch=header.patch
+            ),
             config,
             metres_per_unit=metres_per_unit,
             channels=header.outputs.channels,
@@ -124,7 +126,7 @@ class OnnxEncoder:
         )
         return header.outputs.features(features)
 
-    def _run(self, part: Gaussians, whole: Curves | None, voxel: float) -> Float32[np.ndarray, "n channels"]:
+    def _run(self, part: Gaussians, whole: SceneCurves | None, voxel: float) -> Float32[np.ndarray, "n channels"]:
         feed = feed_of(part, whole, voxel)
         try:
             (found,) = self._session.run([OUTPUT], feed)
@@ -135,7 +137,7 @@ class OnnxEncoder:
         return np.asarray(found, np.float32)
 
 
-def feed_of(part: Gaussians, whole: Curves | None, voxel: float) -> dict[str, np.ndarray]:
+def feed_of(part: Gaussians, whole: SceneCurves | None, voxel: float) -> dict[str, np.ndarray]:
     """What the graph takes of a part of a scene, in the grid of the whole; `whole` is None where it is all of it.
 
     Raises:
@@ -153,10 +155,10 @@ def inputs_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
     return dict(zip(FIELDS, (*values, np.ascontiguousarray(gaussians.sh[:, 0])), strict=True))
 
 
-def rows_of(curves: Curves) -> Int64[np.ndarray, "rows P"]:
-    """The starts of all levels and orders in one array, as the graph takes them, filled up with `NEVER`."""
+def rows_of(curves: SceneCurves) -> Int64[np.ndarray, "rows P"]:
+    """The starts of all levels and orders in one array, as the graph takes them, filled up with `INVALID_CODE`."""
     rows = [row for starts in curves.starts for row in starts]
-    table = np.full((len(rows), max(map(len, rows))), NEVER, np.int64)
+    table = np.full((len(rows), max(map(len, rows))), INVALID_CODE, np.int64)
     for place, row in zip(table, rows, strict=True):
         place[: len(row)] = row
     return table

@@ -1,4 +1,4 @@
-"""From points to cells of the grid."""
+"""Quantization of points to integer coordinates of a voxel grid."""
 
 import torch
 from jaxtyping import Int64
@@ -8,19 +8,20 @@ from gsencoder.core.errors import InputError
 from gsencoder.models.grid.serialize import ALIGN, check_extent
 
 
-def cells_of(points: Tensor, voxel: float, corner: Tensor | None = None) -> Int64[Tensor, "N 3"]:
-    """Grid cells of points [N, 3] in world units, counted on each axis from just below the lowest occupied one.
+def grid_coords(points: Tensor, voxel: float, corner: Tensor | None = None) -> Int64[Tensor, "N 3"]:
+    """Non-negative grid coordinates of points [N, 3].
 
-    The grid is anchored at the world's zero and counted from a multiple of ALIGN cells, so that a part of a scene is
-    cut and pooled as the whole is. With the corner of the whole it is also ordered alike.
+    Cell borders lie at multiples of `voxel` in world coordinates. The origin of the coordinates is the largest multiple
+    of ALIGN cells at or below the lowest point on each axis, so that a part of a scene is divided into cells and pooled
+    exactly as the full scene is. With the corner of the full scene its cells also have the same coordinates.
 
     Args:
         points: world units.
-        voxel: edge of a cell, world units.
-        corner: from where cells are counted, [3], world units; None = the lowest of the points.
+        voxel: edge length of a cell, world units.
+        corner: lowest corner of the full scene, [3], world units; None = the lowest of the points.
 
     Raises:
-        InputError: points that are not finite, or that spread over 2²⁰ cells or more on an axis.
+        InputError: points that are not finite, or that spread over 2²⁰ cells or more along an axis.
     """
     if not len(points):
         return torch.zeros(0, 3, dtype=torch.int64, device=points.device)

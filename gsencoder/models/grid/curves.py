@@ -1,4 +1,4 @@
-"""Where the curves of a whole scene are cut into patches, so that parts of it are cut in the same places."""
+"""Patch boundaries along the space-filling curves of a full scene, so that its parts are cut into the same patches."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,52 +6,62 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.models.grid.serialize import ALIGN, LARGEST_EXTENT, Order, bits_of, encode_morton, morton_codes
+from gsencoder.models.grid.serialize import (
+    ALIGN,
+    MAX_EXTENT,
+    Order,
+    coordinate_bits,
+    curve_from_morton,
+    morton_codes,
+)
 
 
-class Curves(NamedTuple):
-    """A whole scene along its curves, for plans of parts of it.
+class SceneCurves(NamedTuple):
+    """The patch boundaries of a full scene, for the plans of its parts.
 
     Attributes:
-        corner: from where cells are counted, world units.
-        starts: for each level, in each of O orders, the code at which each of P patches begins.
+        corner: lowest corner of the scene, which is the origin of its grid coordinates; world units.
+        starts: for each level, the first code of each of P patches along each of O orders.
     """
 
     corner: Float32[np.ndarray, "3"]
     starts: tuple[Int64[np.ndarray, "O _P"], ...]
 
 
-def curves_of(
+def cut_scene_curves(
     means: Float32[np.ndarray, "N 3"], voxel: float, *, levels: int, orders: Sequence[Order], patch: int
-) -> Curves | None:
-    """A scene along its curves; None where it has too many cells for one set of codes, and each part has its own.
+) -> SceneCurves | None:
+    """Cuts the curves of a scene into patches.
 
     Args:
         means: centers, world units; at least one.
-        voxel: edge of the finest grid, world units; each level below doubles it.
-        levels: how many there are.
+        voxel: edge length of the finest grid's cells, world units; it doubles from level to level.
+        levels: number of levels.
         orders: the curves that attention follows.
-        patch: most tokens in a patch. T tokens have ⌈T / patch⌉ patches, of which the k-th begins at token
+        patch: largest number of tokens in a patch. T tokens make ⌈T / patch⌉ patches, and the k-th begins at token
             ⌊k·T / patches⌋.
+
+    Returns:
+        The boundaries; None if the scene has too many cells for one set of codes, so that each part needs its own.
     """
     scaled = np.floor(means.astype(np.float64) / voxel)
     low, high = scaled.min(axis=0), scaled.max(axis=0)
-    # Two cells fewer than would fit: a part of the scene may be counted from a cell beside the lowest.
-    if not (high - low).max() < LARGEST_EXTENT - 2:
+    # Two cells fewer than would fit: the coordinates of a part may be counted from a cell beside the lowest.
+    if not (high - low).max() < MAX_EXTENT - 2:
         return None
     cells = (scaled - np.floor(low / ALIGN) * ALIGN).astype(np.int64)
     morton = np.unique(morton_codes(cells))
-    along = [np.sort(encode_morton(morton, order, bits_of(cells))) for order in orders]
+    curve_codes = [np.sort(curve_from_morton(morton, order, coordinate_bits(cells))) for order in orders]
     starts = []
     for level in range(levels):
         if level:
-            along = [_distinct(codes >> 3) for codes in along]
-        count = len(along[0])
+            curve_codes = [_unique_sorted(codes >> 3) for codes in curve_codes]
+        count = len(curve_codes[0])
         patches = -(-count // patch)
-        begins = np.arange(patches) * count // patches
-        starts.append(np.stack([codes[begins] for codes in along]))
-    return Curves(means.min(axis=0), tuple(starts))
+        first_tokens = np.arange(patches) * count // patches
+        starts.append(np.stack([codes[first_tokens] for codes in curve_codes]))
+    return SceneCurves(means.min(axis=0), tuple(starts))
 
 
-def _distinct(sorted_codes: Int64[np.ndarray, " T"]) -> Int64[np.ndarray, " t"]:
+def _unique_sorted(sorted_codes: Int64[np.ndarray, " T"]) -> Int64[np.ndarray, " t"]:
     return sorted_codes[np.concatenate(([True], sorted_codes[1:] != sorted_codes[:-1]))]

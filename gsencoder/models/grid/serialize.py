@@ -1,10 +1,10 @@
 """Space-filling orders of grid cells: Morton and Hilbert codes and their transposed forms (PTv3, Wu et al. 2024).
 
-A code is an int64 whose sorted order visits cells so that neighbors in the order are neighbors in space. Codes are
-hierarchical: `code >> 3` is the code of the cell twice as large, so one set of codes serves every level of pooling.
+A code is an int64, and cells sorted by code follow a curve on which neighbors are close in space. Codes are
+hierarchical: `code >> 3` is the code of the parent cell, so one set of codes serves every level of pooling.
 
-Everything here is written in operators that numpy's arrays and torch's tensors share: plans are made of tensors, and a
-runtime without torch needs the same curves.
+All functions use only operators that numpy arrays and torch tensors share: the torch encoder and a runtime without
+torch need the same curves.
 """
 
 from functools import cache
@@ -15,68 +15,68 @@ from jaxtyping import Int64
 
 from gsencoder.core.errors import InputError
 
-MOST_LEVELS = 22
-"""Bits of a coordinate, at most and with one to spare: levels go in pairs."""
+MAX_LEVELS = 22
+"""Largest number of bits of a coordinate that Hilbert codes handle; even, since levels are processed in pairs."""
 
 Order = Literal["z", "z-trans", "hilbert", "hilbert-trans"]
 
-_EVERY_THIRD = 0x1249249249249249
+_EVERY_THIRD_BIT = 0x1249249249249249
 
-LARGEST_EXTENT = 2**20
-"""Cells along an axis, at most; with room for ALIGN, coordinates take 21 bits, and three of them fill an int64."""
+MAX_EXTENT = 2**20
+"""Limit of the number of cells along an axis. With room for ALIGN a coordinate takes 21 bits; three fill an int64."""
 
 ALIGN = 64
-"""Cells are counted from a multiple of this, so that pooling pairs the same cells in a part of a scene as in all of it,
-through six levels."""
+"""Grid coordinates are counted from a multiple of this many cells, so that six levels of pooling merge the same cells
+in a part of a scene as in the full scene."""
 
 
-NEVER = 2**63 - 1
-"""A code that no cell has."""
+INVALID_CODE = 2**63 - 1
+"""A code that no cell has, used as padding."""
 
 
 def check_extent(extent: float, voxel: float) -> None:
-    """Refuses points that spread over more cells than a code can number.
+    """Checks that points do not spread over more cells than codes can number.
 
     Args:
-        extent: cells along the longest axis.
-        voxel: edge of a cell, world units.
+        extent: number of cells along the longest axis.
+        voxel: edge length of a cell, world units.
 
     Raises:
-        InputError: 2²⁰ cells or more.
+        InputError: the extent is 2²⁰ cells or more.
     """
-    if not extent < LARGEST_EXTENT:
+    if not extent < MAX_EXTENT:
         raise InputError(
             f"grid: the points spread over {extent:.3g} cells of {voxel:.3g} units on an axis; the limit is 2²⁰; "
             "check the unit (data.metres_per_unit), and remove stray Gaussians (`gsencoder repair`)"
         )
 
 
-def bits_of(cells: Int64[Any, "N 3"]) -> int:
-    """Bits that the largest coordinate needs, at least 1."""
+def coordinate_bits(cells: Int64[Any, "N 3"]) -> int:
+    """Number of bits that the largest coordinate needs, at least 1."""
     return max(1, int(cells.max()).bit_length()) if len(cells) else 1
 
 
 def encode_cells(cells: Int64[Any, "N 3"], order: Order, bits: int) -> Int64[Any, " N"]:
-    """Codes of cells (each coordinate from 0 to 2^bits − 1) along a curve; the "-trans" ones swap x and y first."""
-    return encode_morton(morton_codes(cells), order, bits)
+    """Codes of cells (coordinates from 0 to 2^bits − 1) along a curve; the "-trans" orders swap x and y first."""
+    return curve_from_morton(morton_codes(cells), order, bits)
 
 
-def encode_morton(morton: Int64[Any, " N"], order: Order, bits: int) -> Int64[Any, " N"]:
-    """`encode_cells` for cells that are given by their Morton codes."""
-    morton = swapped(morton, order)
+def curve_from_morton(morton: Int64[Any, " N"], order: Order, bits: int) -> Int64[Any, " N"]:
+    """Codes along a curve, as `encode_cells` gives them, of cells given by their Morton codes."""
+    morton = swap_xy(morton, order)
     return hilbert_from_morton(morton, bits) if order.startswith("hilbert") else morton
 
 
-def swapped(morton: Int64[Any, " N"], order: Order) -> Int64[Any, " N"]:
-    """Morton codes with x and y swapped, for the "-trans" orders; for others as they are."""
+def swap_xy(morton: Int64[Any, " N"], order: Order) -> Int64[Any, " N"]:
+    """Morton codes with x and y swapped for the "-trans" orders, and unchanged for the others."""
     if not order.endswith("-trans"):
         return morton
-    y = (morton & (_EVERY_THIRD << 1)) << 1
-    return (morton & _EVERY_THIRD) | y | ((morton >> 1) & (_EVERY_THIRD << 1))
+    y = (morton & (_EVERY_THIRD_BIT << 1)) << 1
+    return (morton & _EVERY_THIRD_BIT) | y | ((morton >> 1) & (_EVERY_THIRD_BIT << 1))
 
 
 def morton_codes(cells: Int64[Any, "N 3"]) -> Int64[Any, " N"]:
-    """Z-order: the bits of x, y and z interleaved, x highest, for coordinates below 2²¹."""
+    """Morton codes (Z-order): the bits of x, y and z interleaved, x highest, for coordinates below 2²¹."""
     spread = cells & (2**21 - 1)
     # Each step moves the upper half of every group of bits away, until two zeros stand between any two bits.
     for shift, mask in (
@@ -84,67 +84,69 @@ def morton_codes(cells: Int64[Any, "N 3"]) -> Int64[Any, " N"]:
         (16, 0x1F0000FF0000FF),
         (8, 0x100F00F00F00F00F),
         (4, 0x10C30C30C30C30C3),
-        (2, _EVERY_THIRD),
+        (2, _EVERY_THIRD_BIT),
     ):
         spread = (spread | (spread << shift)) & mask
     return (spread[:, 0] << 2) | (spread[:, 1] << 1) | spread[:, 2]
 
 
 def hilbert_from_morton(morton: Int64[Any, " N"], bits: int) -> Int64[Any, " N"]:
-    """Positions along Hilbert's curve, which only ever steps to a face neighbor.
+    """Positions along Hilbert's curve, on which consecutive cells share a face.
 
-    Hamilton 2006, "Compact Hilbert indices": the curve within a cell is one of 24 orientations, and a table gives,
-    for an orientation and the octants of the next two levels, their places on the curve and the orientation inside.
-    `bits` says how far to look and changes nothing else: cells that are counted from one corner are always ordered
-    alike.
+    The curve within a cell has one of 24 orientations (Hamilton 2006, "Compact Hilbert indices"). A table gives, for an
+    orientation and the octants of the next two levels, their digits on the curve and the orientation inside. `bits`
+    limits the work and does not change the result: cells counted from one corner always get the same codes.
     """
     table = hilbert_table()
     if hasattr(morton, "new_tensor"):
         table = morton.new_tensor(table)
     levels = bits + bits % 2
     code = morton & 0
-    state = code + start_of(levels)
+    orientation = code + start_orientation(levels)
     for level in range(levels - 2, -1, -2):
-        found = table.take((state << 6) | ((morton >> (3 * level)) & 63))
-        code = (code << 6) | (found & 63)
-        state = found >> 6
+        entry = table.take((orientation << 6) | ((morton >> (3 * level)) & 63))
+        code = (code << 6) | (entry & 63)
+        orientation = entry >> 6
     return code
 
 
 @cache
-def start_of(levels: int) -> int:
-    """The orientation of the lowest corner of so many levels, within a curve of MOST_LEVELS."""
-    state = 0
-    for _ in range(MOST_LEVELS - levels):
-        _, state = _hilbert_step(state, 0)
-    return state
+def start_orientation(levels: int) -> int:
+    """The orientation of the lowest cube of 2^levels cells an edge, within a curve of MAX_LEVELS levels."""
+    orientation = 0
+    for _ in range(MAX_LEVELS - levels):
+        _, orientation = _hilbert_step(orientation, 0)
+    return orientation
 
 
 @cache
 def hilbert_table() -> Int64[np.ndarray, " 1536"]:
-    """For orientation·64 + two octants: the inner orientation·64 + two digits of the code."""
+    """At row orientation·64 + two octal digits of octants: the inner orientation·64 + two octal digits of the code."""
     rows = []
-    for state in range(24):
-        for first in range(8):
-            digit, inside = _hilbert_step(state, first)
-            for second in range(8):
-                below, innermost = _hilbert_step(inside, second)
-                rows.append((innermost << 6) | (digit << 3) | below)
+    for orientation in range(24):
+        for first_octant in range(8):
+            first_digit, inner = _hilbert_step(orientation, first_octant)
+            for second_octant in range(8):
+                second_digit, innermost = _hilbert_step(inner, second_octant)
+                rows.append((innermost << 6) | (first_digit << 3) | second_digit)
     return np.array(rows, np.int64)
 
 
-def _hilbert_step(state: int, octant: int) -> tuple[int, int]:
-    """An octant's place on the curve of orientation 3·entry + direction, and the orientation of the curve in it."""
-    entry, direction = divmod(state, 3)
-    turned = _rotate_left(octant ^ entry, 3 - (direction + 1) % 3)
-    digit = turned ^ (turned >> 1) ^ (turned >> 2)
-    start = 0 if digit == 0 else _gray(2 * ((digit - 1) // 2))
+def _hilbert_step(orientation: int, octant: int) -> tuple[int, int]:
+    """The digit of an octant on the curve, and the orientation of the curve inside the octant.
+
+    An orientation is 3·entry + direction, with the octant of the entry and the axis from entry to exit.
+    """
+    entry, direction = divmod(orientation, 3)
+    rotated = _rotate_left(octant ^ entry, 3 - (direction + 1) % 3)
+    digit = rotated ^ (rotated >> 1) ^ (rotated >> 2)
+    start = 0 if digit == 0 else _gray_code(2 * ((digit - 1) // 2))
     step = 0 if digit == 0 else _trailing_ones(digit - 1 if digit % 2 == 0 else digit) % 3
-    inner = entry ^ _rotate_left(start, (direction + 1) % 3)
-    return digit, 3 * inner + (direction + step + 1) % 3
+    inner_entry = entry ^ _rotate_left(start, (direction + 1) % 3)
+    return digit, 3 * inner_entry + (direction + step + 1) % 3
 
 
-def _gray(number: int) -> int:
+def _gray_code(number: int) -> int:
     return number ^ (number >> 1)
 
 
