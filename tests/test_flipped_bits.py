@@ -25,7 +25,7 @@ from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_packag
 from gsencoder.fusion.teacher_maps import read_map, write_map
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import load_weights, save_weights
-from gsencoder.reconstruct.anchor import leash_of
+from gsencoder.reconstruct.anchor import anchor_at
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.row_adam import RowAdam
@@ -121,13 +121,13 @@ def training(folder: Path) -> Made:
 
 def reconstruction(folder: Path) -> Made:
     parameters = parameters_from(random_gaussians(40), 1)
-    state = State(adam=RowAdam(parameters), leash=leash_of(parameters, 0.4), step=3, seconds=2.0, facts={"seeds": 40})
+    state = State(adam=RowAdam(parameters), anchor=anchor_at(parameters, 0.4), step=3, seconds=2.0, facts={"seeds": 40})
     save_state(folder / "r", state, {"rate": 0.1})
 
     def read() -> Any:
         got = load_state(folder / "r", {"rate": 0.1}, steps=5, sh_degree=1)
-        assert got.leash is not None
-        return got.adam.tables(), got.adam.steps, got.leash, got.step, got.seconds, got.facts
+        assert got.anchor is not None
+        return got.adam.tables(), got.adam.steps, got.anchor, got.step, got.seconds, got.facts
 
     return folder / "r", read
 

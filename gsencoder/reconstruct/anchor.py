@@ -1,4 +1,4 @@
-"""Gaussians that began on a measured surface stay near the place where they stood."""
+"""Anchors: Gaussians that were seeded on a measured surface stay near their seeds."""
 
 from dataclasses import dataclass
 
@@ -7,21 +7,21 @@ from torch import Tensor
 
 from gsencoder.reconstruct.parameters import Parameters
 
-SHORTEST = 1e-30
-"""World units; what no float can tell from nothing would make 0 / 0 of a rate that is 0."""
+MIN_REACH = 1e-30
+"""Smallest reach in world units: a reach of 0 would divide a learning rate of 0 by 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Leash:
-    """Where each Gaussian began, and how far it may go from there.
+class Anchor:
+    """Initial means of Gaussians, and how far each may move from there.
 
     A step of Adam moves a coordinate by its rate at most, or little more. Pulling back by rate / reach of the way after
     each step therefore leaves it within about one reach, whatever its gradients say; those that disagree from one
     photograph to the next move it less. It is AdamW's decay (Loshchilov & Hutter 2019), towards the seed instead of 0.
 
     Attributes:
-        means: the beginning, world units.
-        reach: world units, above 0.
+        means: initial centers, world units.
+        reach: distance in world units, above 0.
     """
 
     means: Float32[Tensor, "N 3"]
@@ -32,11 +32,11 @@ class Leash:
         share = (rate / self.reach[rows]).clamp(max=1).unsqueeze(1)
         means[rows] = means[rows].lerp(self.means[rows], share)
 
-    def keep(self, rows: Int64[Tensor, " n"]) -> "Leash":
-        """That of these rows alone."""
-        return Leash(means=self.means[rows], reach=self.reach[rows])
+    def keep(self, rows: Int64[Tensor, " n"]) -> "Anchor":
+        """The anchor of some rows."""
+        return Anchor(means=self.means[rows], reach=self.reach[rows])
 
 
-def leash_of(raw: Parameters, length: float) -> Leash:
-    """A leash from where the Gaussians are now, `length` times their largest standard deviation long."""
-    return Leash(means=raw["means"].clone(), reach=(length * raw["log_scales"].amax(dim=1).exp()).clamp(min=SHORTEST))
+def anchor_at(raw: Parameters, length: float) -> Anchor:
+    """An anchor at the present means, with a reach of `length` times each Gaussian's largest standard deviation."""
+    return Anchor(means=raw["means"].clone(), reach=(length * raw["log_scales"].amax(dim=1).exp()).clamp(min=MIN_REACH))

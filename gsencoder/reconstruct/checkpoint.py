@@ -1,4 +1,4 @@
-"""Where a reconstruction stands: parameters, moments and step in one file that appears whole or not at all."""
+"""Checkpoints of a reconstruction: parameters, moments and step in one file, written atomically."""
 
 import math
 from collections.abc import Mapping
@@ -10,12 +10,12 @@ import torch
 
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
-from gsencoder.reconstruct.anchor import Leash
+from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.parameters import shapes_of
 from gsencoder.reconstruct.row_adam import RowAdam
 
 CHECKPOINT_FILE = "reconstruction.safetensors"
-LEASH_SHAPES: dict[str, tuple[int | str, ...]] = {"means": ("N", 3), "reach": ("N",)}
+ANCHOR_SHAPES: dict[str, tuple[int | str, ...]] = {"means": ("N", 3), "reach": ("N",)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,14 +24,14 @@ class State:
 
     Attributes:
         adam: parameters and moments.
-        leash: what holds positions back, if anything does.
+        anchor: what holds positions near their seeds, if anything does.
         step: steps that are done.
         seconds: that they took.
         facts: how it began, as JSON values: number and source of the seeds, and what was added to points.
     """
 
     adam: RowAdam
-    leash: Leash | None
+    anchor: Anchor | None
     step: int
     seconds: float
     facts: Mapping[str, Any]
@@ -53,8 +53,8 @@ def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
         for kind, table in state.adam.tables().items()
         for name, value in table.items()
     }
-    if state.leash is not None:
-        arrays |= {f"leash.{name}": getattr(state.leash, name).cpu().numpy() for name in LEASH_SHAPES}
+    if state.anchor is not None:
+        arrays |= {f"leash.{name}": getattr(state.anchor, name).cpu().numpy() for name in ANCHOR_SHAPES}
     header = {
         "step": state.step,
         "adam_steps": state.adam.steps,
@@ -81,9 +81,9 @@ def load_state(
         InputError: damaged, or of a run with other settings; the first that differs is named.
     """
     with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
-        found = file.value("settings", dict)
-        if found != settings:
-            raise InputError(f"{path}: was made with {first_difference(found, settings)}")
+        earlier = file.value("settings", dict)
+        if earlier != settings:
+            raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
         step, adam_steps = file.value("step", int), file.value("adam_steps", int)
         seconds, facts = float(file.value("seconds", float, int)), file.value("facts", dict)
         if not (0 <= adam_steps <= step <= steps and 0 <= seconds < math.inf):
@@ -95,8 +95,8 @@ def load_state(
             }
             for kind in RowAdam.KINDS
         }
-        leash = None
+        anchor = None
         if "leash.means" in file:
-            stood = {name: file.array(f"leash.{name}", "float32", shape) for name, shape in LEASH_SHAPES.items()}
-            leash = Leash(**{name: torch.from_numpy(value.copy()).to(device) for name, value in stood.items()})
-    return State(adam=RowAdam.restored(tables, adam_steps), leash=leash, step=step, seconds=seconds, facts=facts)
+            arrays = {name: file.array(f"leash.{name}", "float32", shape) for name, shape in ANCHOR_SHAPES.items()}
+            anchor = Anchor(**{name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()})
+    return State(adam=RowAdam.restored(tables, adam_steps), anchor=anchor, step=step, seconds=seconds, facts=facts)

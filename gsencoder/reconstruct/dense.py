@@ -1,6 +1,6 @@
-"""Seeds where structure from motion left none: nothing grows later, so every surface must be seeded before.
+"""Dense seeds from photographs: nothing grows later, so every surface must be seeded before the first step.
 
-Two sources, both judged by what other photographs show. Textured pixels get the depth of a plane sweep (stereo.py), if
+Two sources, both checked against other photographs. Textured pixels get the depth of a plane sweep (stereo.py), if
 two other views find a surface at the same place. Pixels between those are given depths interpolated between their
 neighbors', and kept if their colors agree in two other views and no other view sees through them.
 """
@@ -17,15 +17,15 @@ from torch import Tensor
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.geometry import transform
-from gsencoder.reconstruct.photographs import Photographs, Shot
+from gsencoder.reconstruct.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.stereo import (
     DepthMap,
-    agreeing,
+    confirms,
+    count_agreeing,
     depth_range,
-    finds,
-    look_up,
-    neighbors_of,
+    sample_depth,
     sees_through,
+    source_views,
     sweep,
     to_grid,
     window_mean,
@@ -34,10 +34,10 @@ from gsencoder.reconstruct.stereo import (
 from gsencoder.types import Cameras
 
 FILLED_SPACING = 2.0
-"""Interpolated seeds stand on a grid so much coarser: they are where little is to be seen."""
-SEEN_THROUGH = 1
-"""So many views may see through a point that no view finds."""
-SMALLEST_SPACING = 0.1
+"""Interpolated seeds stand on a grid this many times coarser: they lie where photographs show little detail."""
+MAX_SEE_THROUGH = 1
+"""A point that no view confirms may be seen through by this many views."""
+MIN_SPACING = 0.1
 CELL = 1 / 40
 """Side of the cells in which coverage is counted, as a share of the picture's longer side."""
 
@@ -63,8 +63,8 @@ class DenseConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.enough <= 1:
             raise InputError(f"enough: expected a share from 0 to 1, got {self.enough}")
-        if not SMALLEST_SPACING <= self.spacing < math.inf:
-            raise InputError(f"spacing: expected {SMALLEST_SPACING} pixels or more, got {self.spacing}")
+        if not MIN_SPACING <= self.spacing < math.inf:
+            raise InputError(f"spacing: expected {MIN_SPACING} pixels or more, got {self.spacing}")
         if self.samples < 1:
             raise InputError(f"samples: expected at least 1 pixel, got {self.samples}")
         if not -1 <= self.alike < 1:
@@ -80,11 +80,11 @@ class DenseConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Dense:
-    """Points with what was added to them.
+class DenseSeeds:
+    """Structure-from-motion points and the seeds that were added to them.
 
     Attributes:
-        points: old and new, world units relative to the scene's origin.
+        points: all of them, world units relative to the scene's origin.
         colors: RGB.
         swept: how many came from plane sweeps.
         filled: how many were interpolated.
@@ -99,7 +99,7 @@ class Dense:
 
 
 def coverage(cameras: Cameras, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
-    """Mean share of the pictures' cells into which some point projects; what hides what is not looked at."""
+    """Mean share of the pictures' cells into which some point projects; occlusion is not tested."""
     shares = []
     for view in views:
         width, height = int(cameras.widths[view]), int(cameras.heights[view])
@@ -119,7 +119,7 @@ def densify(
     config: DenseConfig = DenseConfig(),
     *,
     track: Track = untracked,
-) -> Dense | None:
+) -> DenseSeeds | None:
     """Points for every surface that the training photographs show; None where the given ones cover enough.
 
     Args:
@@ -134,67 +134,70 @@ def densify(
     before = coverage(cameras, training, points)
     if before >= config.enough:
         return None
-    neighbors = neighbors_of(cameras, points, training, config.sources)
-    shots, poses = {}, {}
+    neighbors = source_views(cameras, points, training, config.sources)
+    photos, poses = {}, {}
     for view in training:
         longest = max(int(cameras.widths[view]), int(cameras.heights[view]))
-        shots[view] = photographs.shot(view, max(1, round(longest / config.size)))
+        photos[view] = photographs.at_scale(view, max(1, round(longest / config.size)))
         poses[view] = torch.from_numpy(cameras.cam_from_world[view].copy())
     maps: dict[int, DepthMap] = {}
     for view in track(training, "sweeping planes"):
         limits, others = depth_range(cameras, view, points), neighbors[view]
         if limits is not None and len(others) >= 2:
-            found = sweep(shots[view], poses[view], [shots[o] for o in others], [poses[o] for o in others], *limits)
-            maps[view] = found._replace(depth=torch.where(found.score >= config.alike, found.depth, 0))
-    agreed = _agreed(maps, shots, poses, neighbors, config)
-    swept = _points_of(agreed, shots, poses)
-    seen = _fill_depths(agreed, shots, poses, points)
-    filled = _points_of(_gaps(seen, agreed, shots, poses, neighbors, config), shots, poses)
-    voxel = config.spacing * _pixel_size(cameras, agreed)
-    swept = carve(*thin(*swept, voxel, config.samples), agreed, shots, poses, config.agree)
-    filled = thin(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
-    filled = carve(*filled, agreed, shots, poses, config.agree)
-    places, tints = (np.concatenate(parts) for parts in zip((points, colors), swept, filled, strict=True))
-    after = coverage(cameras, training, places)
-    return Dense(points=places, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after))
+            swept_map = sweep(
+                photos[view], poses[view], [photos[o] for o in others], [poses[o] for o in others], *limits
+            )
+            maps[view] = swept_map._replace(depth=torch.where(swept_map.score >= config.alike, swept_map.depth, 0))
+    consistent = _consistent_depths(maps, photos, poses, neighbors, config)
+    swept = _back_project(consistent, photos, poses)
+    seen = _fill_depths(consistent, photos, poses, points)
+    filled = _back_project(_supported_depths(seen, consistent, photos, poses, neighbors, config), photos, poses)
+    voxel = config.spacing * _pixel_size(cameras, consistent)
+    swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses, config.agree)
+    filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
+    filled = carve(*filled, consistent, photos, poses, config.agree)
+    positions, tints = (np.concatenate(arrays) for arrays in zip((points, colors), swept, filled, strict=True))
+    after = coverage(cameras, training, positions)
+    return DenseSeeds(
+        points=positions, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after)
+    )
 
 
 def _pixel_size(cameras: Cameras, depths: Mapping[int, Float[Tensor, "h w"]]) -> float:
-    """What a pixel of a typical photograph covers of the surfaces that were found, in world units."""
-    found = [(view, depth[depth > 0]) for view, depth in depths.items()]
-    return float(np.median([float(z.median() / cameras.Ks[view, 0, 0]) for view, z in found if len(z)] or [1.0]))
+    """What a pixel of a typical photograph covers of the known surfaces, in world units."""
+    known = [(view, depth[depth > 0]) for view, depth in depths.items()]
+    return float(np.median([float(z.median() / cameras.Ks[view, 0, 0]) for view, z in known if len(z)] or [1.0]))
 
 
 def carve(
     points: Float32[np.ndarray, "P 3"],
     colors: UInt8[np.ndarray, "P 3"],
-    agreed: Mapping[int, Float[Tensor, "h w"]],
-    shots: Mapping[int, Shot],
+    consistent: Mapping[int, Float[Tensor, "h w"]],
+    photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
     tolerance: float,
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Takes out points that stand in the way: more views see through them, to a surface that was found behind, than
-    find one where they are.
+    """Removes points in free space: those that more views see through, to a surface behind, than confirm.
 
     Args:
         points: world units.
         colors: beside them.
-        agreed: depths of each view, 0 = unknown.
-        shots: the views.
+        consistent: depths of each view, 0 = unknown.
+        photos: the views.
         poses: their cam_from_world.
         tolerance: relative difference of depths that agree; what lies in front by twice as much is seen through.
     """
-    places = torch.from_numpy(points)
-    through, there = (torch.zeros(len(points), dtype=torch.int64) for _ in range(2))
-    for view, depth in agreed.items():
-        z, measured = look_up(places, depth, shots[view], poses[view])
+    positions = torch.from_numpy(points)
+    through, confirmed = (torch.zeros(len(points), dtype=torch.int64) for _ in range(2))
+    for view, depth in consistent.items():
+        z, measured = sample_depth(positions, depth, photos[view], poses[view])
         through += sees_through(z, measured, tolerance)
-        there += finds(z, measured, tolerance)
-    kept = (through <= there.clamp(min=SEEN_THROUGH)).numpy()
-    return points[kept], colors[kept]
+        confirmed += confirms(z, measured, tolerance)
+    keep = (through <= confirmed.clamp(min=MAX_SEE_THROUGH)).numpy()
+    return points[keep], colors[keep]
 
 
-def thin(
+def average_by_voxel(
     points: Float32[np.ndarray, "P 3"],
     colors: UInt8[np.ndarray, "P 3"],
     voxel: float,
@@ -204,69 +207,73 @@ def thin(
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """Means of the points and colors of each voxel with at least so many samples; none where `beside` has points."""
     cells = np.floor(points.astype(np.float64) / voxel).astype(np.int64)
-    taken = np.floor(np.empty((0, 3)) if beside is None else beside.astype(np.float64) / voxel).astype(np.int64)
-    found, inverse, counts = np.unique(np.concatenate((cells, taken)), axis=0, return_inverse=True, return_counts=True)
+    occupied = np.floor(np.empty((0, 3)) if beside is None else beside.astype(np.float64) / voxel).astype(np.int64)
+    cells_used, inverse, counts = np.unique(
+        np.concatenate((cells, occupied)), axis=0, return_inverse=True, return_counts=True
+    )
     inverse = inverse.reshape(-1)
     keep = counts >= samples
     keep[inverse[len(cells) :]] = False
     inverse = inverse[: len(cells)]
     columns = (*points.T.astype(np.float64), *colors.T.astype(np.float64))
-    means = np.stack([np.bincount(inverse, column, len(found))[keep] / counts[keep] for column in columns], axis=1)
+    means = np.stack([np.bincount(inverse, column, len(cells_used))[keep] / counts[keep] for column in columns], axis=1)
     return means[:, :3].astype(np.float32), np.round(means[:, 3:]).astype(np.uint8)
 
 
-def _agreed(
+def _consistent_depths(
     maps: Mapping[int, DepthMap],
-    shots: Mapping[int, Shot],
+    photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
     neighbors: Mapping[int, Sequence[int]],
     config: DenseConfig,
 ) -> dict[int, Float[Tensor, "h w"]]:
-    """Depths at which two other views find a surface, too."""
-    kept = {}
-    for view, found in maps.items():
-        others = [(maps[other], shots[other], poses[other]) for other in neighbors[view] if other in maps]
-        votes = agreeing(found.depth, shots[view], poses[view], others, config.agree)
-        kept[view] = torch.where(votes >= 2, found.depth, 0)
-    return kept
+    """Depths that two other views confirm; 0 elsewhere."""
+    consistent = {}
+    for view, depth_map in maps.items():
+        others = [(maps[other], photos[other], poses[other]) for other in neighbors[view] if other in maps]
+        votes = count_agreeing(depth_map.depth, photos[view], poses[view], others, config.agree)
+        consistent[view] = torch.where(votes >= 2, depth_map.depth, 0)
+    return consistent
 
 
-def _points_of(
-    depths: Mapping[int, Float[Tensor, "h w"]], shots: Mapping[int, Shot], poses: Mapping[int, Tensor]
+def _back_project(
+    depths: Mapping[int, Float[Tensor, "h w"]], photos: Mapping[int, ScaledPhotograph], poses: Mapping[int, Tensor]
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    parts: list[tuple[np.ndarray, np.ndarray]] = [(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))]
+    arrays: list[tuple[np.ndarray, np.ndarray]] = [(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))]
     for view, depth in depths.items():
         known = depth > 0
-        where = world_points(depth, shots[view], poses[view])[known]
-        parts.append((where.numpy(), (shots[view].image[known] * 255 + 0.5).to(torch.uint8).numpy()))
-    places, tints = zip(*parts, strict=True)
-    return np.concatenate(places), np.concatenate(tints)
+        points_seen = world_points(depth, photos[view], poses[view])[known]
+        arrays.append((points_seen.numpy(), (photos[view].image[known] * 255 + 0.5).to(torch.uint8).numpy()))
+    positions, tints = zip(*arrays, strict=True)
+    return np.concatenate(positions), np.concatenate(tints)
 
 
 def _fill_depths(
-    agreed: Mapping[int, Float[Tensor, "h w"]],
-    shots: Mapping[int, Shot],
+    consistent: Mapping[int, Float[Tensor, "h w"]],
+    photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
     points: Float32[np.ndarray, "P 3"],
 ) -> dict[int, Float[Tensor, "h w"]]:
     """Depth at every pixel of every view: its own, else that of other views' points, else between its neighbors'."""
-    cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(_points_of(agreed, shots, poses)[0])))
+    cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(_back_project(consistent, photos, poses)[0])))
     return {
-        view: interpolate(torch.where(depth > 0, depth, splat_depths(cloud, shots[view], poses[view])))
-        for view, depth in agreed.items()
+        view: interpolate(torch.where(depth > 0, depth, splat_depths(cloud, photos[view], poses[view])))
+        for view, depth in consistent.items()
     }
 
 
-def splat_depths(cloud: Float[Tensor, "P 3"], shot: Shot, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "h w"]:
+def splat_depths(
+    cloud: Float[Tensor, "P 3"], photo: ScaledPhotograph, pose: Float[Tensor, "4 4"]
+) -> Float[Tensor, "h w"]:
     """The nearest point of each pixel: its depth, 0 where there is none."""
     camera = transform(pose, cloud)
-    grid, inside = to_grid(camera, shot)
+    grid, inside = to_grid(camera, photo)
     camera, grid = camera[inside], grid[inside]
-    column, row = ((grid + 1) / 2 * torch.tensor([shot.width, shot.height])).long().unbind(-1)
-    index = row.clamp(max=shot.height - 1) * shot.width + column.clamp(max=shot.width - 1)
-    nearest = torch.full((shot.height * shot.width,), torch.inf)
+    column, row = ((grid + 1) / 2 * torch.tensor([photo.width, photo.height])).long().unbind(-1)
+    index = row.clamp(max=photo.height - 1) * photo.width + column.clamp(max=photo.width - 1)
+    nearest = torch.full((photo.height * photo.width,), torch.inf)
     nearest.scatter_reduce_(0, index, camera[:, 2], "amin")
-    return torch.where(nearest.isfinite(), nearest, 0).reshape(shot.height, shot.width)
+    return torch.where(nearest.isfinite(), nearest, 0).reshape(photo.height, photo.width)
 
 
 def interpolate(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -287,37 +294,37 @@ def interpolate(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     return torch.where(depth > 0, depth, torch.where(result > 0, 1 / result.clamp(min=1e-9), 0))
 
 
-def _gaps(
+def _supported_depths(
     seen: Mapping[int, Float[Tensor, "h w"]],
-    agreed: Mapping[int, Float[Tensor, "h w"]],
-    shots: Mapping[int, Shot],
+    consistent: Mapping[int, Float[Tensor, "h w"]],
+    photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
     neighbors: Mapping[int, Sequence[int]],
     config: DenseConfig,
 ) -> dict[int, Float[Tensor, "h w"]]:
-    """Interpolated depths that other photographs do not speak against."""
-    smooth = {view: window_mean(shots[view].image.permute(2, 0, 1)[None])[0] for view in seen}
-    kept = {}
+    """Interpolated depths whose colors two other photographs confirm, and that none sees through; 0 elsewhere."""
+    smooth = {view: window_mean(photos[view].image.permute(2, 0, 1)[None])[0] for view in seen}
+    supported = {}
     for view, depth in seen.items():
-        candidates = (agreed[view] == 0) & (depth > 0)
-        mask = shots[view].mask
+        candidates = (consistent[view] == 0) & (depth > 0)
+        mask = photos[view].mask
         if mask is not None:
             candidates &= mask
-        where = world_points(depth, shots[view], poses[view])[candidates]
+        points_seen = world_points(depth, photos[view], poses[view])[candidates]
         tints = smooth[view].permute(1, 2, 0)[candidates]
-        votes = torch.zeros(len(where), dtype=torch.int64)
-        against = torch.zeros(len(where), dtype=torch.bool)
+        votes = torch.zeros(len(points_seen), dtype=torch.int64)
+        against = torch.zeros(len(points_seen), dtype=torch.bool)
         for other in neighbors[view]:
             if other not in seen:
                 continue
-            grid, inside = to_grid(transform(poses[other], where), shots[other])
-            there = torch.nn.functional.grid_sample(smooth[other][None], grid[None, None], align_corners=False)[
+            grid, inside = to_grid(transform(poses[other], points_seen), photos[other])
+            other_tints = torch.nn.functional.grid_sample(smooth[other][None], grid[None, None], align_corners=False)[
                 0, :, 0
             ].T
-            votes += inside & ((there - tints).abs().mean(dim=-1) <= config.color)
-            z, measured = look_up(where, agreed[other], shots[other], poses[other])
+            votes += inside & ((other_tints - tints).abs().mean(dim=-1) <= config.color)
+            z, measured = sample_depth(points_seen, consistent[other], photos[other], poses[other])
             against |= sees_through(z, measured, config.agree)
         chosen = torch.zeros_like(candidates)
         chosen[candidates] = (votes >= 2) & ~against
-        kept[view] = torch.where(chosen, depth, 0)
-    return kept
+        supported[view] = torch.where(chosen, depth, 0)
+    return supported

@@ -9,7 +9,7 @@ from gsencoder.core.errors import InputError, SceneWarning, advised, listed
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.data.scenes import SceneConfig, find_scenes, is_scene, load_scene
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
-from gsencoder.reconstruct.sfm import PLACED_FILE, Placed, SfmConfig, photographs_in, place_photographs, placed_before
+from gsencoder.reconstruct.sfm import PLACED_FILE, Placed, SfmConfig, load_placement, photographs_in, place_photographs
 from gsencoder.types import Scene
 
 START_AGAIN = "give resume=false to begin anew"
@@ -65,7 +65,7 @@ def open_scene(
             f"{path}: splat={splat} lies in a world of its own, and photographs without poses are placed "
             "in another; give a scene with the poses that belong to the splat"
         )
-    placed = placed_before(pictures, work, sfm)
+    placed = load_placement(pictures, work, sfm)
     if placed is None and os.path.lexists(work / CHECKPOINT_FILE):
         raise InputError(
             f"{work}: a run was cut off here, and where its photographs were placed ({PLACED_FILE}, sparse/0) is "

@@ -1,4 +1,4 @@
-"""Fitting a splat to photographs: L1 + D-SSIM, depth where it is known, pruning, never growing."""
+"""Optimization of a splat against photographs: L1 + D-SSIM, depth where it is measured, pruning, no growing."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.signals import held_back
-from gsencoder.reconstruct.anchor import Leash
+from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.parameters import (
     Parameters,
     camera_of,
@@ -19,7 +19,7 @@ from gsencoder.reconstruct.parameters import (
     rows_in_view,
     seen_colors,
 )
-from gsencoder.reconstruct.photographs import Photographs, Shot
+from gsencoder.reconstruct.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render.image_metrics import WINDOW as SSIM_WINDOW
@@ -27,7 +27,7 @@ from gsencoder.render.image_metrics import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Gaussians
 
-LARGEST_RATE = 10.0
+MAX_RATE = 10.0
 """Adam's steps are about as large as the rate, and an e-fold of a scale is 1."""
 
 
@@ -81,7 +81,7 @@ class OptimizeConfig:
         if not 0 <= self.seed < 2**63:
             raise InputError(f"seed: expected 0 or more, got {self.seed}")
         limits = {"sh_every": 1.0, "depth_weight": 100.0, "leash": 1e6}
-        limits |= dict.fromkeys((field.name for field in fields(self) if field.name.endswith("_rate")), LARGEST_RATE)
+        limits |= dict.fromkeys((field.name for field in fields(self) if field.name.endswith("_rate")), MAX_RATE)
         for name, limit in limits.items():
             if not 0 <= getattr(self, name) <= limit:
                 raise InputError(f"{name}: expected a number from 0 to {limit:g}, got {getattr(self, name)}")
@@ -112,9 +112,9 @@ class Optimizer:
 
     Attributes:
         adam: holds the parameters, and their moments.
-        leash: what holds positions back, if anything does.
+        anchor: what holds positions near their seeds, if anything does.
         step: steps that are done.
-        whole: whether the state is one between two steps.
+        is_consistent: whether the state is one between two steps.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Optimizer:
         *,
         prune: PruneConfig,
         raster: RasterConfig = RasterConfig(),
-        leash: Leash | None = None,
+        anchor: Anchor | None = None,
         step: int = 0,
     ) -> None:
         """Args:
@@ -136,7 +136,7 @@ class Optimizer:
         config: see there.
         prune: what is taken out, and when.
         raster: accuracy of rendering.
-        leash: what holds positions back; None = nothing.
+        anchor: what holds positions near their seeds; None = nothing.
         step: steps that are done.
 
         Raises:
@@ -144,12 +144,12 @@ class Optimizer:
         """
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
-        self.adam, self.leash, self.step, self.whole = adam, leash, step, True
+        self.adam, self.anchor, self.step, self.is_consistent = adam, anchor, step, True
         self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
         self._check_sizes()
         poses = {view: camera_of(photographs.cameras, view, self.device)[0] for view in self.training}
-        if not any(len(self._rows(pose, photographs.shot(view, 2))) for view, pose in poses.items()):
+        if not any(len(self._rows(pose, photographs.at_scale(view, 2))) for view, pose in poses.items()):
             raise InputError(
                 f"reconstruct: none of {len(self.raw['means'])} Gaussians is in view of any of {len(self.training)} "
                 "photographs; are the splat and the poses of one world, and is raster.near small enough?"
@@ -164,9 +164,9 @@ class Optimizer:
 
     def view_at(self, step: int) -> int:
         """Each view once in a round, in an order that depends on the seed and the round alone."""
-        turn, place = divmod(step, len(self.training))
+        turn, position = divmod(step, len(self.training))
         order = np.random.default_rng((self.config.seed, turn)).permutation(len(self.training))
-        return self.training[int(order[place])]
+        return self.training[int(order[position])]
 
     def advance(self) -> dict[str, float]:
         """One step; the terms of the loss.
@@ -175,12 +175,12 @@ class Optimizer:
             InputError: a loss or gradient that is not finite; view and term are named.
         """
         view = self.view_at(self.step)
-        shot = self.photographs.shot(view, self.config.shrink_at(self.step))
+        photo = self.photographs.at_scale(view, self.config.shrink_at(self.step))
         terms: dict[str, float] = {}
         grads: Parameters = {}
-        raster, rows, seen = self._look(view, shot, self.config.degree_at(self.step))
+        raster, rows, seen = self._look(view, photo, self.config.degree_at(self.step))
         if len(rows):
-            losses = losses_of(raster, shot, self.config)
+            losses = losses_of(raster, photo, self.config)
             total = torch.stack([*losses.values()]).sum()
             total.backward()
             grads = {name: value.grad for name, value in seen.items() if value.grad is not None}
@@ -188,31 +188,31 @@ class Optimizer:
             terms = {name: float(value.detach()) for name, value in losses.items()}
         # A step that is cut in two could not be gone on with.
         with held_back():
-            self.whole = False
+            self.is_consistent = False
             if len(rows):
                 rates = self.config.rates_at(self.step, self.extent)
                 self.adam.step(rows, grads, rates)
-                if self.leash is not None:
-                    self.leash.pull(self.raw["means"], rows, rates["means"])
+                if self.anchor is not None:
+                    self.anchor.pull(self.raw["means"], rows, rates["means"])
             self.step += 1
             if self.pruning.due(self.step, self.config.steps):
                 self.prune()
-            self.whole = True
+            self.is_consistent = True
         return terms
 
-    def _look(self, view: int, shot: Shot, degree: int) -> tuple[Raster, Int64[Tensor, " n"], Parameters]:
+    def _look(self, view: int, photo: ScaledPhotograph, degree: int) -> tuple[Raster, Int64[Tensor, " n"], Parameters]:
         """A view over black, the rows that may show in it, and these rows as leaves that gradients go to."""
         pose, center = camera_of(self.photographs.cameras, view, self.device)
-        K, size = shot.K.to(self.device), (shot.width, shot.height)
-        rows = self._rows(pose, shot)
+        K, size = photo.K.to(self.device), (photo.width, photo.height)
+        rows = self._rows(pose, photo)
         seen = {name: value[rows].requires_grad_() for name, value in self.raw.items()}
         shape = (seen["means"], seen["quats"], seen["log_scales"].exp(), seen["logit_opacities"].sigmoid())
         raster = rasterize(*shape, seen_colors(seen, degree, center), pose, K, *size, config=self.raster)
         return raster, rows, seen
 
-    def _rows(self, pose: Float[Tensor, "4 4"], shot: Shot) -> Int64[Tensor, " n"]:
+    def _rows(self, pose: Float[Tensor, "4 4"], photo: ScaledPhotograph) -> Int64[Tensor, " n"]:
         knobs = {"near": self.raster.near, "eps2d": self.raster.eps2d}
-        return rows_in_view(self.raw, pose, shot.K.to(self.device), shot.width, shot.height, **knobs)
+        return rows_in_view(self.raw, pose, photo.K.to(self.device), photo.width, photo.height, **knobs)
 
     def _check_sizes(self) -> None:
         smallest = SSIM_WINDOW * max(self.config.shrinks)
@@ -229,11 +229,11 @@ class Optimizer:
 
     def prune(self) -> None:
         """Takes out what does not contribute."""
-        views = ((view, self.photographs.shot(view, 2)) for view in self.training)
+        views = ((view, self.photographs.at_scale(view, 2)) for view in self.training)
         rows = rows_to_keep(self.raw, self.photographs.cameras, views, self.pruning, self.raster)
         self.adam.keep(rows)
-        if self.leash is not None:
-            self.leash = self.leash.keep(rows)
+        if self.anchor is not None:
+            self.anchor = self.anchor.keep(rows)
 
     def _check(self, view: int, losses: Mapping[str, Tensor], grads: Mapping[str, Tensor]) -> None:
         named = {f"the loss {name}": value for name, value in losses.items()}
@@ -250,19 +250,19 @@ class Optimizer:
         return gaussians_of(self.raw)
 
     @torch.no_grad()
-    def picture(self, view: int, shot: Shot) -> Float[Tensor, "H W 3"]:
+    def picture(self, view: int, photo: ScaledPhotograph) -> Float[Tensor, "H W 3"]:
         """A view as it is now, in [0, 1]."""
-        return self._look(view, shot, self.config.sh_degree)[0].rgb.clamp(0, 1).cpu()
+        return self._look(view, photo, self.config.sh_degree)[0].rgb.clamp(0, 1).cpu()
 
 
-def losses_of(raster: Raster, shot: Shot, config: OptimizeConfig) -> dict[str, Float[Tensor, ""]]:
+def losses_of(raster: Raster, photo: ScaledPhotograph, config: OptimizeConfig) -> dict[str, Float[Tensor, ""]]:
     """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, and the relative error of depth where it is known."""
-    image = shot.image.to(raster.rgb.device)
+    image = photo.image.to(raster.rgb.device)
     rgb = raster.rgb
     losses = {}
-    if shot.mask is not None:
+    if photo.mask is not None:
         # What is masked is made equal: it gives no gradient, and no edge to windows that reach over it.
-        mask = shot.mask.to(rgb.device)
+        mask = photo.mask.to(rgb.device)
         image = torch.where(mask.unsqueeze(-1), image, rgb.detach())
         share = mask.float().mean().clamp(min=1e-6)
     else:
@@ -270,12 +270,12 @@ def losses_of(raster: Raster, shot: Shot, config: OptimizeConfig) -> dict[str, F
     losses["l1"] = (1 - config.ssim_weight) * (rgb - image).abs().mean() / share
     if config.ssim_weight:
         losses["ssim"] = config.ssim_weight * (1 - ssim(rgb, image)) / share
-    if config.depth_weight and shot.depth is not None:
-        depth = shot.depth.to(rgb.device)
+    if config.depth_weight and photo.depth is not None:
+        depth = photo.depth.to(rgb.device)
         known = (depth > 0) & (raster.alpha.detach() > 0.5)
-        if shot.mask is not None:
-            known &= shot.mask.to(rgb.device)
-        found = raster.depth / raster.alpha.clamp(min=1e-3)
-        error = ((found - depth).abs() / depth.clamp(min=1e-6)).clamp(max=1)
+        if photo.mask is not None:
+            known &= photo.mask.to(rgb.device)
+        expected = raster.depth / raster.alpha.clamp(min=1e-3)
+        error = ((expected - depth).abs() / depth.clamp(min=1e-6)).clamp(max=1)
         losses["depth"] = config.depth_weight * torch.where(known, error, 0).mean()
     return losses

@@ -1,4 +1,4 @@
-"""What the optimizer moves: a splat in unbounded numbers (logarithms of scales, logits of opacities)."""
+"""The parameters that are optimized: a splat with logarithms of scales and logits of opacities."""
 
 import numpy as np
 import torch
@@ -8,9 +8,9 @@ from torch import Tensor
 from gsencoder.geometry import colors_from_sh, normalize_quats, project_points, transform
 from gsencoder.types import Cameras, Gaussians
 
-OPACITY_ENDS = 1e-3
+OPACITY_MARGIN = 1e-3
 """Opacities begin at least so far from 0 and 1, where a logit has no slope."""
-REACH = 3.33
+MAX_SIGMAS = 3.33
 """No splat reaches further than so many standard deviations: √(2 ln 255) at an opacity of 1."""
 
 Parameters = dict[str, Tensor]
@@ -32,11 +32,11 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
 
 def parameters_from(gaussians: Gaussians, sh_degree: int, device: torch.device | str = "cpu") -> Parameters:
     """The parameters of a splat; color coefficients above those that it has begin at zero, more are cut."""
-    n, wanted = len(gaussians), (sh_degree + 1) ** 2
-    sh = np.zeros((n, wanted, 3), np.float32)
-    kept = min(wanted, gaussians.sh.shape[1])
-    sh[:, :kept] = gaussians.sh[:, :kept]
-    opacities = torch.from_numpy(gaussians.opacities.copy()).clamp(OPACITY_ENDS, 1 - OPACITY_ENDS)
+    n, num_coefficients = len(gaussians), (sh_degree + 1) ** 2
+    sh = np.zeros((n, num_coefficients, 3), np.float32)
+    common = min(num_coefficients, gaussians.sh.shape[1])
+    sh[:, :common] = gaussians.sh[:, :common]
+    opacities = torch.from_numpy(gaussians.opacities.copy()).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     raw = {
         "means": torch.from_numpy(gaussians.means.copy()),
         "quats": torch.from_numpy(gaussians.quats.copy()),
@@ -50,14 +50,14 @@ def parameters_from(gaussians: Gaussians, sh_degree: int, device: torch.device |
 
 def gaussians_of(raw: Parameters) -> Gaussians:
     """The splat in physical values."""
-    found = {
+    values = {
         "means": raw["means"],
         "quats": normalize_quats(raw["quats"]),
         "scales": raw["log_scales"].exp(),
         "opacities": raw["logit_opacities"].sigmoid(),
         "sh": torch.cat((raw["sh0"], raw["shN"]), dim=1),
     }
-    return Gaussians(**{name: value.detach().cpu().numpy().copy() for name, value in found.items()})
+    return Gaussians(**{name: value.detach().cpu().numpy().copy() for name, value in values.items()})
 
 
 def seen_colors(raw: Parameters, degree: int, camera_center: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
@@ -86,10 +86,10 @@ def rows_in_view(
     inside: Bool[Tensor, " N"] = z > near
     largest = raw["log_scales"].amax(dim=1).exp() / z.clamp(min=near)
     focals, middles, sizes = K.diagonal()[:2], K[:2, 2], (width, height)
-    for place, focal, middle, size in zip(project_points(local, K).unbind(1), focals, middles, sizes, strict=True):
+    for position, focal, middle, size in zip(project_points(local, K).unbind(1), focals, middles, sizes, strict=True):
         tangent = torch.maximum(middle, size - middle) / focal + 0.15 * size / focal
-        reach = REACH * torch.sqrt((focal * largest).square() * (1 + tangent.square()) + eps2d)
-        inside &= (place + reach > 0) & (place - reach < size)
+        reach = MAX_SIGMAS * torch.sqrt((focal * largest).square() * (1 + tangent.square()) + eps2d)
+        inside &= (position + reach > 0) & (position - reach < size)
     return inside.nonzero().squeeze(1)
 
 

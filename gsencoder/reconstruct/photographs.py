@@ -1,4 +1,4 @@
-"""The photographs that a reconstruction is fitted to, kept in memory and made smaller on demand."""
+"""The photographs that a reconstruction is fitted to, in memory, downscaled on demand."""
 
 from dataclasses import dataclass
 from hashlib import sha1
@@ -14,7 +14,7 @@ from gsencoder.types import Cameras, Views
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Shot:
+class ScaledPhotograph:
     """One photograph at one size.
 
     Attributes:
@@ -67,21 +67,21 @@ class Photographs:
         return len(self._images)
 
     def digest(self) -> str:
-        """What tells these photographs, masks, depths and poses from others."""
-        found = sha1()
+        """A digest of photographs, masks, depths and poses."""
+        digest = sha1()
         arrays = [getattr(self.cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights")]
         for part in (*self._images, *self._masks, *self._depths):
             arrays.append(np.empty(0) if part is None else part.numpy())
         for name, array in zip((*"ptwh", *3 * self.names), arrays, strict=True):
-            found.update(f"{name}{array.shape}{array.dtype}".encode())
-            found.update(np.ascontiguousarray(array).data)
-        return found.hexdigest()[:16]
+            digest.update(f"{name}{array.shape}{array.dtype}".encode())
+            digest.update(np.ascontiguousarray(array).data)
+        return digest.hexdigest()[:16]
 
     def mask(self, view: int) -> Bool[Tensor, "H W"] | None:
         """Pixels of a photograph that count; None where all do."""
         return self._masks[view]
 
-    def shot(self, view: int, shrink: int = 1) -> Shot:
+    def at_scale(self, view: int, shrink: int = 1) -> ScaledPhotograph:
         """A view; each of its pixels stands for `shrink` × `shrink` of the photograph's.
 
         Colors are averaged. A pixel is looked at if all it covers is, and its depth is known if all it covers
@@ -98,4 +98,4 @@ class Photographs:
                 far, close = (torch.nn.functional.max_pool2d(sign * depth[None], shrink)[0] for sign in (1, -1))
                 depth = torch.where((far + close <= 0.05 * far) & (close < 0), (far - close) / 2, 0)
             K[:2] /= shrink
-        return Shot(image=image, mask=mask, depth=depth, K=K)
+        return ScaledPhotograph(image=image, mask=mask, depth=depth, K=K)

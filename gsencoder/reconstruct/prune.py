@@ -1,4 +1,4 @@
-"""What is taken out of a splat while it is fitted; nothing is ever added (SplatDistill, section 3.1)."""
+"""Pruning during the optimization of a splat; nothing is ever added (SplatDistill, sec. 3.1)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.reconstruct.parameters import Parameters, camera_of, rows_in_view
-from gsencoder.reconstruct.photographs import Shot
+from gsencoder.reconstruct.photographs import ScaledPhotograph
 from gsencoder.render.rasterize import RasterConfig, rasterize
 from gsencoder.types import Cameras
 
@@ -42,7 +42,11 @@ class PruneConfig:
 
 
 def rows_to_keep(
-    raw: Parameters, cameras: Cameras, views: Iterable[tuple[int, Shot]], config: PruneConfig, raster: RasterConfig
+    raw: Parameters,
+    cameras: Cameras,
+    views: Iterable[tuple[int, ScaledPhotograph]],
+    config: PruneConfig,
+    raster: RasterConfig,
 ) -> Int64[Tensor, " n"]:
     """Rows that are opaque enough, of sane size on every screen, and seen somewhere.
 
@@ -61,27 +65,29 @@ def rows_to_keep(
     """
     means = raw["means"]
     opacities = raw["logit_opacities"].sigmoid()
-    most, widest = torch.zeros_like(opacities), torch.zeros_like(opacities)
-    for view, shot in views:
+    contributions, max_widths = torch.zeros_like(opacities), torch.zeros_like(opacities)
+    for view, photo in views:
         pose, _ = camera_of(cameras, view, means.device)
-        K = shot.K.to(means.device)
-        pixels = float(cameras.Ks[view, 0, 0] / shot.K[0, 0]) ** 2
-        rows = rows_in_view(raw, pose, K, shot.width, shot.height, near=raster.near, eps2d=raster.eps2d)
+        K = photo.K.to(means.device)
+        pixels = float(cameras.Ks[view, 0, 0] / photo.K[0, 0]) ** 2
+        rows = rows_in_view(raw, pose, K, photo.width, photo.height, near=raster.near, eps2d=raster.eps2d)
         if not len(rows):
             continue
         ones = torch.ones(len(rows), 3, device=means.device, requires_grad=True)
         shape = (means[rows], raw["quats"][rows], raw["log_scales"][rows].exp(), opacities[rows])
-        seen = rasterize(*shape, ones, pose, K, shot.width, shot.height, config=raster)
+        seen = rasterize(*shape, ones, pose, K, photo.width, photo.height, config=raster)
         (sums,) = torch.autograd.grad(seen.rgb[..., 0].sum(), ones)
-        most[rows] = torch.maximum(most[rows], pixels * sums[:, 0])
-        widest[rows] = torch.maximum(widest[rows], seen.radii / max(shot.width, shot.height))
-    bad = {"opacity": opacities < config.opacity, "contribution": most < config.contribution}
+        contributions[rows] = torch.maximum(contributions[rows], pixels * sums[:, 0])
+        max_widths[rows] = torch.maximum(max_widths[rows], seen.radii / max(photo.width, photo.height))
+    rejected = {"opacity": opacities < config.opacity, "contribution": contributions < config.contribution}
     if config.screen:
-        bad["screen"] = widest > config.screen
-    kept = (~torch.stack([*bad.values()]).any(dim=0)).nonzero().squeeze(1)
-    if not len(kept):
+        rejected["screen"] = max_widths > config.screen
+    rows_left = (~torch.stack([*rejected.values()]).any(dim=0)).nonzero().squeeze(1)
+    if not len(rows_left):
         why = ", ".join(
-            f"{int(rows.sum())} by prune.{name}={getattr(config, name):g}" for name, rows in bad.items() if rows.any()
+            f"{int(rows.sum())} by prune.{name}={getattr(config, name):g}"
+            for name, rows in rejected.items()
+            if rows.any()
         )
         raise InputError(f"reconstruct: pruning would leave none of {len(means)} Gaussians ({why}); change these")
-    return kept
+    return rows_left

@@ -1,4 +1,4 @@
-"""Adam that steps only some rows of its parameters: those in view, so that a step costs what it sees."""
+"""Adam over selected rows of its parameters: those in view, so that the cost of a step is that of the view."""
 
 from collections.abc import Mapping
 from typing import no_type_check
@@ -50,10 +50,10 @@ class RowAdam:
     @classmethod
     def restored(cls, tables: Mapping[str, Mapping[str, Tensor]], steps: int) -> "RowAdam":
         """One that stands where `tables` of another, and its steps, were taken."""
-        made = cls(tables["parameters"])
-        made.averages, made.squares = dict(tables["averages"]), dict(tables["squares"])
-        made.steps = steps
-        return made
+        restored = cls(tables["parameters"])
+        restored.averages, restored.squares = dict(tables["averages"]), dict(tables["squares"])
+        restored.steps = steps
+        return restored
 
     def tables(self) -> dict[str, dict[str, Tensor]]:
         """Parameters and moments."""
@@ -87,7 +87,7 @@ class RowAdam:
     def _on_cpu(
         rows: Tensor, grad: Tensor, value: Tensor, average: Tensor, square: Tensor, rate: float, correction: float
     ) -> None:
-        tables = [part.reshape(len(part), -1).numpy() for part in (grad.contiguous(), value, average, square)]
+        tables = [array.reshape(len(array), -1).numpy() for array in (grad.contiguous(), value, average, square)]
         # As numbers of the arrays' own type all arithmetic stays in it; 1 − 0.999 must be rounded once, and at the end.
         first, second = BETAS
         exact = (rate, correction, first, 1 - first, second, 1 - second, EPS)

@@ -23,7 +23,7 @@ from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.reconstruct.anchor import leash_of
+from gsencoder.reconstruct.anchor import anchor_at
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.dense import DenseConfig
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
@@ -31,8 +31,8 @@ from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.score import FEWEST, score, seen_pixels, split, unmasked
-from gsencoder.reconstruct.start import start_of
+from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, covisible_pixels, drop_masked_views, score, split
+from gsencoder.reconstruct.start import initial_gaussians
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Gaussians, Scene
 
@@ -49,8 +49,8 @@ Report = Callable[[str], None]
 class ReconstructConfig:
     """How photographs become Gaussians, and how the result is judged."""
 
-    holdout: int = field(default=8, metadata={"help": "of so many photographs one is kept to judge by; 0 = none"})
-    validate_every: int = field(default=500, metadata={"help": "steps between judgements; 0 = at the end alone"})
+    holdout: int = field(default=8, metadata={"help": "hold out every n-th photograph for validation; 0 = none"})
+    validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = at the end alone"})
     checkpoint_every: float = field(default=60.0, metadata={"help": "seconds between checkpoints"})
     seeds: SeedConfig = field(default_factory=SeedConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
@@ -152,8 +152,8 @@ def reconstruct(
         with clock("read"):
             photographs = Photographs(scene.views, track=track)
         training, held_out = split(len(photographs), config.holdout)
-        training = unmasked(photographs, training, "photographs to fit", least=FEWEST)
-        held_out = unmasked(photographs, held_out, "held-out photographs")
+        training = drop_masked_views(photographs, training, "photographs to fit", least=MIN_PHOTOGRAPHS)
+        held_out = drop_masked_views(photographs, held_out, "held-out photographs")
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
         chosen_device, checkpoint = choose_device(device), folder / CHECKPOINT_FILE
         if continued := os.path.lexists(checkpoint):
@@ -169,7 +169,7 @@ def reconstruct(
             config.optimize,
             prune=config.prune,
             raster=config.raster,
-            leash=state.leash,
+            anchor=state.anchor,
             step=state.step,
         )
         if not continued:
@@ -198,7 +198,7 @@ def initial_state(
     report: Report,
 ) -> State:
     """The state before the first step: seeds as parameters, and how they came about."""
-    start = start_of(scene, photographs, training, config.seeds, config.dense, track=track)
+    start = initial_gaussians(scene, photographs, training, config.seeds, config.dense, track=track)
     seeding: dict[str, Any] = {"seeds": len(start.gaussians), "source": start.source}
     if start.dense is not None:
         dense = start.dense
@@ -215,8 +215,8 @@ def initial_state(
                 stacklevel=3,
             )
     adam = RowAdam(parameters_from(start.gaussians, config.optimize.sh_degree, device))
-    leash = leash_of(adam.parameters, config.optimize.leash) if start.measured and config.optimize.leash else None
-    return State(adam=adam, leash=leash, step=0, seconds=0.0, facts=seeding)
+    anchor = anchor_at(adam.parameters, config.optimize.leash) if start.measured and config.optimize.leash else None
+    return State(adam=adam, anchor=anchor, step=0, seconds=0.0, facts=seeding)
 
 
 def optimize(
@@ -234,7 +234,7 @@ def optimize(
     with advised(START_AGAIN):
         log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
         rows = read_rows(work / LOG_FILE)
-    seen = seen_pixels(optimizer.photographs, held_out, optimizer.training)
+    seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
     start, saved_at, saved_step = time.monotonic() - state.seconds, time.monotonic(), optimizer.step
 
     def validate() -> None:
@@ -256,7 +256,7 @@ def optimize(
     def save() -> None:
         now = State(
             adam=optimizer.adam,
-            leash=optimizer.leash,
+            anchor=optimizer.anchor,
             step=optimizer.step,
             seconds=time.monotonic() - start,
             facts=state.facts,
@@ -273,7 +273,7 @@ def optimize(
                 saved_at, saved_step = time.monotonic(), optimizer.step
     finally:
         # Also after the last step: writing the results may be interrupted as well.
-        if optimizer.whole and optimizer.step > saved_step:
+        if optimizer.is_consistent and optimizer.step > saved_step:
             save()
     return rows
 
@@ -298,12 +298,12 @@ def compare(optimizer: Optimizer, held_out: Sequence[int]) -> tuple[Comparison, 
 
     comparisons = []
     for view in (held_out[index] for index in evenly(len(held_out), MAX_COMPARISONS)):
-        shot = optimizer.photographs.shot(view)
+        photo = optimizer.photographs.at_scale(view)
         comparisons.append(
             Comparison(
                 name=optimizer.photographs.names[view],
-                photograph=pixels(shot.image),
-                render=pixels(optimizer.picture(view, shot)),
+                photograph=pixels(photo.image),
+                render=pixels(optimizer.picture(view, photo)),
             )
         )
     return tuple(comparisons)

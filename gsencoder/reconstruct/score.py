@@ -1,4 +1,4 @@
-"""How well a splat shows photographs that it was not fitted to: the whole picture, and what could be known of it."""
+"""Scores of a splat on held-out photographs: over all pixels, and over those that a fitted photograph shows."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,11 +12,11 @@ from torch import Tensor
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.photographs import Photographs
-from gsencoder.reconstruct.stereo import finds, look_up, world_points
+from gsencoder.reconstruct.stereo import confirms, sample_depth, world_points
 from gsencoder.render.image_metrics import inner, psnr, ssim
 
-FEWEST = 2
-"""Photographs that a splat can be fitted to."""
+MIN_PHOTOGRAPHS = 2
+"""Smallest number of photographs that a splat can be fitted to."""
 SAME_DEPTH = 0.02
 """Relative difference of measured depths up to which two photographs show the same surface."""
 
@@ -40,19 +40,21 @@ class Score(NamedTuple):
 
 
 def split(count: int, every: int) -> tuple[list[int], list[int]]:
-    """Views to fit, and every so manyth that is kept to judge by.
+    """Row numbers of the views to fit, and of every n-th view, which is held out.
 
     Raises:
         InputError: too few.
     """
     held_out = [view for view in range(count) if every and view % every == 0]
     training = [view for view in range(count) if view not in held_out]
-    if len(training) < FEWEST:
-        raise InputError(f"reconstruct: expected at least {FEWEST} photographs to fit, got {len(training)} of {count}")
+    if len(training) < MIN_PHOTOGRAPHS:
+        raise InputError(
+            f"reconstruct: expected at least {MIN_PHOTOGRAPHS} photographs to fit, got {len(training)} of {count}"
+        )
     return training, held_out
 
 
-def unmasked(photographs: Photographs, views: Sequence[int], what: str, *, least: int = 0) -> list[int]:
+def drop_masked_views(photographs: Photographs, views: Sequence[int], what: str, *, least: int = 0) -> list[int]:
     """The views of which a mask leaves a window of pixels.
 
     Args:
@@ -68,18 +70,18 @@ def unmasked(photographs: Photographs, views: Sequence[int], what: str, *, least
         SceneWarning: some are not left; they are named.
     """
     masks = {view: photographs.mask(view) for view in views}
-    blank = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
-    if not blank:
+    masked = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
+    if not masked:
         return list(views)
-    told = f"{len(blank)} of {len(views)} {what} are masked all over"
-    names = listed([photographs.names[view] for view in blank])
-    if len(views) - len(blank) < least:
-        raise InputError(f"reconstruct: {told}: {names}; look at their masks, or at their alpha channels")
-    warnings.warn(f"{told} and not used: {names}", SceneWarning, stacklevel=2)
-    return [view for view in views if view not in blank]
+    message = f"{len(masked)} of {len(views)} {what} are masked all over"
+    names = listed([photographs.names[view] for view in masked])
+    if len(views) - len(masked) < least:
+        raise InputError(f"reconstruct: {message}: {names}; look at their masks, or at their alpha channels")
+    warnings.warn(f"{message} and not used: {names}", SceneWarning, stacklevel=2)
+    return [view for view in views if view not in masked]
 
 
-def seen_pixels(
+def covisible_pixels(
     photographs: Photographs, views: Sequence[int], training: Sequence[int]
 ) -> dict[int, Bool[Tensor, "H W"]]:
     """For each view the pixels whose surface some other photograph shows; nothing else can be known about the rest.
@@ -94,18 +96,18 @@ def seen_pixels(
     """
     depths, points, shown = {}, {}, {}
     for view in views:
-        shot = photographs.shot(view)
-        if shot.depth is not None:
-            depths[view] = shot.depth
-            points[view] = world_points(shot.depth, shot, _pose(photographs, view))[shot.depth > 0]
+        photo = photographs.at_scale(view)
+        if photo.depth is not None:
+            depths[view] = photo.depth
+            points[view] = world_points(photo.depth, photo, _pose(photographs, view))[photo.depth > 0]
             shown[view] = torch.zeros(len(points[view]), dtype=torch.bool)
     # One fitted photograph after the other, so that not all of them are held at once.
     for other in training if points else ():
-        shot = photographs.shot(other)
-        for view, places in points.items():
-            if shot.depth is not None:
-                z, measured = look_up(places, shot.depth, shot, _pose(photographs, other))
-                shown[view] |= finds(z, measured, SAME_DEPTH)
+        photo = photographs.at_scale(other)
+        for view, positions in points.items():
+            if photo.depth is not None:
+                z, measured = sample_depth(positions, photo.depth, photo, _pose(photographs, other))
+                shown[view] |= confirms(z, measured, SAME_DEPTH)
     return {view: (depth > 0).masked_scatter(depth > 0, shown[view]) for view, depth in depths.items()}
 
 
@@ -115,26 +117,26 @@ def _pose(photographs: Photographs, view: int) -> Float[Tensor, "4 4"]:
 
 @torch.no_grad()
 def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Tensor, "H W"]] = {}) -> Score:
-    """How well an optimizer's splat shows some views.
+    """Mean scores of a splat on some views.
 
     Args:
         optimizer: as it is now.
         views: to look at.
-        seen: what `seen_pixels` found; a view of which nothing is seen, or its edges alone, in which no window of SSIM
-            has its middle, counts in the whole pictures alone.
+        seen: what `covisible_pixels` found; a view of which nothing is seen, or its edges alone, in which no window of
+            SSIM has its middle, counts in the whole pictures alone.
     """
-    whole, known, shares = [], [], []
+    complete, covisible, shares = [], [], []
     for view in views:
-        shot = optimizer.photographs.shot(view)
-        picture = optimizer.picture(view, shot)
-        whole.append((psnr(picture, shot.image, shot.mask), float(ssim(picture, shot.image, shot.mask))))
+        photo = optimizer.photographs.at_scale(view)
+        picture = optimizer.picture(view, photo)
+        complete.append((psnr(picture, photo.image, photo.mask), float(ssim(picture, photo.image, photo.mask))))
         if view in seen:
-            mask = seen[view] if shot.mask is None else seen[view] & shot.mask
+            mask = seen[view] if photo.mask is None else seen[view] & photo.mask
             shares.append(float(mask.float().mean()))
             if inner(mask).any():
-                known.append((psnr(picture, shot.image, mask), float(ssim(picture, shot.image, mask))))
-    found = Score(*(float(mean) for mean in np.mean(whole, axis=0)))
-    if not known:
-        return found
-    seen_psnr, seen_ssim = (float(mean) for mean in np.mean(known, axis=0))
-    return found._replace(seen_psnr=seen_psnr, seen_ssim=seen_ssim, seen=float(np.mean(shares)))
+                covisible.append((psnr(picture, photo.image, mask), float(ssim(picture, photo.image, mask))))
+    scores = Score(*(float(mean) for mean in np.mean(complete, axis=0)))
+    if not covisible:
+        return scores
+    seen_psnr, seen_ssim = (float(mean) for mean in np.mean(covisible, axis=0))
+    return scores._replace(seen_psnr=seen_psnr, seen_ssim=seen_ssim, seen=float(np.mean(shares)))

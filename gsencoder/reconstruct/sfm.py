@@ -1,4 +1,4 @@
-"""Photographs without poses: structure from motion by pycolmap, on a CPU."""
+"""Structure from motion for photographs without poses, by pycolmap on a CPU."""
 
 import hashlib
 import json
@@ -19,11 +19,11 @@ from gsencoder.data.readers.undistort import load_pycolmap
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")
 OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".nef", ".arw", ".mp4", ".mov", ".avi")
 """Pictures and films that pycolmap does not read; that they are left out is said."""
-MOST_PIXELS, MOST_FEATURES = 100_000, 1_000_000
+MAX_PIXELS, MAX_FEATURES = 100_000, 1_000_000
 PLACED_FILE = "placed.json"
-BYTES_A_FEATURE, USUAL_FEATURES = 160, 8192
+BYTES_PER_FEATURE, TYPICAL_FEATURES = 160, 8192
 """In the database: descriptor and place. Photographs seldom have more, whatever is allowed."""
-MOST_EXHAUSTIVE = 150
+MAX_EXHAUSTIVE = 150
 """Up to so many photographs all pairs are compared."""
 
 
@@ -35,7 +35,7 @@ class SfmConfig:
         default="auto",
         metadata={
             "help": "which photographs are compared: all pairs, or neighbors by name; auto = all pairs up to "
-            f"{MOST_EXHAUSTIVE} photographs"
+            f"{MAX_EXHAUSTIVE} photographs"
         },
     )
     size: int = field(default=1600, metadata={"help": "longer side in pixels at which features are sought"})
@@ -43,9 +43,9 @@ class SfmConfig:
     camera: str = field(default="SIMPLE_RADIAL", metadata={"help": "COLMAP's camera model"})
 
     def __post_init__(self) -> None:
-        if not (64 <= self.size <= MOST_PIXELS and 64 <= self.features <= MOST_FEATURES):
+        if not (64 <= self.size <= MAX_PIXELS and 64 <= self.features <= MAX_FEATURES):
             raise InputError(
-                f"size and features: expected at least 64, and at most {MOST_PIXELS} pixels and {MOST_FEATURES} "
+                f"size and features: expected at least 64, and at most {MAX_PIXELS} pixels and {MAX_FEATURES} "
                 f"features, got {self.size} and {self.features}"
             )
 
@@ -99,7 +99,7 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
         raise InputError(f"{folder}: expected at least 3 photographs ({', '.join(SUFFIXES)}), found {len(names)}")
     _check(folder, names)
     # Before they are looked at: a photograph that changes meanwhile is not the one that was placed.
-    asked = _asked(folder, names, config)
+    inputs = _inputs(folder, names, config)
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     known = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
@@ -124,28 +124,28 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
             "that lie apart; take more, with larger overlap, of a scene that holds still and has texture"
         )
     best: Any = max(models.values(), key=lambda each: (each.num_reg_images(), each.num_points3D()))
-    whole = model.with_name("unfinished")
-    whole.mkdir(parents=True)
-    best.write(whole)
-    os.replace(whole, model)
+    partial = model.with_name("unfinished")
+    partial.mkdir(parents=True)
+    best.write(partial)
+    os.replace(partial, model)
     shutil.rmtree(attempts, ignore_errors=True)
     database.unlink(missing_ok=True)
     placed = sorted(best.images[number].name for number in best.reg_image_ids())
-    found = {
+    summary = {
         "placed": placed,
         "missing": [name for name in names if name not in set(placed)],
         "points": best.num_points3D(),
         "error": float(best.compute_mean_reprojection_error()),
     }
-    record = {"asked": asked, "found": found, "files": _digests(model)}
+    record = {"asked": inputs, "found": summary, "files": _digests(model)}
     with atomic_file(work / PLACED_FILE) as stream:
         stream.write(json.dumps({**record, "digest": _digest(record)}).encode())
-    return _placed(model, found)
+    return _placed(model, summary)
 
 
-def placed_before(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed | None:
-    """What an earlier call left in `work`, if it came to its end for the same photographs and settings, and its files
-    have their checksums; with several threads a second search need not find the same.
+def load_placement(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed | None:
+    """The result of an earlier call in `work`, if it was completed for the same photographs and settings, and its files
+    have their checksums. A second run of structure from motion with several threads need not give the same poses.
 
     Args:
         folder: of the photographs.
@@ -155,12 +155,12 @@ def placed_before(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> 
     model = work / "sparse" / "0"
     try:
         record = json.loads((work / PLACED_FILE).read_text(encoding="utf-8"))
-        same = model.is_dir() and record["asked"] == _asked(folder, photographs_in(folder), config)
+        same = model.is_dir() and record["asked"] == _inputs(folder, photographs_in(folder), config)
         sound = record.pop("digest") == _digest(record) and record["files"] == _digests(model)
-        found = _placed(model, record["found"])
+        placed = _placed(model, record["found"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    return found if same and sound else None
+    return placed if same and sound else None
 
 
 def _digests(model: Path) -> dict[str, str]:
@@ -172,7 +172,7 @@ def _digest(record: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
-def _asked(folder: Path, names: list[str], config: SfmConfig) -> dict[str, Any]:
+def _inputs(folder: Path, names: list[str], config: SfmConfig) -> dict[str, Any]:
     """What tells the photographs from others of their names, and the settings."""
     states = [(folder / name).stat() for name in names]
     stamps = [[name, state.st_size, state.st_mtime_ns] for name, state in zip(names, states, strict=True)]
@@ -181,7 +181,7 @@ def _asked(folder: Path, names: list[str], config: SfmConfig) -> dict[str, Any]:
 
 def _check_room(work: Path, count: int, config: SfmConfig) -> None:
     """pycolmap ends the whole process where the disk fills under its database."""
-    needed, free = count * min(config.features, USUAL_FEATURES) * BYTES_A_FEATURE, shutil.disk_usage(work).free
+    needed, free = count * min(config.features, TYPICAL_FEATURES) * BYTES_PER_FEATURE, shutil.disk_usage(work).free
     if free < needed:
         raise InputError(
             f"{work}: placing {count} photographs may take {needed / 2**20:.0f} MiB, and {free / 2**20:.0f} are free "
@@ -203,20 +203,21 @@ def _check(folder: Path, names: list[str]) -> None:
         try:
             name.encode()
         except UnicodeEncodeError:
-            told = f"{folder}: {name!r} has bytes that are no text; give the photograph another name"
-            raise InputError(told) from None
+            raise InputError(
+                f"{folder}: {name!r} has bytes that are no text; give the photograph another name"
+            ) from None
         check_picture(folder / name)
 
 
-def _placed(model: Path, found: Mapping[str, Any]) -> Placed:
-    if not isinstance(found["placed"], list) or not isinstance(found["missing"], list):
+def _placed(model: Path, summary: Mapping[str, Any]) -> Placed:
+    if not isinstance(summary["placed"], list) or not isinstance(summary["missing"], list):
         raise TypeError("expected lists of names")
     return Placed(
         model=model,
-        placed=tuple(found["placed"]),
-        missing=tuple(found["missing"]),
-        points=found["points"],
-        error=found["error"],
+        placed=tuple(summary["placed"]),
+        missing=tuple(summary["missing"]),
+        points=summary["points"],
+        error=summary["error"],
     )
 
 
@@ -241,7 +242,7 @@ def _find_features(pycolmap: Any, database: Path, folder: Path, names: list[str]
 def _match(pycolmap: Any, database: Path, count: int, config: SfmConfig) -> None:
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    every = config.pairs == "exhaustive" or (config.pairs == "auto" and count <= MOST_EXHAUSTIVE)
+    every = config.pairs == "exhaustive" or (config.pairs == "auto" and count <= MAX_EXHAUSTIVE)
     if every:
         pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
         return

@@ -1,4 +1,4 @@
-"""Where a reconstruction begins: everything that will be there at the end must be there at the start."""
+"""Initial Gaussians of a reconstruction: its own splat, or seeds for every surface, since nothing grows later."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,14 +7,14 @@ from typing import Any
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.reconstruct.dense import Dense, DenseConfig, densify
+from gsencoder.reconstruct.dense import DenseConfig, DenseSeeds, densify
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.types import Gaussians, Scene, Views
 
-MEASURED = ("depth", "mesh", "tsdf")
-"""Sources whose points lie on surfaces; those of photographs alone are estimates, and a splat has moved already."""
-DENSE_SPACING = 4.0
-"""Seeds of dense points are at most so many median spacings apart: strays among them must not become great blobs."""
+MEASURED_SOURCES = ("depth", "mesh", "tsdf")
+"""Sources of seeds that were measured on surfaces; points of photographs are estimates, and a splat was optimized."""
+MAX_DENSE_SPACING = 4.0
+"""Spacing of dense seeds is clipped to this many medians: outliers must not become large blobs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,16 +29,16 @@ class Start:
 
     gaussians: Gaussians
     source: str
-    dense: Dense | None = None
+    dense: DenseSeeds | None = None
 
     @property
     def measured(self) -> bool:
-        """Whether the Gaussians stand on surfaces that something measured."""
-        return self.source in MEASURED
+        """Whether the Gaussians lie on measured surfaces."""
+        return self.source in MEASURED_SOURCES
 
 
-class _Chosen(Sequence[Any]):
-    """Some entries of a lazy sequence."""
+class _Subset(Sequence[Any]):
+    """A lazy sequence of selected entries of another."""
 
     def __init__(self, items: Sequence[Any], rows: Sequence[int]) -> None:
         self.items, self.rows = items, rows
@@ -50,16 +50,16 @@ class _Chosen(Sequence[Any]):
         return self.items[self.rows[index]]
 
 
-def chosen_views(views: Views, rows: Sequence[int]) -> Views:
-    """Some of the views; pictures stay on disk until they are asked for."""
+def select_views(views: Views, rows: Sequence[int]) -> Views:
+    """Selected views; pictures are decoded on access."""
     lazy = {
-        name: None if getattr(views, name) is None else _Chosen(getattr(views, name), rows)
+        name: None if getattr(views, name) is None else _Subset(getattr(views, name), rows)
         for name in ("images", "depths", "masks", "instances")
     }
     return Views(cameras=views.cameras.select(rows), names=tuple(views.names[row] for row in rows), **lazy)
 
 
-def start_of(
+def initial_gaussians(
     scene: Scene,
     photographs: Photographs,
     training: Sequence[int],
@@ -84,7 +84,7 @@ def start_of(
     if scene.gaussians is not None:
         return Start(gaussians=scene.gaussians, source="splat")
     assert scene.views is not None
-    views = chosen_views(scene.views, list(training))
+    views = select_views(scene.views, list(training))
     source = seeds.source
     if source == "auto":
         source = "depth" if views.depths is not None else "points"
@@ -96,5 +96,5 @@ def start_of(
     added = densify(photographs, training, points, colors, dense, track=track)
     if added is None:
         return Start(gaussians=seed(replace(seen, sfm_colors=colors), replace(seeds, source="points")), source="points")
-    gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=DENSE_SPACING)
+    gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=MAX_DENSE_SPACING)
     return Start(gaussians=gaussians, source="points", dense=added)

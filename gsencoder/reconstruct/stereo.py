@@ -1,4 +1,4 @@
-"""Depth along the rays of textured pixels: plane sweeps between neighboring photographs (Collins 1996).
+"""Depth of textured pixels by plane sweeps between neighboring photographs (Collins 1996).
 
 For every pixel of a reference view, planes z = d of many depths carry it into a few other views; the depth at which
 small windows look most alike there is kept, if they look alike enough.
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from gsencoder.geometry import invert_rigid, project_points, transform, unproject_points
-from gsencoder.reconstruct.photographs import Shot
+from gsencoder.reconstruct.photographs import ScaledPhotograph
 from gsencoder.types import Cameras
 from gsencoder.types.cameras import pixel_centers
 
@@ -21,10 +21,10 @@ WINDOW = 5
 """Side of the windows that are compared, in pixels of the small pictures."""
 PLANE_STEP = 0.7
 """Neighboring planes move a pixel by so many pixels in the view where it moves most."""
-MOST_PLANES = 128
+MAX_PLANES = 128
 SMALLEST_DEPTH = 1e-6
 """Points nearer to a camera, or behind it, are in no picture, world units."""
-LEAST_CONTRAST = 0.01
+MIN_CONTRAST = 0.01
 """Windows whose colors deviate less (of 1) say nothing."""
 BEST_ANGLE = np.deg2rad(8.0)
 """Views whose rays meet at about this angle are compared: further ones look different, nearer ones measure little."""
@@ -44,7 +44,7 @@ class DepthMap(NamedTuple):
     step: Float[Tensor, "h w"]
 
 
-def neighbors_of(
+def source_views(
     cameras: Cameras, points: Float32[np.ndarray, "P 3"], chosen: Sequence[int], count: int
 ) -> dict[int, list[int]]:
     """For each of the chosen views the others to compare it with: those that share many points at a good angle.
@@ -55,9 +55,9 @@ def neighbors_of(
     exact = points.astype(np.float64)
     inside = {view: cameras.in_image(*cameras.project(exact, view), view) for view in chosen}
     centers = cameras.centers
-    found: dict[int, list[int]] = {}
+    sources: dict[int, list[int]] = {}
     for view in chosen:
-        worth = []
+        ranked = []
         for other in chosen:
             both = np.flatnonzero(inside[view] & inside[other])
             if other == view or not both.size:
@@ -66,13 +66,14 @@ def neighbors_of(
             norms = np.prod([np.linalg.norm(ray, axis=1) for ray in rays], axis=0)
             cosine = np.einsum("ij,ij->i", *rays) / np.maximum(norms, 1e-12)
             angle = np.arccos(np.clip(cosine, -1, 1))
-            worth.append((float(np.exp(-np.square(np.log(np.maximum(angle, 1e-6) / BEST_ANGLE))).sum()), other))
-        found[view] = [other for value, other in sorted(worth, reverse=True)[:count] if value > 0]
-    return found
+            ranked.append((float(np.exp(-np.square(np.log(np.maximum(angle, 1e-6) / BEST_ANGLE))).sum()), other))
+        sources[view] = [other for value, other in sorted(ranked, reverse=True)[:count] if value > 0]
+    return sources
 
 
 def depth_range(cameras: Cameras, view: int, points: Float32[np.ndarray, "P 3"]) -> tuple[float, float] | None:
-    """Where to look: the depths of the points in the picture, 2 % of the strays cut off at each end, and a margin."""
+    """Range of depths to sweep: those of the points in the picture, without 2 % of outliers at each end, with a
+    margin."""
     pixels, depths = cameras.project(points.astype(np.float64), view)
     depths = depths[cameras.in_image(pixels, depths, view)]
     if len(depths) < 10:
@@ -81,13 +82,13 @@ def depth_range(cameras: Cameras, view: int, points: Float32[np.ndarray, "P 3"])
     return 0.85 * float(near), 1.3 * float(far)
 
 
-def _points_at(depth: Float[Tensor, "h w"], shot: Shot) -> Float[Tensor, "h w 3"]:
+def _points_at(depth: Float[Tensor, "h w"], photo: ScaledPhotograph) -> Float[Tensor, "h w 3"]:
     """Points on the rays through the pixel centers at depths z, in camera axes."""
-    return unproject_points(torch.from_numpy(pixel_centers(shot.width, shot.height)).float(), depth, shot.K)
+    return unproject_points(torch.from_numpy(pixel_centers(photo.width, photo.height)).float(), depth, photo.K)
 
 
 def _planes(
-    rays: Tensor, relative: Sequence[Tensor], sources: Sequence[Shot], near: float, far: float
+    rays: Tensor, relative: Sequence[Tensor], sources: Sequence[ScaledPhotograph], near: float, far: float
 ) -> Float[Tensor, " D"]:
     """Depths from near to far, evenly spaced in 1/depth, as close as pixels ask."""
     corners = rays[:: max(1, rays.shape[0] - 1), :: max(1, rays.shape[1] - 1)].reshape(-1, 3)
@@ -99,14 +100,14 @@ def _planes(
         ]
         moved = (ends[0] - ends[1]).norm(dim=-1)
         longest = max(longest, float(moved.median()))
-    count = int(np.clip(np.ceil(longest / PLANE_STEP), 16, MOST_PLANES))
+    count = int(np.clip(np.ceil(longest / PLANE_STEP), 16, MAX_PLANES))
     return 1 / torch.linspace(1 / near, 1 / far, count)
 
 
 def sweep(
-    reference: Shot,
+    reference: ScaledPhotograph,
     pose: Float[Tensor, "4 4"],
-    sources: Sequence[Shot],
+    sources: Sequence[ScaledPhotograph],
     source_poses: Sequence[Float[Tensor, "4 4"]],
     near: float,
     far: float,
@@ -116,7 +117,7 @@ def sweep(
     Args:
         reference: the view.
         pose: its cam_from_world.
-        sources: views to compare with, at least two for hidden pixels to be told.
+        sources: views to compare with, at least two, so that occluded pixels are recognized.
         source_poses: their cam_from_world.
         near: smallest depth, world units.
         far: largest depth.
@@ -127,7 +128,7 @@ def sweep(
     windows = _Windows(reference.image.mean(dim=-1)[None, None])
     scores = torch.stack(
         [
-            _alike(windows, rays, source_from_reference, source, depths)
+            _correlations(windows, rays, source_from_reference, source, depths)
             for source_from_reference, source in zip(relative, sources, strict=True)
         ]
     )
@@ -141,7 +142,7 @@ def sweep(
     inverse = 1 / depths
     spacing = inverse[1] - inverse[0]
     at = torch.where(inner == plane, inverse[plane] + shift * spacing, inverse[plane])
-    textured = windows.deviation[0, 0] >= LEAST_CONTRAST
+    textured = windows.deviation[0, 0] >= MIN_CONTRAST
     ends = (plane == 0) | (plane == len(depths) - 1)
     good = textured & ~ends
     if reference.mask is not None:
@@ -165,8 +166,8 @@ def window_mean(maps: Float[Tensor, "n c h w"], side: int = WINDOW) -> Float[Ten
     return pool(lines, (1, side), stride=1, padding=(0, side // 2), count_include_pad=False)
 
 
-def _alike(
-    reference: _Windows, rays: Tensor, source_from_reference: Tensor, source: Shot, depths: Tensor
+def _correlations(
+    reference: _Windows, rays: Tensor, source_from_reference: Tensor, source: ScaledPhotograph, depths: Tensor
 ) -> Float[Tensor, "D h w"]:
     """Zero-mean normalized cross-correlation of each pixel's window with where each plane carries it."""
     # Turned once, and not once for each plane.
@@ -179,15 +180,15 @@ def _alike(
     )
     other = _Windows(warped)
     covariance = window_mean(warped * reference.pictures) - other.mean * reference.mean
-    found = covariance / (other.deviation * reference.deviation + 1e-4)
-    return torch.where(inside, found[:, 0], -1)
+    correlation = covariance / (other.deviation * reference.deviation + 1e-4)
+    return torch.where(inside, correlation[:, 0], -1)
 
 
-def to_grid(points: Float[Tensor, "*n 3"], shot: Shot) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+def to_grid(points: Float[Tensor, "*n 3"], photo: ScaledPhotograph) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
     """Where points in a camera lie in its picture, as grid_sample counts (−1 to 1), and whether they are in it."""
     # The intrinsics of an image whose pixels run from −1 to 1.
-    scale = shot.K.new_tensor([2 / shot.width, 2 / shot.height, 1.0])
-    K = scale[:, None] * shot.K
+    scale = photo.K.new_tensor([2 / photo.width, 2 / photo.height, 1.0])
+    K = scale[:, None] * photo.K
     K[:2, 2] -= 1
     grid = project_points(points, K, min_depth=SMALLEST_DEPTH)
     u, v = grid.unbind(-1)
@@ -201,49 +202,51 @@ def sample_nearest(values: Float[Tensor, "h w"], grid: Float[Tensor, "n 2"]) -> 
     )[0, 0, 0]
 
 
-def look_up(
-    points: Float[Tensor, "n 3"], depth: Float[Tensor, "h w"], shot: Shot, pose: Float[Tensor, "4 4"]
+def sample_depth(
+    points: Float[Tensor, "n 3"], depth: Float[Tensor, "h w"], photo: ScaledPhotograph, pose: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Depths of world points in a view, and the depths that were found where they project: 0 = none, or outside."""
     camera = transform(pose, points)
-    grid, inside = to_grid(camera, shot)
+    grid, inside = to_grid(camera, photo)
     return camera[:, 2], torch.where(inside, sample_nearest(depth, grid), 0)
 
 
-def finds(z: Float[Tensor, " n"], measured: Float[Tensor, " n"], tolerance: float) -> Bool[Tensor, " n"]:
-    """Whether a view of which `look_up` told finds a surface where each point is, within a share of its depth."""
+def confirms(z: Float[Tensor, " n"], measured: Float[Tensor, " n"], tolerance: float) -> Bool[Tensor, " n"]:
+    """Whether a depth map confirms points: its depth, by `sample_depth`, equals theirs within a share of it."""
     return (measured > 0) & ((z - measured).abs() <= tolerance * measured)
 
 
 def sees_through(z: Float[Tensor, " n"], measured: Float[Tensor, " n"], tolerance: float) -> Bool[Tensor, " n"]:
-    """Whether it finds one behind each point, further than twice that."""
+    """Whether a depth map sees through points: its surface is behind them by more than twice the tolerance."""
     return (measured > 0) & (z < (1 - 2 * tolerance) * measured)
 
 
-def agreeing(
+def count_agreeing(
     depth: Float[Tensor, "h w"],
-    shot: Shot,
+    photo: ScaledPhotograph,
     pose: Float[Tensor, "4 4"],
-    others: Sequence[tuple[DepthMap, Shot, Float[Tensor, "4 4"]]],
+    others: Sequence[tuple[DepthMap, ScaledPhotograph, Float[Tensor, "4 4"]]],
     tolerance: float,
 ) -> Int64[Tensor, "h w"]:
-    """In how many other depth maps a pixel's point lies where they, too, found a surface.
+    """Number of other depth maps that have a surface at each pixel's point.
 
     Args:
         depth: of the view, 0 = unknown.
-        shot: the view.
+        photo: the view.
         pose: its cam_from_world.
         others: depth maps of other views.
         tolerance: relative difference of depths.
     """
-    points = world_points(depth, shot, pose).reshape(-1, 3)
+    points = world_points(depth, photo, pose).reshape(-1, 3)
     votes = torch.zeros(len(points), dtype=torch.int64)
-    for found, other, other_pose in others:
-        z, measured = look_up(points, found.depth, other, other_pose)
-        votes += finds(z, measured, tolerance)
+    for depth_map, other, other_pose in others:
+        z, measured = sample_depth(points, depth_map.depth, other, other_pose)
+        votes += confirms(z, measured, tolerance)
     return torch.where(depth.reshape(-1) > 0, votes, 0).reshape(depth.shape)
 
 
-def world_points(depth: Float[Tensor, "h w"], shot: Shot, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "h w 3"]:
+def world_points(
+    depth: Float[Tensor, "h w"], photo: ScaledPhotograph, pose: Float[Tensor, "4 4"]
+) -> Float[Tensor, "h w 3"]:
     """Where the pixels' surfaces lie in the world."""
-    return transform(invert_rigid(pose), _points_at(depth, shot))
+    return transform(invert_rigid(pose), _points_at(depth, photo))

@@ -1,4 +1,4 @@
-"""Gaussians on a leash stay near their seeds whatever pulls at them, and keep it through pruning and resuming."""
+"""Gaussians on a anchor stay near their seeds whatever pulls at them, and keep it through pruning and resuming."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import torch
 from walls import wall_views
 
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.anchor import Leash, leash_of
+from gsencoder.reconstruct.anchor import Anchor, anchor_at
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
@@ -23,12 +23,12 @@ PRUNED = PruneConfig(at=(0.3,))
 def held(length: float, config: OptimizeConfig = ALL) -> Optimizer:
     adam = RowAdam(parameters_from(seed_from_depth(wall_views(depth=True), voxel=0.06), 0))
     adam.parameters["logit_opacities"][::7] = -9
-    leash = leash_of(adam.parameters, length) if length else None
-    return Optimizer(adam, Photographs(wall_views(depth=True)), [0, 1, 3], config, prune=PRUNED, leash=leash)
+    anchor = anchor_at(adam.parameters, length) if length else None
+    return Optimizer(adam, Photographs(wall_views(depth=True)), [0, 1, 3], config, prune=PRUNED, anchor=anchor)
 
 
-def strayed(one: Optimizer, leash: Leash) -> torch.Tensor:
-    return (one.raw["means"] - leash.means).norm(dim=1) / leash.reach
+def strayed(one: Optimizer, anchor: Anchor) -> torch.Tensor:
+    return (one.raw["means"] - anchor.means).norm(dim=1) / anchor.reach
 
 
 @pytest.mark.usefixtures("no_jaxtyping")
@@ -38,13 +38,13 @@ def strayed(one: Optimizer, leash: Leash) -> torch.Tensor:
 def test_what_pulls_forever_moves_no_further_than_the_reach(rate: float, reach: float) -> None:
     means = torch.zeros(3, 3)
     adam = RowAdam({"means": means})
-    leash = Leash(means=torch.zeros(3, 3), reach=torch.full((3,), reach))
+    anchor = Anchor(means=torch.zeros(3, 3), reach=torch.full((3,), reach))
     rows = torch.tensor([0, 2])
     grads = {"means": torch.tensor([[1.0, 0, 0], [0, -1e6, 0]])}
     # Four times the steps that a pull takes to come within 1/e of its end.
     for _ in range(int(4 * max(5.0, reach / rate))):
         adam.step(rows, grads, {"means": rate})
-        leash.pull(means, rows, rate)
+        anchor.pull(means, rows, rate)
     assert (means[rows].norm(dim=1) <= 1.001 * reach).all()
     if rate < reach:
         assert means[0, 0] < -0.9 * reach
@@ -53,40 +53,40 @@ def test_what_pulls_forever_moves_no_further_than_the_reach(rate: float, reach: 
 
 
 def test_only_rows_in_view_are_pulled() -> None:
-    leash = Leash(means=torch.zeros(3, 3), reach=torch.ones(3))
+    anchor = Anchor(means=torch.zeros(3, 3), reach=torch.ones(3))
     means = torch.full((3, 3), 4.0)
-    leash.pull(means, torch.tensor([1]), 0.25)
+    anchor.pull(means, torch.tensor([1]), 0.25)
     assert means[:, 0].tolist() == [4.0, 3.0, 4.0]
 
 
 @pytest.mark.slow
-def test_a_fitted_splat_stays_within_its_leash_and_strays_without() -> None:
+def test_a_fitted_splat_stays_within_its_anchor_and_strays_without() -> None:
     free, bound = held(0), held(0.3)
-    leash = leash_of(free.raw, 0.3)
+    anchor = anchor_at(free.raw, 0.3)
     kept = replace(PRUNED, at=())
     free.pruning = bound.pruning = kept
     for _ in range(30):
         free.advance()
         bound.advance()
-    assert strayed(free, leash).max() > 3
+    assert strayed(free, anchor).max() > 3
     # Adam's first steps on a row may be a little longer than the rate, and three coordinates each have their own.
-    assert strayed(bound, leash).max() < 3**0.5
-    assert strayed(bound, leash).max() > 0.1
+    assert strayed(bound, anchor).max() < 3**0.5
+    assert strayed(bound, anchor).max() > 0.1
 
 
 @pytest.mark.slow
-def test_a_leash_is_pruned_with_its_gaussians_and_taken_up_with_them(tmp_path: Path) -> None:
+def test_a_anchor_is_pruned_with_its_gaussians_and_taken_up_with_them(tmp_path: Path) -> None:
     whole, cut = held(0.3), held(0.3)
     for _ in range(20):
         whole.advance()
     for _ in range(12):
         cut.advance()
-    assert cut.leash is not None
-    assert len(cut.raw["means"]) == len(cut.leash.means) < len(held(0.3).raw["means"])
-    assert strayed(cut, cut.leash).max() < 3**0.5
-    save_state(tmp_path / "state", State(adam=cut.adam, leash=cut.leash, step=12, seconds=0.0, facts={}), {})
+    assert cut.anchor is not None
+    assert len(cut.raw["means"]) == len(cut.anchor.means) < len(held(0.3).raw["means"])
+    assert strayed(cut, cut.anchor).max() < 3**0.5
+    save_state(tmp_path / "state", State(adam=cut.adam, anchor=cut.anchor, step=12, seconds=0.0, facts={}), {})
     found = load_state(tmp_path / "state", {}, steps=30, sh_degree=0)
-    again = Optimizer(found.adam, cut.photographs, cut.training, ALL, prune=PRUNED, leash=found.leash, step=12)
+    again = Optimizer(found.adam, cut.photographs, cut.training, ALL, prune=PRUNED, anchor=found.anchor, step=12)
     for _ in range(8):
         again.advance()
     for name, value in whole.raw.items():

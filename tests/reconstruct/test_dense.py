@@ -6,9 +6,17 @@ import torch
 from walls import DEPTH, TILT, cameras, seen, wall_points, wall_views
 
 from gsencoder.core.errors import InputError
-from gsencoder.reconstruct.dense import DenseConfig, carve, coverage, densify, interpolate, splat_depths, thin
+from gsencoder.reconstruct.dense import (
+    DenseConfig,
+    average_by_voxel,
+    carve,
+    coverage,
+    densify,
+    interpolate,
+    splat_depths,
+)
 from gsencoder.reconstruct.photographs import Photographs
-from gsencoder.reconstruct.stereo import DepthMap, agreeing, neighbors_of, sweep, world_points
+from gsencoder.reconstruct.stereo import DepthMap, count_agreeing, source_views, sweep, world_points
 
 SMALL = DenseConfig(spacing=3.0, size=96, sources=3, samples=1)
 
@@ -19,8 +27,8 @@ def pose(view: int, count: int = 4) -> torch.Tensor:
 
 def test_a_sweep_finds_the_depth_of_a_slanted_wall() -> None:
     photographs = Photographs(wall_views())
-    shots = [photographs.shot(view) for view in range(4)]
-    found = sweep(shots[1], pose(1), [shots[0], shots[2], shots[3]], [pose(0), pose(2), pose(3)], 2.0, 5.0)
+    photos = [photographs.at_scale(view) for view in range(4)]
+    found = sweep(photos[1], pose(1), [photos[0], photos[2], photos[3]], [pose(0), pose(2), pose(3)], 2.0, 5.0)
     truth = torch.from_numpy(seen(cameras(), 1)[1])
     known = (found.depth > 0) & (found.score > 0.8)
     assert known.float().mean() > 0.6
@@ -31,32 +39,32 @@ def test_a_sweep_finds_the_depth_of_a_slanted_wall() -> None:
 
 def test_depths_agree_where_they_are_true_and_nowhere_else() -> None:
     photographs = Photographs(wall_views())
-    shots = [photographs.shot(view) for view in range(3)]
+    photos = [photographs.at_scale(view) for view in range(3)]
     truths = [torch.from_numpy(seen(cameras(), view)[1]) for view in range(3)]
     others = [
-        (DepthMap(truths[view], torch.ones_like(truths[view]), truths[view]), shots[view], pose(view))
+        (DepthMap(truths[view], torch.ones_like(truths[view]), truths[view]), photos[view], pose(view))
         for view in (0, 2)
     ]
-    votes = agreeing(truths[1], shots[1], pose(1), others, 0.02)
+    votes = count_agreeing(truths[1], photos[1], pose(1), others, 0.02)
     assert (votes[:, 16:-16] == 2).all()
-    assert (agreeing(1.1 * truths[1], shots[1], pose(1), others, 0.02) == 0).all()
-    assert (agreeing(0 * truths[1], shots[1], pose(1), others, 0.02) == 0).all()
+    assert (count_agreeing(1.1 * truths[1], photos[1], pose(1), others, 0.02) == 0).all()
+    assert (count_agreeing(0 * truths[1], photos[1], pose(1), others, 0.02) == 0).all()
 
 
 def test_points_go_to_the_world_and_back() -> None:
     photographs = Photographs(wall_views())
-    shot, truth = photographs.shot(2), torch.from_numpy(seen(cameras(), 2)[1])
-    points = world_points(truth, shot, pose(2))
+    photo, truth = photographs.at_scale(2), torch.from_numpy(seen(cameras(), 2)[1])
+    points = world_points(truth, photo, pose(2))
     torch.testing.assert_close(points[..., 2], DEPTH + TILT * points[..., 0])
-    torch.testing.assert_close(splat_depths(points.reshape(-1, 3), shot, pose(2)), truth)
+    torch.testing.assert_close(splat_depths(points.reshape(-1, 3), photo, pose(2)), truth)
 
 
 def test_views_that_share_points_at_a_good_angle_are_neighbors() -> None:
     made = cameras(6, step=0.2)
-    found = neighbors_of(made, wall_points(200), range(6), 2)
+    found = source_views(made, wall_points(200), range(6), 2)
     assert all(len(others) == 2 and view not in others for view, others in found.items())
     assert 5 not in found[0]
-    alone = neighbors_of(made, wall_points(200) + np.float32([0, 0, -100]), range(6), 2)
+    alone = source_views(made, wall_points(200) + np.float32([0, 0, -100]), range(6), 2)
     assert all(others == [] for others in alone.values())
 
 
@@ -73,28 +81,28 @@ def test_holes_in_a_plane_are_filled_with_the_plane() -> None:
 def test_a_voxel_gives_the_mean_of_enough_samples_and_nothing_beside_others() -> None:
     points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [5.5, 0, 0], [9.1, 0, 0], [9.3, 0, 0]], np.float32)
     colors = np.array([[0] * 3, [10] * 3, [20] * 3, [30] * 3, [40] * 3], np.uint8)
-    places, tints = thin(points, colors, 1.0, 2)
+    places, tints = average_by_voxel(points, colors, 1.0, 2)
     np.testing.assert_allclose(places, [[0.2, 0.1, 0.1], [9.2, 0, 0]], atol=1e-6)
     assert tints.tolist() == [[5] * 3, [35] * 3]
-    places, _ = thin(points, colors, 1.0, 2, beside=np.array([[9.9, 0.5, 0.5]], np.float32))
+    places, _ = average_by_voxel(points, colors, 1.0, 2, beside=np.array([[9.9, 0.5, 0.5]], np.float32))
     np.testing.assert_allclose(places, [[0.2, 0.1, 0.1]], atol=1e-6)
-    assert thin(points[:0], colors[:0], 1.0, 1)[0].shape == (0, 3)
+    assert average_by_voxel(points[:0], colors[:0], 1.0, 1)[0].shape == (0, 3)
 
 
 def test_what_stands_in_the_way_is_carved_out() -> None:
     photographs = Photographs(wall_views())
-    shots = {view: photographs.shot(view) for view in range(4)}
+    photos = {view: photographs.at_scale(view) for view in range(4)}
     depths = {view: torch.from_numpy(seen(cameras(), view)[1]) for view in range(4)}
     poses = {view: pose(view) for view in range(4)}
     on = np.array([[0.2, 0.1, DEPTH + 0.2 * TILT], [0.0, 0.0, DEPTH]], np.float32)
     floating, hidden, elsewhere = ([[0.2, 0.1, 2.0]], [[0.2, 0.1, 4.0]], [[50.0, 0.0, 2.0]])
     points = np.concatenate((on, np.array(floating + hidden + elsewhere, np.float32)))
     colors = np.arange(15, dtype=np.uint8).reshape(5, 3)
-    kept, tints = carve(points, colors, depths, shots, poses, 0.02)
+    kept, tints = carve(points, colors, depths, photos, poses, 0.02)
     np.testing.assert_array_equal(kept, points[[0, 1, 3, 4]])
     np.testing.assert_array_equal(tints, colors[[0, 1, 3, 4]])
     unknown = {view: torch.zeros_like(depth) for view, depth in depths.items()}
-    assert len(carve(points, colors, unknown, shots, poses, 0.02)[0]) == 5
+    assert len(carve(points, colors, unknown, photos, poses, 0.02)[0]) == 5
 
 
 def test_few_points_on_a_wall_become_many_that_lie_on_it() -> None:

@@ -100,7 +100,7 @@ def test_a_signal_within_a_step_is_heard_after_it() -> None:
     with pytest.raises(KeyboardInterrupt):
         cut.advance()
     whole.advance()
-    assert (cut.step, cut.whole) == (1, True)
+    assert (cut.step, cut.is_consistent) == (1, True)
     for name, value in whole.raw.items():
         assert torch.equal(value, cut.raw[name]), name
 
@@ -112,7 +112,7 @@ def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None
         whole.advance()
     for _ in range(8):
         cut.advance()
-    state = State(adam=cut.adam, leash=None, step=cut.step, seconds=1.5, facts={"seeds": 7})
+    state = State(adam=cut.adam, anchor=None, step=cut.step, seconds=1.5, facts={"seeds": 7})
     save_state(tmp_path / "state", state, {"run": 1})
     asked = {"steps": QUICK.steps, "sh_degree": QUICK.sh_degree}
     found = load_state(tmp_path / "state", {"run": 1}, **asked)
@@ -137,12 +137,12 @@ def test_what_does_nothing_is_taken_out_and_nothing_else() -> None:
     raw["means"][5] = torch.tensor([0.0, 0, -5])
     raw["log_scales"][7] = 3
     raw["means"][9] += torch.tensor([0.0, 0, 2.0])  # Behind the wall.
-    shots = [(view, photographs.shot(view, 2)) for view in range(4)]
-    kept = rows_to_keep(raw, photographs.cameras, shots, PruneConfig(screen=0.9), RasterConfig())
+    photos = [(view, photographs.at_scale(view, 2)) for view in range(4)]
+    kept = rows_to_keep(raw, photographs.cameras, photos, PruneConfig(screen=0.9), RasterConfig())
     gone = sorted(set(range(len(splat))) - set(kept.tolist()))
     assert {3, 5, 7} <= set(gone)
     raw["log_scales"][7] = raw["log_scales"][8]
-    kept = rows_to_keep(raw, photographs.cameras, shots, PruneConfig(screen=0.9), RasterConfig())
+    kept = rows_to_keep(raw, photographs.cameras, photos, PruneConfig(screen=0.9), RasterConfig())
     assert {3, 5, 9} <= set(range(len(splat))) - set(kept.tolist())
     assert len(kept) > 0.8 * len(splat)
 
@@ -214,7 +214,7 @@ def test_masked_pixels_do_not_count() -> None:
 
 def test_smaller_photographs_keep_their_rays() -> None:
     photographs = Photographs(wall_views(depth=True))
-    whole, half = photographs.shot(1), photographs.shot(1, 2)
+    whole, half = photographs.at_scale(1), photographs.at_scale(1, 2)
     assert (half.width, half.height) == (48, 36)
     torch.testing.assert_close(half.image[3, 4], whole.image[6:8, 8:10].mean(dim=(0, 1)))
     assert half.depth is not None

@@ -9,7 +9,7 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.photographs import Shot
+from gsencoder.reconstruct.photographs import ScaledPhotograph
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.render import blend
 from gsencoder.render.rasterize import RasterConfig
@@ -27,12 +27,12 @@ def two_cameras() -> Cameras:
     return Cameras(cam_from_world=poses, **repeated)
 
 
-def shots(cameras: Cameras, shrink: int) -> list[tuple[int, Shot]]:
+def photos(cameras: Cameras, shrink: int) -> list[tuple[int, ScaledPhotograph]]:
     scale = torch.diag(torch.tensor([1 / shrink, 1 / shrink, 1]))
     return [
         (
             view,
-            Shot(
+            ScaledPhotograph(
                 image=torch.zeros(48 // shrink, 64 // shrink, 3), mask=None, depth=None, K=scale @ torch.from_numpy(K)
             ),
         )
@@ -47,7 +47,7 @@ def test_a_contribution_is_counted_in_pixels_of_the_photograph_whatever_size_it_
     pixels = torch.maximum(*columns).numpy()
     least = float(np.median(pixels))
     config = replace(NOTHING, contribution=least)
-    kept = rows_to_keep(parameters_from(splat, 0), cameras, shots(cameras, shrink), config, RasterConfig()).numpy()
+    kept = rows_to_keep(parameters_from(splat, 0), cameras, photos(cameras, shrink), config, RasterConfig()).numpy()
     # Coarser pixels round.
     slack = 1.02 if shrink == 1 else 1.5
     clear = (pixels > slack * least) | (pixels < least / slack)
@@ -58,7 +58,7 @@ def test_a_contribution_is_counted_in_pixels_of_the_photograph_whatever_size_it_
 def test_opacities_below_the_least_are_taken_out_and_all_others_stay() -> None:
     splat, cameras = random_gaussians(150), two_cameras()
     kept = rows_to_keep(
-        parameters_from(splat, 0), cameras, shots(cameras, 1), replace(NOTHING, opacity=0.4), RasterConfig()
+        parameters_from(splat, 0), cameras, photos(cameras, 1), replace(NOTHING, opacity=0.4), RasterConfig()
     )
     np.testing.assert_array_equal(kept.numpy(), np.flatnonzero(splat.opacities >= 0.4))
 
@@ -76,7 +76,7 @@ def test_what_is_wider_than_a_share_of_some_picture_is_taken_out(shrink: int) ->
         opacities=np.full(5, 0.99, np.float32),
     )
     cameras = two_cameras()
-    raw, some = parameters_from(splat, 0), shots(cameras, shrink)
+    raw, some = parameters_from(splat, 0), photos(cameras, shrink)
     everything = rows_to_keep(raw, cameras, some, NOTHING, RasterConfig())
     assert everything.tolist() == list(range(5))
     for screen, count in ((0.5, 2), (1.0, 3), (4.0, 5)):

@@ -13,7 +13,7 @@ from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.score import score, seen_pixels
+from gsencoder.reconstruct.score import covisible_pixels, score
 from gsencoder.types import Views
 
 
@@ -25,7 +25,7 @@ def optimizer(views: Views) -> Optimizer:
 
 def test_a_pixel_is_seen_where_its_point_lies_in_another_picture() -> None:
     views = wall_views(depth=True)
-    found = seen_pixels(Photographs(views), [3], [0])[3]
+    found = covisible_pixels(Photographs(views), [3], [0])[3]
     assert views.depths is not None
     K, depth = views.cameras.Ks[3].astype(np.float64), views.depths[3].astype(np.float64)
     # Camera 3 stands 0.45 to the right of camera 0, and both look along z: the point moves right by f·0.45/z pixels.
@@ -35,7 +35,7 @@ def test_a_pixel_is_seen_where_its_point_lies_in_another_picture() -> None:
     # At the edge of the picture a pixel may fall on either side.
     sure = np.abs(moved - 96) > 1e-3
     np.testing.assert_array_equal(found.numpy()[sure], inside[sure])
-    assert bool(seen_pixels(Photographs(views), [3], [0, 2, 3])[3].all())
+    assert bool(covisible_pixels(Photographs(views), [3], [0, 2, 3])[3].all())
 
 
 def test_what_something_hides_is_not_seen_and_what_is_not_measured_neither() -> None:
@@ -44,7 +44,7 @@ def test_what_something_hides_is_not_seen_and_what_is_not_measured_neither() -> 
     depths = [depth.copy() for depth in views.depths]
     depths[0][20:40] *= 0.9
     depths[1][50:60] = 0
-    found = seen_pixels(Photographs(replace(views, depths=depths)), [1], [0])[1]
+    found = covisible_pixels(Photographs(replace(views, depths=depths)), [1], [0])[1]
     assert not found[21:39].any()
     assert not found[50:60].any()
     assert found[:18, :80].all()
@@ -67,10 +67,10 @@ def test_pixels_that_are_all_seen_score_as_the_whole_picture() -> None:
 def test_nothing_is_said_about_seen_pixels_where_no_sensor_or_no_photograph_tells() -> None:
     one = optimizer(wall_views(depth=True))
     bare = Photographs(wall_views())
-    assert seen_pixels(bare, [2], [0, 1]) == {}
+    assert covisible_pixels(bare, [2], [0, 1]) == {}
     for seen in ({}, {2: torch.zeros(72, 96, dtype=torch.bool)}):
         found = score(one, [2], seen)
         assert (found.seen_psnr, found.seen_ssim, found.seen) == (None, None, None)
-    thin = torch.zeros(72, 96, dtype=torch.bool)
-    thin[:3] = True
-    assert score(one, [2], {2: thin}).seen_psnr is None
+    average_by_voxel = torch.zeros(72, 96, dtype=torch.bool)
+    average_by_voxel[:3] = True
+    assert score(one, [2], {2: average_by_voxel}).seen_psnr is None

@@ -12,7 +12,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig, seed_from_depth
 from gsencoder.reconstruct.dense import DenseConfig
 from gsencoder.reconstruct.photographs import Photographs
-from gsencoder.reconstruct.start import Start, start_of
+from gsencoder.reconstruct.start import Start, initial_gaussians
 from gsencoder.types import Scene
 
 NEVER = DenseConfig(enough=0.0)
@@ -24,7 +24,7 @@ def scene(**parts: object) -> Scene:
 
 def begun(made: Scene, seeds: SeedConfig = SeedConfig(), dense: DenseConfig = NEVER) -> Start:
     assert made.views is not None
-    return start_of(made, Photographs(made.views), [0, 1, 3], seeds, dense)
+    return initial_gaussians(made, Photographs(made.views), [0, 1, 3], seeds, dense)
 
 
 def test_a_splat_is_taken_as_it_is() -> None:
