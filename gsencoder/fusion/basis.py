@@ -93,7 +93,7 @@ def fit_basis(
         rank = min(int(np.searchsorted(values.cumsum() / total, energy - 1e-9)) + 1, meaningful)
     if max_rank:
         rank = min(rank, max_rank)
-    kept = float(values[:rank].sum() / total) if total else 1.0
+    energy_kept = float(values[:rank].sum() / total) if total else 1.0
     components = vectors[:, :rank].T
     # The sign of an eigenvector is arbitrary; its largest entry is made positive so that reruns agree.
     largest = np.abs(components).argmax(axis=1)
@@ -101,7 +101,7 @@ def fit_basis(
     return FeatureBasis(
         mean=mean.astype(np.float32),
         components=np.ascontiguousarray(components, np.float32),
-        energy_kept=min(kept, 1.0),
+        energy_kept=min(energy_kept, 1.0),
         space=space,
     )
 

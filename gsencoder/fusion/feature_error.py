@@ -1,4 +1,4 @@
-"""How far two fields of features on the same Gaussians are apart."""
+"""The error between two sets of features on the same Gaussians."""
 
 from dataclasses import dataclass
 

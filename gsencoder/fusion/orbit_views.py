@@ -1,4 +1,4 @@
-"""What a splat alone needs before its views can be fused: cameras around it."""
+"""Orbit cameras and rendered views for a splat that comes without any."""
 
 from dataclasses import replace
 

@@ -56,10 +56,10 @@ def ssim(
     picture: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, ""]:
     """Mean structural similarity; over the windows whose middle is in `mask` where one is given."""
-    found = ssim_map(picture, truth)
+    similarity = ssim_map(picture, truth)
     if mask is None:
-        return found.mean()
-    return found[inner(mask)].mean()
+        return similarity.mean()
+    return similarity[inner(mask)].mean()
 
 
 def inner(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "h w"]:

@@ -108,12 +108,12 @@ def _row_span(a, b, c, u, dv, limit, last):
 def _composite(first, last, starts, members, splats, values, size, stop, out):
     """out[y, x] = Σ w·(values, 1) in tiles [first, last), front to back."""
     width, height, tiles_x = size
-    light = np.empty((TILE, TILE), np.float64)
+    transmittance = np.empty((TILE, TILE), np.float64)
     sums = np.empty((TILE, TILE, CHANNELS), np.float64)
     for t in range(first, last):
         left, top = (t % tiles_x) * TILE, (t // tiles_x) * TILE
         end_u, end_v = min(TILE, width - left), min(TILE, height - top)
-        light[:] = 1.0
+        transmittance[:] = 1.0
         sums[:] = 0.0
         open_rays = end_u * end_v
         for m in range(starts[t], starts[t + 1]):
@@ -137,16 +137,16 @@ def _composite(first, last, starts, members, splats, values, size, stop, out):
                     alpha = min(value, ALPHA_MAX)
                     value *= ratio
                     ratio *= falloff
-                    before = light[j, i]
+                    before = transmittance[j, i]
                     # A negative transmittance marks a ray that has stopped.
                     if alpha < ALPHA_MIN or before < 0:
                         continue
                     after = before * (1.0 - alpha)
                     if after <= stop:
-                        light[j, i] = -1.0
+                        transmittance[j, i] = -1.0
                         open_rays -= 1
                         continue
-                    light[j, i] = after
+                    transmittance[j, i] = after
                     w = alpha * before
                     cell = sums[j, i]
                     cell[0] += w * v0
@@ -184,19 +184,19 @@ def composite(
 def _differentiate(first, last, starts, members, splats, values, size, stop, out, grads, partials):
     """partials[entry] = derivatives of the loss by the splat of each entry of tiles [first, last)."""
     width, height, tiles_x = size
-    light = np.empty((TILE, TILE), np.float64)
+    transmittance = np.empty((TILE, TILE), np.float64)
     behind = np.empty((TILE, TILE), np.float64)
-    slope = np.empty((TILE, TILE, CHANNELS), np.float64)
+    pixel_grad = np.empty((TILE, TILE, CHANNELS), np.float64)
     for t in range(first, last):
         left, top = (t % tiles_x) * TILE, (t // tiles_x) * TILE
         end_u, end_v = min(TILE, width - left), min(TILE, height - top)
-        light[:] = 1.0
+        transmittance[:] = 1.0
         for j in range(end_v):
             for i in range(end_u):
                 total = 0.0
                 for k in range(CHANNELS):
-                    slope[j, i, k] = grads[top + j, left + i, k]
-                    total += slope[j, i, k] * out[top + j, left + i, k]
+                    pixel_grad[j, i, k] = grads[top + j, left + i, k]
+                    total += pixel_grad[j, i, k] * out[top + j, left + i, k]
                 behind[j, i] = total
         open_rays = end_u * end_v
         for m in range(starts[t], starts[t + 1]):
@@ -226,26 +226,26 @@ def _differentiate(first, last, starts, members, splats, values, size, stop, out
                     clamped = value > ALPHA_MAX
                     value *= ratio
                     ratio *= falloff
-                    before = light[j, i]
+                    before = transmittance[j, i]
                     if alpha < ALPHA_MIN or before < 0:
                         continue
                     after = before * (1.0 - alpha)
                     if after <= stop:
-                        light[j, i] = -1.0
+                        transmittance[j, i] = -1.0
                         open_rays -= 1
                         continue
-                    light[j, i] = after
+                    transmittance[j, i] = after
                     w = alpha * before
-                    line = slope[j, i]
-                    worth = line[0] * v0 + line[1] * v1 + line[2] * v2 + line[3] * v3 + line[4]
+                    line = pixel_grad[j, i]
+                    weight_grad = line[0] * v0 + line[1] * v1 + line[2] * v2 + line[3] * v3 + line[4]
                     by_0 += w * line[0]
                     by_1 += w * line[1]
                     by_2 += w * line[2]
                     by_3 += w * line[3]
-                    rest = behind[j, i] - w * worth
+                    rest = behind[j, i] - w * weight_grad
                     behind[j, i] = rest
                     if not clamped:
-                        change = alpha * (before * worth - rest / (1.0 - alpha))
+                        change = alpha * (before * weight_grad - rest / (1.0 - alpha))
                         du = i - u
                         s0 += change
                         s1 += change * du

@@ -167,5 +167,16 @@ class _Composite(torch.autograd.Function):
 
         tiles, splats, colors, stop, out = ctx.saved
         slopes = raster_cpu.differentiate(tiles, splats, colors, stop, out, grads.contiguous().numpy())
-        found = torch.from_numpy(slopes)
-        return found[:, :2], found[:, 2:5], found[:, 5], found[:, 6:], None, None, None, None, None, None
+        gradients = torch.from_numpy(slopes)
+        return (
+            gradients[:, :2],
+            gradients[:, 2:5],
+            gradients[:, 5],
+            gradients[:, 6:],
+            None,
+            None,
+            None,
+            None,
+            None,
+            None,
+        )

@@ -1,4 +1,4 @@
-"""Products with compressed sparse rows on a CPU: what rendering and lifting come down to once B is known."""
+"""Products of compressed sparse rows on a CPU, by which B renders and lifts."""
 
 from typing import no_type_check
 
@@ -90,11 +90,11 @@ def count_codes(
 @no_type_check
 def _count_between(first, last, crow, cols, depths, least, most, counts):
     for row in range(first, last):
-        kept = 0
+        count = 0
         for e in range(crow[row], crow[row + 1]):
             z = depths[cols[e]]
-            kept += (z >= least[row]) & (z <= most[row])
-        counts[row] = kept
+            count += (z >= least[row]) & (z <= most[row])
+        counts[row] = count
 
 
 @kernel

@@ -20,7 +20,7 @@ from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question
 from gsencoder.infer.ask.batch import ANSWER, ANSWERS, PROMPT, REQUEST, ask_question, ask_questions, write_answers
 from gsencoder.infer.ask.prompts import Task, check_question
-from gsencoder.infer.ask.questions import Asked, read_questions
+from gsencoder.infer.ask.questions import BatchQuestion, read_questions
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig
@@ -111,7 +111,7 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
 
 def ask_file(
     out: Path,
-    questions: Sequence[Asked],
+    questions: Sequence[BatchQuestion],
     asker: Asker,
     server: VlmServer | None,
     config: AskCommandConfig,

@@ -17,11 +17,11 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import evenly
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
-MOST_BITS = 8
+MAX_BITS = 8
 """Of a coordinate."""
 SAMPLE = 10_000
 """Gaussians that levels are fitted to."""
-ALIKE = 0.9
+SAME_KIND_COSINE = 0.9
 """Rows whose centered cosine is above are of one kind."""
 RETRIES = 3
 """Times that a sample is completed by rows that it missed."""
@@ -30,7 +30,7 @@ ROUNDS = 10
 BINS = 1024
 BLOCK = 16_384
 """Rows that are turned into bits, or back, at a time."""
-LOST = 0.8
+MIN_COSINE = 0.8
 """A row whose cosine falls below is of a kind that the sample missed; generous budgets take a lower bound."""
 
 
@@ -68,7 +68,7 @@ class CompactFeatures:
     def __post_init__(self) -> None:
         counts = self.bits.astype(np.int64)
         fits = self.codes.shape[1] == -(-int(counts.sum()) // 8) and len(self.levels) == int((1 << counts).sum())
-        some = len(counts) == self.basis.rank > 0 and 1 <= counts.min() <= counts.max() <= MOST_BITS
+        some = len(counts) == self.basis.rank > 0 and 1 <= counts.min() <= counts.max() <= MAX_BITS
         if not fits or not some:
             raise InputError(
                 f"CompactFeatures: {self.codes.shape[1]} bytes a row and {len(self.levels)} levels do not go with bits "
@@ -91,20 +91,20 @@ class CompactFeatures:
     def __len__(self) -> int:
         return self.total
 
-    def coordinates(self, places: np.ndarray | slice = slice(None)) -> Float32[np.ndarray, "k R"]:
+    def coordinates(self, positions: np.ndarray | slice = slice(None)) -> Float32[np.ndarray, "k R"]:
         """Coordinates in the basis of seen rows, by their place among these."""
-        codes = self.codes[places]
+        codes = self.codes[positions]
         bits = self.bits.astype(np.int64)
         begins = np.concatenate(([0], np.cumsum(bits)))
         offsets = np.concatenate(([0], np.cumsum(1 << bits)))
-        found = np.empty((len(codes), len(bits)), np.float32)
+        compacted = np.empty((len(codes), len(bits)), np.float32)
         for start in range(0, len(codes), BLOCK):
             ones = np.unpackbits(codes[start : start + BLOCK], axis=1)
             for number, width in enumerate(bits):
                 part = ones[:, begins[number] : begins[number + 1]]
                 code = part @ (1 << np.arange(width - 1, -1, -1))
-                found[start : start + BLOCK, number] = self.levels[offsets[number] + code]
-        return found
+                compacted[start : start + BLOCK, number] = self.levels[offsets[number] + code]
+        return compacted
 
     def features(self) -> GaussianFeatures:
         """All of them, as other stages take them."""
@@ -144,14 +144,14 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
     if not len(rows):
         raise InputError("compact: no Gaussian has features")
     sample = rows[evenly(len(rows), SAMPLE)]
-    bound = min(LOST, 1 - 10 * error)
+    bound = min(MIN_COSINE, 1 - 10 * error)
     for _ in range(RETRIES):
-        found, cosines = _within(features, rows, sample, error)
-        lost = np.setdiff1d(rows[cosines < bound], sample)
-        if not len(lost):
+        compacted, cosines = _within(features, rows, sample, error)
+        missed = np.setdiff1d(rows[cosines < bound], sample)
+        if not len(missed):
             break
-        sample = np.union1d(sample, lost[evenly(len(lost), SAMPLE // 4)])
-    return found
+        sample = np.union1d(sample, missed[evenly(len(missed), SAMPLE // 4)])
+    return compacted
 
 
 def _within(
@@ -165,20 +165,20 @@ def _within(
         raise InputError("compact: all features are the space's mean, which no direction tells from one another")
     rarity = _rarity(centered, norms)
     # A cosine weighs an error by what it is an error of.
-    heft = rarity / np.maximum(norms, 1e-6 * float(norms.max())) ** 2
-    _, vectors = np.linalg.eigh((centered * heft[:, None]).T @ centered)
-    turned = vectors[:, ::-1]
-    choice = _Choice(centered @ turned, heft, rarity)
+    row_weight = rarity / np.maximum(norms, 1e-6 * float(norms.max())) ** 2
+    _, vectors = np.linalg.eigh((centered * row_weight[:, None]).T @ centered)
+    rotated = vectors[:, ::-1]
+    allocation = _BitAllocation(centered @ rotated, row_weight, rarity)
     while True:
-        choice.add_bits(8)
-        if max(choice.errors()) > error and choice.can_grow:
+        allocation.add_bits(8)
+        if max(allocation.errors()) > error and allocation.can_grow:
             continue
-        found, cosines = _encode(features, rows, turned, choice)
-        if found.error <= error:
-            return found, cosines
-        if not choice.can_grow:
+        compacted, cosines = _encode(features, rows, rotated, allocation)
+        if compacted.error <= error:
+            return compacted, cosines
+        if not allocation.can_grow:
             raise InputError(
-                f"error={error}: {MOST_BITS} bits a coordinate reach {found.error:.2g}; give a larger budget, or "
+                f"error={error}: {MAX_BITS} bits a coordinate reach {compacted.error:.2g}; give a larger budget, or "
                 "another form"
             )
 
@@ -191,25 +191,27 @@ def _centered(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarra
 def _rarity(centered: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """1 over the number of rows that point the same way, which adds up to one for each kind of feature."""
     units = (centered / norms[:, None]).astype(np.float32)
-    alike = [(units[start : start + 1024] @ units.T > ALIKE).sum(axis=1) for start in range(0, len(units), 1024)]
-    return 1 / np.maximum(np.concatenate(alike), 1)
+    counts_alike = [
+        (units[start : start + 1024] @ units.T > SAME_KIND_COSINE).sum(axis=1) for start in range(0, len(units), 1024)
+    ]
+    return 1 / np.maximum(np.concatenate(counts_alike), 1)
 
 
-class _Choice:
+class _BitAllocation:
     """How many bits each coordinate has, and its levels, on a sample."""
 
     def __init__(
         self,
         sample: Float64[np.ndarray, "n R"],
-        heft: Float64[np.ndarray, " n"],
+        row_weight: Float64[np.ndarray, " n"],
         rarity: Float64[np.ndarray, " n"],
     ) -> None:
-        self._sample, self._heft, self._rarity = sample, heft, rarity
+        self._sample, self._heft, self._rarity = sample, row_weight, rarity
         count = sample.shape[1]
         self.bits = np.zeros(count, np.int64)
         self.levels = [np.zeros(1)] * count
         self._rounded = np.zeros_like(sample)
-        self._now = heft @ sample**2
+        self._now = row_weight @ sample**2
         self._next = [self._fit(number, 1) for number in range(count)]
 
     @property
@@ -221,7 +223,7 @@ class _Choice:
     @property
     def can_grow(self) -> bool:
         """Whether some coordinate may have more bits."""
-        return bool((self.bits < MOST_BITS).any())
+        return bool((self.bits < MAX_BITS).any())
 
     def errors(self) -> tuple[float, float]:
         """The mean of 1 − cosine over rows, and over kinds."""
@@ -232,16 +234,16 @@ class _Choice:
         """Gives some more bits, each where it lowers the error most."""
         for _ in range(count):
             gains = [
-                self._now[number] - self._next[number][0] if self.bits[number] < MOST_BITS else -1.0
+                self._now[number] - self._next[number][0] if self.bits[number] < MAX_BITS else -1.0
                 for number in range(len(self.bits))
             ]
             best = int(np.argmax(gains))
-            if self.bits[best] == MOST_BITS:
+            if self.bits[best] == MAX_BITS:
                 break
             self._now[best], self.levels[best] = self._next[best]
             self.bits[best] += 1
             self._rounded[:, best] = self.levels[best][_nearest(self.levels[best], self._sample[:, best])]
-            if self.bits[best] < MOST_BITS:
+            if self.bits[best] < MAX_BITS:
                 self._next[best] = self._fit(best, int(self.bits[best]) + 1)
 
     def _fit(self, number: int, bits: int) -> tuple[float, Float64[np.ndarray, " L"]]:
@@ -273,15 +275,18 @@ def _nearest(levels: np.ndarray, values: np.ndarray) -> Int64[np.ndarray, " n"]:
 
 
 def _encode(
-    features: GaussianFeatures, rows: Int64[np.ndarray, " n"], turned: Float64[np.ndarray, "R R"], choice: _Choice
+    features: GaussianFeatures,
+    rows: Int64[np.ndarray, " n"],
+    rotated: Float64[np.ndarray, "R R"],
+    allocation: _BitAllocation,
 ) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
-    used = np.flatnonzero(choice.bits)
-    bits, levels = choice.bits[used], [choice.levels[number].astype(np.float32) for number in used]
+    used = np.flatnonzero(allocation.bits)
+    bits, levels = allocation.bits[used], [allocation.levels[number].astype(np.float32) for number in used]
     codes = np.empty((len(rows), -(-int(bits.sum()) // 8)), np.uint8)
     cosines = np.ones(len(rows))
     for start in range(0, len(rows), BLOCK):
         centered = _centered(features, rows[start : start + BLOCK])
-        values = centered @ turned[:, used]
+        values = centered @ rotated[:, used]
         ones, rounded = [], np.empty_like(values)
         for number, (each, width) in enumerate(zip(levels, bits, strict=True)):
             code = _nearest(each, values[:, number])
@@ -290,7 +295,7 @@ def _encode(
         codes[start : start + BLOCK] = np.packbits(np.concatenate(ones, axis=1).astype(np.uint8), axis=1)
         squares = (centered**2).sum(axis=1)
         cosines[start : start + BLOCK] = np.where(squares > 0, _cosines(values, rounded, squares), np.nan)
-    axes = turned[:, used].T
+    axes = rotated[:, used].T
     basis = features.basis
     components = axes if basis is None else axes @ basis.components
     weights = features.weights[rows].astype(np.float64)
@@ -309,10 +314,10 @@ def _encode(
         basis=FeatureBasis(
             mean=features.mean,
             components=np.ascontiguousarray(components, np.float32),
-            energy_kept=choice.energy_kept * (1.0 if basis is None else basis.energy_kept),
+            energy_kept=allocation.energy_kept * (1.0 if basis is None else basis.energy_kept),
             space=features.space,
         ),
-        error=max(1 - float(np.nanmean(cosines)), choice.errors()[1], 0.0),
+        error=max(1 - float(np.nanmean(cosines)), allocation.errors()[1], 0.0),
         lowest=float(np.nanquantile(cosines, 0.001)),
     )
     return made, cosines

@@ -1,4 +1,4 @@
-"""From a teacher's settings to the teacher, and to the words that its space understands."""
+"""Teachers, and their text tables, from settings."""
 
 import numpy as np
 

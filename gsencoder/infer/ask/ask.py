@@ -1,4 +1,4 @@
-"""A question about a scene, from words to what a VLM is sent: what to look for, which views, which prompt."""
+"""From a question about a scene to the prompt of a VLM: words, targets, views, pictures."""
 
 import warnings
 from collections.abc import Hashable, Sequence
@@ -21,9 +21,9 @@ from gsencoder.infer.views.targets import Target, best_boxes, target_of, targets
 from gsencoder.text.table import TextTable
 from gsencoder.types import Box, Scene
 
-KEPT_PICTURES = 8
+MAX_CACHED_PICTURES = 8
 """Sets of pictures that are kept for the next question; each is some megabytes."""
-SAME = 0.5
+SAME_THING_IOU = 0.5
 """What shares more of its Gaussians with what was found before, as intersection over union, is the same thing."""
 
 
@@ -120,8 +120,8 @@ class Asker:
         self.scene, self.table, self.space = scene, table, space
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
         self.word_rules = word_rules
-        self._kept: dict[Hashable, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
-        self._drawn: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
+        self._looked_up: dict[Hashable, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
+        self._picture_cache: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
 
     def prompt(self, question: Question) -> Prompt:
         """What to send for a question.
@@ -138,14 +138,14 @@ class Asker:
         if not words and not question.aabb and self.table is not None:
             words = words_in(question.text, self.table, self.word_rules)
         key = (words, question.aabb, question.task == "caption")
-        if key not in self._kept:
-            self._kept[key] = self._look(words, question)
-        targets, boxes, views = self._kept[key]
+        if key not in self._looked_up:
+            self._looked_up[key] = self._look_up(words, question)
+        targets, boxes, views = self._looked_up[key]
         if not targets and self.views.method == "greedy":
-            told = self._nothing(words)
+            message = self._nothing(words)
             if question.task != "answer":
-                raise InputError(f"task={question.task}: {told}; give query= or aabb=")
-            warnings.warn(f"{told}: evenly spread views are shown", SceneWarning, stacklevel=2)
+                raise InputError(f"task={question.task}: {message}; give query= or aabb=")
+            warnings.warn(f"{message}: evenly spread views are shown", SceneWarning, stacklevel=2)
         marked = self.config.marks
         if marked is None:
             marked = question.task in ("ground", "caption")
@@ -160,16 +160,16 @@ class Asker:
         self, key: Hashable, views: ViewSet, marked: Sequence[Target]
     ) -> tuple[list[Picture], frozenset[int]]:
         """Pictures of what was asked about last are kept: many questions are about the same thing."""
-        found = self._drawn.pop(key, None) or view_pictures(self.scene, views, marked)
-        self._drawn[key] = found
-        if len(self._drawn) > KEPT_PICTURES:
-            del self._drawn[next(iter(self._drawn))]
-        return found
+        localization = self._picture_cache.pop(key, None) or view_pictures(self.scene, views, marked)
+        self._picture_cache[key] = localization
+        if len(self._picture_cache) > MAX_CACHED_PICTURES:
+            del self._picture_cache[next(iter(self._picture_cache))]
+        return localization
 
     def _nothing(self, words: Sequence[str]) -> str:
         return f"nothing was found of {', '.join(words)}" if words else "the question names nothing to look for"
 
-    def _look(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]:
+    def _look_up(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]:
         targets, boxes = self._targets(words, question)
         config = self.views
         if not targets:
@@ -193,22 +193,22 @@ class Asker:
             return (), ()
         if self.table is None:
             raise InputError(f"query: no words lead into the features of {self.scene.name}; give words= or aabb=")
-        found = localize(self.scene, words, self.table, self.localization, space=self.space)
+        localization = localize(self.scene, words, self.table, self.localization, space=self.space)
         # A caption is of one thing.
         boxes = self.config.boxes if question.task != "caption" else 1
-        targets, kept = _distinct(targets_of(gaussians, found, boxes), best_boxes(found, boxes))
-        return (targets[:1], kept[:1]) if question.task == "caption" else (targets, kept)
+        targets, distinct = _distinct(targets_of(gaussians, localization, boxes), best_boxes(localization, boxes))
+        return (targets[:1], distinct[:1]) if question.task == "caption" else (targets, distinct)
 
 
 def _distinct(targets: Sequence[Target], boxes: Sequence[Box]) -> tuple[tuple[Target, ...], tuple[Box, ...]]:
     """What several words found is one thing: that of the first word."""
-    kept: list[int] = []
+    distinct: list[int] = []
     for index, box in enumerate(boxes):
-        same = (np.intersect1d(box.rows, boxes[other].rows, assume_unique=True).size for other in kept)
-        sizes = (len(box.rows) + len(boxes[other].rows) for other in kept)
-        if all(shared <= SAME * (size - shared) for shared, size in zip(same, sizes, strict=True)):
-            kept.append(index)
-    return tuple(targets[index] for index in kept), tuple(boxes[index] for index in kept)
+        same = (np.intersect1d(box.rows, boxes[other].rows, assume_unique=True).size for other in distinct)
+        sizes = (len(box.rows) + len(boxes[other].rows) for other in distinct)
+        if all(shared <= SAME_THING_IOU * (size - shared) for shared, size in zip(same, sizes, strict=True)):
+            distinct.append(index)
+    return tuple(targets[index] for index in distinct), tuple(boxes[index] for index in distinct)
 
 
 def _corners(
@@ -222,7 +222,7 @@ def prompt_messages(prompt: Prompt, config: VlmConfig) -> list[dict[str, Any]]:
     return messages(prompt.text, prompt.pictures, side=config.image_side, kind=config.image_format)
 
 
-def meant(prompt: Prompt, text: str) -> int | None:
+def chosen_mark(prompt: Prompt, text: str) -> int | None:
     """Which target an answer to task=ground means, from 1; 0 for none of them, None where it names no mark.
 
     Warns:
@@ -230,9 +230,9 @@ def meant(prompt: Prompt, text: str) -> int | None:
     """
     number = number_in(text, len(prompt.targets))
     if number is None or (number and number not in prompt.marks):
-        told = " ".join(text.split())[:80]
+        message = " ".join(text.split())[:80]
         warnings.warn(
-            f"the answer does not name one of the {len(prompt.marks)} marks: {told!r}", SceneWarning, stacklevel=2
+            f"the answer does not name one of the {len(prompt.marks)} marks: {message!r}", SceneWarning, stacklevel=2
         )
         return None
     return number

@@ -15,8 +15,8 @@ from gsencoder.core.files.json_values import plain, write_bytes, write_json
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.splats import fingerprint
-from gsencoder.infer.ask.ask import Asker, Prompt, Question, meant, prompt_messages
-from gsencoder.infer.ask.questions import Asked, read_answers
+from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt_messages
+from gsencoder.infer.ask.questions import BatchQuestion, read_answers
 from gsencoder.infer.ask.reply import Reply, ServerError
 from gsencoder.infer.ask.server import MODEL_VARIABLE, URL_VARIABLE, VlmServer, request_body
 from gsencoder.infer.localize.localize import box_to_json
@@ -93,7 +93,7 @@ def reply_to_json(question: Question, prompt: Prompt, reply: Reply) -> dict[str,
         "seconds": round(reply.seconds, 3),
     }
     if question.task == "ground":
-        row["mark"] = meant(prompt, reply.text)
+        row["mark"] = chosen_mark(prompt, reply.text)
         row["box"] = targets_to_json(question, prompt)[row["mark"] - 1] if row["mark"] else None
     if reply.finish == "length":
         warnings.warn("the answer ends where vlm.max_tokens cut it off", SceneWarning, stacklevel=3)
@@ -101,7 +101,7 @@ def reply_to_json(question: Question, prompt: Prompt, reply: Reply) -> dict[str,
 
 
 def ask_questions(
-    questions: Sequence[Asked],
+    questions: Sequence[BatchQuestion],
     asker: Asker,
     server: VlmServer | None,
     work: Path,

@@ -1,4 +1,4 @@
-"""Bounds on what a server of the chat protocol may send, and on where it may lead its client."""
+"""Limits on the replies and the redirects of a chat server."""
 
 import importlib
 from collections.abc import Callable, Iterable, Iterator

@@ -1,4 +1,4 @@
-"""The key of a server, taken out of all that the server sends."""
+"""Removal of the API key from everything that a server sends."""
 
 import re
 from html.entities import html5

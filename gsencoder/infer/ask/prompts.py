@@ -68,8 +68,8 @@ def prompt_text(
             lines.append(f"The thing is the {names[0]}.")
         lines.append(MARKED if 1 in marks else PLACED)
     elif marks:
-        told = (f"{number} = {names[number - 1] or 'a thing'}" for number in sorted(marks))
-        lines.append(f"Marks: {'; '.join(told)}.")
+        legend = (f"{number} = {names[number - 1] or 'a thing'}" for number in sorted(marks))
+        lines.append(f"Marks: {'; '.join(legend)}.")
     if question:
         lines.append(f"Question: {question}" if task == "answer" else f"Meant is: {question}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The names of a text table that a question holds."""
+"""Names of a text table in a question."""
 
 import re
 import unicodedata
@@ -48,41 +48,41 @@ def words_in(text: str, table: TextTable, rules: WordRules = ENGLISH) -> tuple[s
     text = unicodedata.normalize("NFKC", text)
     tokens = _tokens(text)
     longest = max((len(name.split()) + name.count("-") for name in table.names), default=0)
-    found: list[tuple[int, int, str]] = []
+    matches: list[tuple[int, int, str]] = []
     start = 0
     while start < len(tokens):
         row, length = _longest_name(text, tokens, start, longest, table)
         if row is not None and not (length == 1 and _is_verb(tokens, start, rules)):
-            found.append((start, start + length, table.names[row]))
+            matches.append((start, start + length, table.names[row]))
         start += length
-    begins = {begin for begin, _, _ in found}
+    begins = {begin for begin, _, _ in matches}
     # A color belongs to the name after it.
-    kept = [
-        name for _, end, name in found if not (name.lower() in rules.colors and end in begins and tokens[end].joined)
+    names = [
+        name for _, end, name in matches if not (name.lower() in rules.colors and end in begins and tokens[end].joined)
     ]
-    return tuple(dict.fromkeys(kept))
+    return tuple(dict.fromkeys(names))
 
 
 def _longest_name(
     text: str, tokens: list[_Token], start: int, longest: int, table: TextTable
 ) -> tuple[int | None, int]:
     """The row of the longest name that begins at a token, and of how many tokens it is; None and 1 where none does."""
-    most = 1
-    while most < longest and start + most < len(tokens) and tokens[start + most].joined:
-        most += 1
-    for length in range(most, 0, -1):
-        part = tokens[start : start + length]
-        for name in (text[part[0].start : part[-1].end], " ".join(token.text for token in part)):
+    count = 1
+    while count < longest and start + count < len(tokens) and tokens[start + count].joined:
+        count += 1
+    for length in range(count, 0, -1):
+        span = tokens[start : start + length]
+        for name in (text[span[0].start : span[-1].end], " ".join(token.text for token in span)):
             row = table.find(name)
             if row is not None:
                 return row, length
     return None, 1
 
 
-def _is_verb(tokens: list[_Token], place: int, rules: WordRules) -> bool:
-    before = tokens[place - 1].text.lower() if place and tokens[place].joined else ""
-    after = tokens[place + 1].text.lower() if place + 1 < len(tokens) and tokens[place + 1].joined else ""
-    return before in rules.pronouns or (tokens[place].text.lower() in rules.auxiliaries and after in rules.pronouns)
+def _is_verb(tokens: list[_Token], position: int, rules: WordRules) -> bool:
+    before = tokens[position - 1].text.lower() if position and tokens[position].joined else ""
+    after = tokens[position + 1].text.lower() if position + 1 < len(tokens) and tokens[position + 1].joined else ""
+    return before in rules.pronouns or (tokens[position].text.lower() in rules.auxiliaries and after in rules.pronouns)
 
 
 def _tokens(text: str) -> list[_Token]:

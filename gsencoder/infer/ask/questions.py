@@ -11,13 +11,13 @@ from gsencoder.core.errors import InputError, about
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.prompts import Task, check_question
 
-LARGEST_FILE = 1 << 26
+MAX_FILE_BYTES = 1 << 26
 """Bytes of a file of questions."""
 FIELDS = ("id", "question", "task", "query", "aabb")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
+class BatchQuestion:
     """One line of a file of questions.
 
     Attributes:
@@ -30,11 +30,11 @@ class Asked:
 
     def digest(self, settings: Mapping[str, Any]) -> str:
         """Of the question and all that its answer depends on."""
-        asked = [self.question.text, self.question.task, list(self.question.query), list(self.question.aabb)]
-        return sha256(json.dumps([asked, settings], sort_keys=True).encode()).hexdigest()[:16]
+        question_row = [self.question.text, self.question.task, list(self.question.query), list(self.question.aabb)]
+        return sha256(json.dumps([question_row, settings], sort_keys=True).encode()).hexdigest()[:16]
 
 
-def read_questions(path: Path, task: Task = "answer") -> tuple[Asked, ...]:
+def read_questions(path: Path, task: Task = "answer") -> tuple[BatchQuestion, ...]:
     """Reads lines such as {"id": "7", "question": "What is on the table?", "query": "table"}; id, task, query and aabb
     may be left out, empty lines are skipped.
 
@@ -48,25 +48,25 @@ def read_questions(path: Path, task: Task = "answer") -> tuple[Asked, ...]:
     if not path.is_file():
         raise InputError(f"questions: {path} is no file; expected JSON lines")
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"questions: {path} holds more than {LARGEST_FILE:,} bytes")
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError(f"questions: {path} holds more than {MAX_FILE_BYTES:,} bytes")
         lines = path.read_bytes().decode("utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"questions: {path} cannot be read as text: {error}") from error
-    found: dict[str, Asked] = {}
+    questions: dict[str, BatchQuestion] = {}
     for number, line in enumerate(lines, start=1):
         if line.strip():
             with about(f"{path}: line {number}"):
-                asked = _asked(line, str(number), task)
-                if asked.id in found:
-                    raise InputError(f"id {asked.id[:40]!r} comes twice")
-                found[asked.id] = asked
-    if not found:
+                question_row = _parse_line(line, str(number), task)
+                if question_row.id in questions:
+                    raise InputError(f"id {question_row.id[:40]!r} comes twice")
+                questions[question_row.id] = question_row
+    if not questions:
         raise InputError(f"questions: {path} holds none")
-    return tuple(found.values())
+    return tuple(questions.values())
 
 
-def _asked(line: str, number: str, task: Task) -> Asked:
+def _parse_line(line: str, number: str, task: Task) -> BatchQuestion:
     try:
         row = json.loads(line)
     except (ValueError, RecursionError) as error:
@@ -95,7 +95,7 @@ def _asked(line: str, number: str, task: Task) -> Asked:
         aabb = tuple(float(value) for value in corners)
     except OverflowError as error:
         raise InputError(f"aabb: expected six numbers, got {str(corners)[:40]!r}") from error
-    return Asked(
+    return BatchQuestion(
         id=str(name),
         question=Question(
             text=text,
@@ -118,11 +118,11 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
         lines = path.read_bytes().split(b"\n")
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    found = {}
+    questions = {}
     for number, line in enumerate(lines[:-1], start=1):
         try:
             row = json.loads(line)
-            found[str(row["id"])] = row
+            questions[str(row["id"])] = row
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: line {number} is no answer; give resume=false to ask anew") from error
-    return found
+    return questions

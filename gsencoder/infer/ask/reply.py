@@ -1,11 +1,11 @@
-"""What servers of the chat protocol send, read with the doubt that it deserves."""
+"""Replies of chat servers, parsed without trusting them."""
 
 from dataclasses import dataclass
 from typing import Any
 
 from gsencoder.core.errors import InputError
 
-MOST_TOKENS = 1 << 53
+MAX_TOKENS_COUNT = 1 << 53
 """Larger counts are no counts, and no number that every reader of JSON knows."""
 
 
@@ -59,18 +59,18 @@ class Heard:
         """
         choices = getattr(part, "choices", None)
         if choices is None:
-            told = getattr(part, "model_extra", None) or {}
+            extra = getattr(part, "model_extra", None) or {}
             # Whole, as half a key could not be recognized; who reports it takes the key out and then cuts it.
-            raise ValueError(str(told.get("error") or told.get("message") or told.get("detail") or part))
+            raise ValueError(str(extra.get("error") or extra.get("message") or extra.get("detail") or part))
         self.parts += 1
         self.model = str(getattr(part, "model", "") or self.model)
         self.tokens = _tokens(getattr(part, "usage", None)) or self.tokens
         # The last chunk of some servers counts tokens and has no choice.
         for choice in choices[:1]:
-            said = getattr(choice, "delta", None) or getattr(choice, "message", None)
-            self.text += _words(getattr(said, "content", None))
-            self.refusal += _words(getattr(said, "refusal", None))
-            self.thought |= bool(getattr(said, "reasoning_content", None) or getattr(said, "reasoning", None))
+            message = getattr(choice, "delta", None) or getattr(choice, "message", None)
+            self.text += _words(getattr(message, "content", None))
+            self.refusal += _words(getattr(message, "refusal", None))
+            self.thought |= bool(getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None))
             self.finish = str(choice.finish_reason or self.finish)
 
     def wrong(self) -> str | None:
@@ -95,16 +95,16 @@ def _words(content: Any) -> str:
 
 def _tokens(usage: Any) -> dict[str, int]:
     counts = {"prompt": getattr(usage, "prompt_tokens", None), "answer": getattr(usage, "completion_tokens", None)}
-    return {name: count for name, count in counts.items() if isinstance(count, int) and 0 <= count < MOST_TOKENS}
+    return {name: count for name, count in counts.items() if isinstance(count, int) and 0 <= count < MAX_TOKENS_COUNT}
 
 
 def cause(error: BaseException) -> str:
     """What went wrong at the bottom: a server's message, or that of the first error."""
-    told = getattr(error, "body", None)
+    extra = getattr(error, "body", None)
     for name in ("error", "message", "detail"):
-        told = told.get(name, told) if isinstance(told, dict) else told
-    if told:
-        return " ".join(str(told).split())
+        extra = extra.get(name, extra) if isinstance(extra, dict) else extra
+    if extra:
+        return " ".join(str(extra).split())
     deepest = error
     while deepest.__cause__ is not None or deepest.__context__ is not None:
         deepest = deepest.__cause__ or deepest.__context__  # type: ignore[assignment]

@@ -18,11 +18,11 @@ from gsencoder.infer.ask.key_filter import KeyFilter
 from gsencoder.infer.ask.reply import Heard, Reply, ServerError, cause
 
 URL_VARIABLE, KEY_VARIABLE, MODEL_VARIABLE = "OPENAI_BASE_URL", "OPENAI_API_KEY", "GSENCODER_VLM_MODEL"
-LONGEST_TOLD = 300
+MAX_MESSAGE = 300
 """Characters of a server's message that an error repeats."""
-LONGEST_NAME = 200
+MAX_NAME = 200
 """Characters of a server's name for its model, or for why an answer ended, that are written down."""
-LONGEST_LIST = 8
+MAX_MODELS_LISTED = 8
 """Models of a server that an error lists."""
 
 Message = Mapping[str, Any]
@@ -165,7 +165,7 @@ class VlmServer:
                 http_client=http,
             )
         except Exception as error:  # settings of proxies and certificates raise whatever they like
-            reason = self._key.clean(cause(error), LONGEST_TOLD)
+            reason = self._key.clean(cause(error), MAX_MESSAGE)
             raise InputError(f"vlm: no connection can be set up ({reason}){_proxies()}") from self._shown(error)
 
     def ask(self, body: Mapping[str, Any]) -> Reply:
@@ -207,8 +207,8 @@ class VlmServer:
         """What was heard, without the key in any of it."""
         return Reply(
             text=self._key.clean(heard.text),
-            model=self._key.clean(heard.model or model, LONGEST_NAME),
-            finish=self._key.clean(heard.finish, LONGEST_NAME),
+            model=self._key.clean(heard.model or model, MAX_NAME),
+            finish=self._key.clean(heard.finish, MAX_NAME),
             tokens={name: count for name, count in (heard.tokens or {}).items() if not self._key.is_in(str(count))},
             seconds=seconds,
         )
@@ -229,30 +229,30 @@ class VlmServer:
         if isinstance(error, openai.APITimeoutError):
             times = f", {self._config.retries + 1} times" if self._config.retries and not heard.parts else ""
             return self._fault(f"was silent for {self._config.timeout:g} s{times} (vlm.timeout)", ServerError)
-        told = cause(error)
+        message = cause(error)
         if isinstance(error, openai.APIStatusError):
-            return self._status(error.status_code, told)
+            return self._status(error.status_code, message)
         after = f" after {len(heard.text)} characters" if heard.text else ""
         if isinstance(error, openai.APIConnectionError) and not heard.parts:
             return self._fault(
-                f"no server answers there ({told}){_proxies()}; start one, or correct vlm.base_url; "
+                f"no server answers there ({message}){_proxies()}; start one, or correct vlm.base_url; "
                 "dry_run=true writes the prompt and the pictures without one",
                 ServerError,
             )
         if isinstance(error, openai.APIConnectionError):
-            return self._fault(f"the answer broke off{after}: {told}", ServerError)
-        return self._fault(f"the answer broke off{after}, or is no chat completion: {told}", ServerError)
+            return self._fault(f"the answer broke off{after}: {message}", ServerError)
+        return self._fault(f"the answer broke off{after}, or is no chat completion: {message}", ServerError)
 
-    def _status(self, code: int, told: str) -> InputError:
+    def _status(self, code: int, message: str) -> InputError:
         if code in (401, 403):
-            return self._fault(f"refuses the key ({code}: {told}); give vlm.key= or {KEY_VARIABLE}", ServerError)
+            return self._fault(f"refuses the key ({code}: {message}); give vlm.key= or {KEY_VARIABLE}", ServerError)
         if code == 404:
             return self._fault(
-                f"has no model of that name, or no chat at this address ({told}){self._models()}", ServerError
+                f"has no model of that name, or no chat at this address ({message}){self._models()}", ServerError
             )
         if code == 429 or code >= 500:
-            return self._fault(f"failed {self._config.retries + 1} times ({code}: {told})", ServerError)
-        return self._fault(f"refuses the request ({code}: {told})", InputError)
+            return self._fault(f"failed {self._config.retries + 1} times ({code}: {message})", ServerError)
+        return self._fault(f"refuses the request ({code}: {message})", InputError)
 
     def _models(self) -> str:
         """The names that the server has, where it tells."""
@@ -261,7 +261,7 @@ class VlmServer:
         def listen() -> None:
             try:
                 models = self._client.with_options(max_retries=0).models.list()
-                names.extend(str(model.id) for model in itertools.islice(models, LONGEST_LIST))
+                names.extend(str(model.id) for model in itertools.islice(models, MAX_MODELS_LISTED))
             except Exception:  # it is only a hint
                 return
 
@@ -270,7 +270,7 @@ class VlmServer:
         return f"; it has {', '.join(names)}"
 
     def _fault(self, message: str, kind: type[InputError]) -> InputError:
-        return kind(self._key.clean(f"the server at {self.url}: ") + self._key.clean(message, LONGEST_TOLD))
+        return kind(self._key.clean(f"the server at {self.url}: ") + self._key.clean(message, MAX_MESSAGE))
 
     def _shown(self, error: BaseException) -> BaseException | None:
         """An error as the cause of ours, unless a traceback of it could show the key."""
@@ -289,9 +289,10 @@ def _ends_within(seconds: float, work: Callable[[], None]) -> bool:
 def _proxies() -> str:
     """Which variables lead elsewhere."""
     names = ("all_proxy", "http_proxy", "https_proxy")
-    found = [name for each in names for name in (each, each.upper()) if os.environ.get(name)]
+    variables = [name for each in names for name in (each, each.upper()) if os.environ.get(name)]
     return (
-        f"; {' and '.join(found)} {'lead' if len(found) > 1 else 'leads'} through a proxy (NO_PROXY names exceptions)"
-        if found
+        f"; {' and '.join(variables)} {'lead' if len(variables) > 1 else 'leads'} through a proxy (NO_PROXY names "
+        "exceptions)"
+        if variables
         else ""
     )

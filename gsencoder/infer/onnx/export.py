@@ -1,4 +1,4 @@
-"""One ONNX file that takes raw Gaussians: the graph, what a runtime must know of it, and the proof that it agrees."""
+"""Export of an encoder to one ONNX file that takes raw Gaussians, with metadata and a parity check."""
 
 import logging
 import warnings
@@ -243,15 +243,15 @@ def check_cosines(
         InputError: they are further apart.
     """
     cheap, full = OnnxEncoder(model, device="cpu"), OnnxEncoder(exact, device="cpu")
-    found: dict[str, float] = {}
+    cosines: dict[str, float] = {}
     for name, cloud, unit in track(clouds, "comparing"):
         ours, theirs = (
             each.encode(cloud, replace(ON_CPU, precision="auto"), metres_per_unit=unit) for each in (cheap, full)
         )
-        found[name] = 1 - field_error(ours, theirs).centered
-        if not found[name] >= cosine:
+        cosines[name] = 1 - field_error(ours, theirs).centered
+        if not cosines[name] >= cosine:
             raise InputError(
                 f"export: on {name} {cheap.header.precision} gives features whose mean centered cosine to float32's is "
-                f"{found[name]:.4f}, below cosine={cosine}; no file was written. Take another precision"
+                f"{cosines[name]:.4f}, below cosine={cosine}; no file was written. Take another precision"
             )
-    return found
+    return cosines

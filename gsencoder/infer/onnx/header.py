@@ -34,7 +34,7 @@ SETTINGS = ("voxel", "corner", "starts")
 """Inputs that have values of their own: the grid in metres, and those of a cloud that is no part of another."""
 OUTPUT = "features"
 ARRAYS = ("mean", "components", "words", "words_mean", "words_scale")
-MOST_DEFLATED = 20
+MAX_INFLATION = 20
 """Bytes that a character of text may stand for, where an array is large."""
 WORD_STEPS = 63
 """Largest integer of a word's embedding in an int8 file: seven bits leave centered cosines of 0.9995 or more."""
@@ -162,10 +162,10 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
 
 def with_sum(model: bytes) -> bytes:
     """A serialized model whose entry `SUM` is filled in."""
-    place = _sum_place(model)
-    if place is None:
+    position = _sum_position(model)
+    if position is None:
         raise ValueError(f"the model has no entry {SUM}")
-    return model[:place] + _digest(model, place) + model[place + len(NO_SUM) :]
+    return model[:position] + _digest(model, position) + model[position + len(NO_SUM) :]
 
 
 def check_sum(model: bytes) -> bool:
@@ -174,26 +174,26 @@ def check_sum(model: bytes) -> bool:
     Raises:
         InputError: it has another than its contents.
     """
-    place = _sum_place(model)
-    if place is not None and model[place : place + len(NO_SUM)] != _digest(model, place):
+    position = _sum_position(model)
+    if position is not None and model[position : position + len(NO_SUM)] != _digest(model, position):
         raise InputError(
             "its contents do not have the sum that was written with them: it is damaged, or was changed by a program "
             f"that left the entry {SUM} in it"
         )
-    return place is not None
+    return position is not None
 
 
-def _sum_place(model: bytes) -> int | None:
+def _sum_position(model: bytes) -> int | None:
     """Where the digits of the sum begin: an entry is its key, then the mark of a second field and the length of it."""
     key = SUM.encode() + bytes((0x12, len(NO_SUM)))
-    found = model.rfind(key)
-    return found + len(key) if found >= 0 and found + len(key) + len(NO_SUM) <= len(model) else None
+    start = model.rfind(key)
+    return start + len(key) if start >= 0 and start + len(key) + len(NO_SUM) <= len(model) else None
 
 
-def _digest(model: bytes, place: int) -> bytes:
-    digest = hashlib.sha256(model[:place])
+def _digest(model: bytes, position: int) -> bytes:
+    digest = hashlib.sha256(model[:position])
     digest.update(NO_SUM.encode())
-    digest.update(model[place + len(NO_SUM) :])
+    digest.update(model[position + len(NO_SUM) :])
     return digest.hexdigest().encode()
 
 
@@ -202,7 +202,7 @@ def _array(entries: Mapping[str, str], name: str, *, dtype: str, shape: list[int
         raise InputError(f"expected {name} of float32, float16 or int8, got {dtype[:20]!r}")
     text = entries[f"{KEY}.{name}"]
     wanted = math.prod(shape) * np.dtype(dtype).itemsize
-    if not 0 <= wanted <= max(1 << 24, MOST_DEFLATED * len(text)):
+    if not 0 <= wanted <= max(1 << 24, MAX_INFLATION * len(text)):
         raise InputError(f"{name} claims {str(wanted)[:20]} bytes in {len(text)} of text")
     unpacking = zlib.decompressobj()
     raw = unpacking.decompress(base64.b64decode(text, validate=True), wanted + 1)

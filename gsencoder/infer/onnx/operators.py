@@ -42,12 +42,12 @@ def search(keys: INT64, wanted: INT64, more: INT64) -> INT64:
     # Place k holds key k − 1, so that a count is the place of the last key that it counts.
     placed = traced.Concat(traced.Expand(largest, traced.Constant(value_ints=[1])), keys, missing, axis=0)
     target = wanted + more
-    found = wanted - wanted
+    result = wanted - wanted
     for _ in range(halvings):
         step = step / 2
-        tried = found + step
-        found = traced.Where(traced.Less(traced.Gather(placed, tried, axis=0), target), tried, found)
-    return found
+        tried = result + step
+        result = traced.Where(traced.Less(traced.Gather(placed, tried, axis=0), target), tried, result)
+    return result
 
 
 @script(OURS, default_opset=op)
@@ -64,10 +64,10 @@ def in_blocks(neighbors: INT32) -> INT32:
 
 
 @script(OURS, default_opset=op)
-def out_of_blocks(found: FLOAT, neighbors: INT32) -> FLOAT:
+def out_of_blocks(result: FLOAT, neighbors: INT32) -> FLOAT:
     """The rows of all blocks, [blocks, rows, channels], as many as there are neighborhoods."""
     first, last = op.Constant(value_ints=[0]), op.Constant(value_ints=[2])
-    flat = op.Reshape(found, op.Concat(op.Constant(value_ints=[-1]), op.Gather(op.Shape(found), last), axis=0))
+    flat = op.Reshape(result, op.Concat(op.Constant(value_ints=[-1]), op.Gather(op.Shape(result), last), axis=0))
     return op.Slice(flat, first, op.Gather(op.Shape(neighbors), first), first)
 
 
@@ -92,8 +92,8 @@ def convolve(x: FLOAT, neighbors: INT32, weight: FLOAT) -> FLOAT:
         near = op.Reshape(op.Gather(padded, part), op.Constant(value_ints=[0, -1]))
         return op.MatMul(near, wide)
 
-    found = op.Scan(table, body=block, num_scan_inputs=1)
-    return out_of_blocks(found, neighbors)
+    result = op.Scan(table, body=block, num_scan_inputs=1)
+    return out_of_blocks(result, neighbors)
 
 
 @script(OURS, default_opset=op)
@@ -110,8 +110,8 @@ def convolve_int8(x: UINT8, step: FLOAT, zero: UINT8, neighbors: INT32, weight: 
         near = op.Reshape(op.Gather(padded, part), op.Constant(value_ints=[0, -1]))
         return op.Cast(op.MatMulInteger(near, weight, zero), to=1) * unit
 
-    found = op.Scan(table, body=block, num_scan_inputs=1)
-    return out_of_blocks(found, neighbors)
+    result = op.Scan(table, body=block, num_scan_inputs=1)
+    return out_of_blocks(result, neighbors)
 
 
 @script(OURS, default_opset=op)
@@ -144,10 +144,10 @@ def hilbert(morton: INT64) -> INT64:
     for step in range(further + 1):
         away = op.Cast((further - step) * 6, to=13)
         octants = op.BitwiseAnd(op.BitShift(given, away, direction="RIGHT"), sixty_three)
-        place = op.BitwiseOr(op.BitShift(state, six, direction="LEFT"), octants)
-        found = op.Gather(table, op.Cast(place, to=7))
-        code = op.BitwiseOr(op.BitShift(code, six, direction="LEFT"), op.BitwiseAnd(found, sixty_three))
-        state = op.BitShift(found, six, direction="RIGHT")
+        key = op.BitwiseOr(op.BitShift(state, six, direction="LEFT"), octants)
+        result = op.Gather(table, op.Cast(key, to=7))
+        code = op.BitwiseOr(op.BitShift(code, six, direction="LEFT"), op.BitwiseAnd(result, sixty_three))
+        state = op.BitShift(result, six, direction="RIGHT")
     return op.Cast(code, to=7)
 
 
@@ -195,8 +195,8 @@ def in_standard_operators(model: onnx.ModelProto) -> onnx.ModelProto:
 
     The types of values stay: they are a hundredth of the file, and onnxruntime takes four times as long to find them.
     """
-    whole = onnx.ModelProto()
-    whole.CopyFrom(model)
+    standard = onnx.ModelProto()
+    standard.CopyFrom(model)
     for function in FUNCTIONS:
         proto = function.to_function_proto()
         # Annotations are types here, and floats may be of either width.
@@ -204,8 +204,8 @@ def in_standard_operators(model: onnx.ModelProto) -> onnx.ModelProto:
         for body in (each.g for node in proto.node for each in node.attribute if each.name == "body"):
             for value in body.output:
                 value.ClearField("type")
-        whole.functions.append(proto)
-    graph = ir.serde.deserialize_model(whole)
+        standard.functions.append(proto)
+    graph = ir.serde.deserialize_model(standard)
     for each in (
         passes.InlinePass(),
         passes.RemoveUnusedFunctionsPass(),

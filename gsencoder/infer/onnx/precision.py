@@ -84,7 +84,7 @@ def products_in_int8(model: onnx.ModelProto, ranges: Ranges | None = None) -> on
             continue
         if product.x not in as_bytes:
             # Queries, keys and values are products of the same tokens.
-            as_bytes[product.x] = tuple(f"{product.x}.{part}" for part in ("uint8", "step", "zero"))  # type: ignore[assignment]
+            as_bytes[product.x] = tuple(f"{product.x}.{chunk}" for chunk in ("uint8", "step", "zero"))  # type: ignore[assignment]
             nodes.append(_quantize(done.graph, product.x, as_bytes[product.x], ranges))
         rounded, scale = round_columns(product.matrix)
         weights = _store(done.graph, product.weight, rounded=rounded, scale=scale)
@@ -133,10 +133,10 @@ def calibrate(
     session = open_session(in_standard_operators(watched).SerializeToString(), "calibration", "cpu")
     low, high = np.full(len(names), np.inf), np.full(len(names), -np.inf)
     for _, cloud, unit in track(given, "calibrating"):
-        for part in cut(cloud.means, EncodeConfig().chunk, EncodeConfig().halo / unit):
-            feed = feed_of(cloud.select(part.rows), None, float(settings["voxel"]) / unit)
-            found = session.run(outputs, {**settings, **feed})
-            low, high = np.minimum(low, found[: len(names)]), np.maximum(high, found[len(names) :])
+        for chunk in cut(cloud.means, EncodeConfig().chunk, EncodeConfig().halo / unit):
+            feed = feed_of(cloud.select(chunk.rows), None, float(settings["voxel"]) / unit)
+            extremes = session.run(outputs, {**settings, **feed})
+            low, high = np.minimum(low, extremes[: len(names)]), np.maximum(high, extremes[len(names) :])
     return {name: (float(a), float(b)) for name, a, b in zip(names, low, high, strict=True)}
 
 
@@ -161,7 +161,7 @@ def _quantize(graph: onnx.GraphProto, x: str, names: Sequence[str], ranges: Rang
 
 
 def _store(graph: onnx.GraphProto, weight: str, **arrays: np.ndarray) -> list[str]:
-    names = [f"{weight}.{part}" for part in arrays]
+    names = [f"{weight}.{chunk}" for chunk in arrays]
     graph.initializer.extend(
         numpy_helper.from_array(np.ascontiguousarray(array), name)
         for name, array in zip(names, arrays.values(), strict=True)
@@ -177,7 +177,7 @@ def _copy(model: onnx.ModelProto) -> onnx.ModelProto:
 
 def _with_nodes(model: onnx.ModelProto, nodes: Sequence[onnx.NodeProto]) -> onnx.ModelProto:
     # The list may hold nodes of the graph itself, which go when it is cleared.
-    kept = [onnx.NodeProto.FromString(node.SerializeToString()) for node in nodes]
+    copies = [onnx.NodeProto.FromString(node.SerializeToString()) for node in nodes]
     del model.graph.node[:]
-    model.graph.node.extend(kept)
+    model.graph.node.extend(copies)
     return model

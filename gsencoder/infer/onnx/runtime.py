@@ -52,11 +52,11 @@ class OnnxEncoder:
         self._session = open_session(model, self.name, device, threads)
         try:
             self.header: OnnxHeader = from_metadata(self._session.get_modelmeta().custom_metadata_map)
-            wanted = {f"{name}: {self._type(name)}" for name in (*FIELDS, *SETTINGS)}
+            expected = {f"{name}: {self._type(name)}" for name in (*FIELDS, *SETTINGS)}
             found = {f"{each.name}: {each.type}" for each in self._session.get_inputs()}
             found |= {f"{each.name}: {each.type}" for each in self._session.get_overridable_initializers()}
-            if found != wanted or OUTPUT not in [each.name for each in self._session.get_outputs()]:
-                raise InputError(f"expected inputs {', '.join(sorted(wanted))}, got {', '.join(sorted(found))}")
+            if found != expected or OUTPUT not in [each.name for each in self._session.get_outputs()]:
+                raise InputError(f"expected inputs {', '.join(sorted(expected))}, got {', '.join(sorted(found))}")
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from error
         if not summed:
@@ -110,8 +110,8 @@ class OnnxEncoder:
             )
         voxel = header.voxel / metres_per_unit
 
-        def run(part: Gaussians, whole: SceneCurves | None) -> Float32[np.ndarray, "n channels"]:
-            return self._run(part, whole, voxel)
+        def run(subset: Gaussians, scene_curves: SceneCurves | None) -> Float32[np.ndarray, "n channels"]:
+            return self._run(subset, scene_curves, voxel)
 
         features = encode_by_chunks(
             gaussians,
@@ -126,27 +126,32 @@ class OnnxEncoder:
         )
         return header.outputs.features(features)
 
-    def _run(self, part: Gaussians, whole: SceneCurves | None, voxel: float) -> Float32[np.ndarray, "n channels"]:
-        feed = feed_of(part, whole, voxel)
+    def _run(
+        self, subset: Gaussians, scene_curves: SceneCurves | None, voxel: float
+    ) -> Float32[np.ndarray, "n channels"]:
+        feed = feed_of(subset, scene_curves, voxel)
         try:
             (found,) = self._session.run([OUTPUT], feed)
         except Exception as error:  # onnxruntime raises its own classes, which share only this base
             raise InputError(f"{self.name}: onnxruntime could not run it: {_first_line(error)}") from error
-        if found.shape != (len(part), self.header.outputs.channels):
+        if found.shape != (len(subset), self.header.outputs.channels):
             raise InputError(f"{self.name}: expected {self.header.outputs.channels} channels, got {found.shape}")
         return np.asarray(found, np.float32)
 
 
-def feed_of(part: Gaussians, whole: SceneCurves | None, voxel: float) -> dict[str, np.ndarray]:
-    """What the graph takes of a part of a scene, in the grid of the whole; `whole` is None where it is all of it.
+def feed_of(subset: Gaussians, scene_curves: SceneCurves | None, voxel: float) -> dict[str, np.ndarray]:
+    """What the graph takes of a part of a scene, in the grid of the whole; `scene_curves` is None where it is all of
+    it.
 
     Raises:
         InputError: the part spreads over too many cells.
     """
-    scaled = np.floor(part.means.astype(np.float64) / voxel)
+    scaled = np.floor(subset.means.astype(np.float64) / voxel)
     check_extent(float((scaled.max(axis=0) - scaled.min(axis=0)).max()) + 1, voxel)
-    feed = inputs_of(part) | {"voxel": np.array(voxel, np.float64)}
-    return feed if whole is None else feed | {"corner": whole.corner, "starts": rows_of(whole)}
+    feed = inputs_of(subset) | {"voxel": np.array(voxel, np.float64)}
+    return (
+        feed if scene_curves is None else feed | {"corner": scene_curves.corner, "starts": starts_table(scene_curves)}
+    )
 
 
 def inputs_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -155,12 +160,12 @@ def inputs_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
     return dict(zip(FIELDS, (*values, np.ascontiguousarray(gaussians.sh[:, 0])), strict=True))
 
 
-def rows_of(curves: SceneCurves) -> Int64[np.ndarray, "rows P"]:
+def starts_table(curves: SceneCurves) -> Int64[np.ndarray, "rows P"]:
     """The starts of all levels and orders in one array, as the graph takes them, filled up with `INVALID_CODE`."""
     rows = [row for starts in curves.starts for row in starts]
     table = np.full((len(rows), max(map(len, rows))), INVALID_CODE, np.int64)
-    for place, row in zip(table, rows, strict=True):
-        place[: len(row)] = row
+    for target, row in zip(table, rows, strict=True):
+        target[: len(row)] = row
     return table
 
 

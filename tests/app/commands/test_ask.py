@@ -26,7 +26,7 @@ from gsencoder.app.runs.printable import printable
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
 from gsencoder.infer.ask import ask as ask_module
-from gsencoder.infer.ask.ask import KEPT_PICTURES, Asker, Question
+from gsencoder.infer.ask.ask import MAX_CACHED_PICTURES, Asker, Question
 from gsencoder.infer.ask.question_words import WordRules, words_in
 from gsencoder.infer.ask.questions import read_answers, read_questions
 from gsencoder.infer.views.pictures import view_pictures
@@ -388,12 +388,12 @@ def test_pictures_are_rendered_once_for_questions_about_one_thing(
     marked = asker.prompt(Question(text="the left cube", task="ground"))
     assert len(rendered) == 2
     assert marked.marks == {1}
-    for number in range(KEPT_PICTURES):
+    for number in range(MAX_CACHED_PICTURES):
         low = ORIGIN + np.array([0.1, 0.0, 0.6 - 0.001 * number])
         asker.prompt(Question(text="What?", aabb=(*low.tolist(), *(ORIGIN + np.array([0.5, 0.4, 1.0])).tolist())))
-    assert len(asker._drawn) == KEPT_PICTURES
+    assert len(asker._picture_cache) == MAX_CACHED_PICTURES
     asker.prompt(Question(text="Where is the cube?"))
-    assert len(rendered) == 3 + KEPT_PICTURES
+    assert len(rendered) == 3 + MAX_CACHED_PICTURES
 
 
 def test_lines_take_the_task_of_the_command_unless_they_name_one(tmp_path: Path) -> None:
