@@ -1,4 +1,4 @@
-"""A teacher whose maps are kept in a folder: made once, and the same for whoever asks again.
+"""A cache of teacher maps in a folder: each map is computed once, and is the same for every later use.
 
 Fusing asks for a dense map twice (for the basis and for the sums), preparing a scene three times, a sweep of settings
 as often as it has settings; making a map takes far longer than reading it. What is given is always what the file

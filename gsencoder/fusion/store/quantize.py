@@ -1,4 +1,4 @@
-"""Features in a few bytes a Gaussian: as many as an error budget asks for.
+"""Quantized features: the fewest bytes a Gaussian that an error budget allows.
 
 Coordinates are turned so that the first hold most, each is replaced by the nearest of 2ᵇ levels (Lloyd 1982, Max 1960),
 and bits go one at a time to the coordinate whose error they lower most. A name or a patch lives near few directions, so

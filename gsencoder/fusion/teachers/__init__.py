@@ -1,4 +1,4 @@
-"""Teachers: what gives each view a map of features. One file each; all share the contract below."""
+"""Teachers: models that give each view a map of features. One file each; all follow the protocol below."""
 
 from typing import Any, Protocol, runtime_checkable
 

@@ -1,4 +1,4 @@
-"""What a VLM is told: SplatDistill's three tasks on pictures of a scene (question answering, visual grounding, dense
+"""Prompts of a VLM: SplatDistill's three tasks on pictures of a scene (question answering, visual grounding, dense
 captioning), as messages of OpenAI's chat protocol."""
 
 import base64

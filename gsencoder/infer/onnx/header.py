@@ -1,4 +1,4 @@
-"""What an exported encoder says of itself: entries of text beside the graph, which any program can read.
+"""Metadata of an exported encoder: entries of text beside the graph, which any program can read.
 
 `gsencoder` is JSON: the format's version, the grid, the curves, the feature space, and for each array its type and
 shape. `gsencoder.NAME` is the array NAME: little-endian, deflated, in base64. `gsencoder.sum` is the sha256 of the

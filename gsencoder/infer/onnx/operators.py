@@ -1,4 +1,4 @@
-"""Operators that the exporter does not know, in others of ONNX.
+"""Translations of operators that the exporter does not know into standard ONNX operators.
 
 Convolutions stay operators of our own (`gsencoder::convolve`) until a graph is finished, so that what changes the
 graph's precision finds them; `in_standard_operators` then writes them out.

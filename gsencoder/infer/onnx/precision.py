@@ -1,4 +1,4 @@
-"""Eight bits for an exported encoder: its weights alone, or its products too.
+"""Quantization of an exported encoder to eight bits: its weights alone, or its products too.
 
 A weight matrix is rounded to int8 with a scale for each output channel. In a product of integers the other side is
 rounded to uint8 with one scale and one zero for all of it: found anew for each cloud (dynamic), or once from clouds
