@@ -27,7 +27,7 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.localize.localize import localize
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.infer.views.scores import look
+from gsencoder.infer.views.scores import score_views
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
 from gsencoder.infer.views.targets import Target, targets_of
 from gsencoder.render import BlendConfig
@@ -86,7 +86,7 @@ def measured(scene: Scene, target: Target, chosen: ViewSet) -> dict[str, np.ndar
     """What full renders of chosen views show."""
     assert scene.gaussians is not None
     assert scene.views is not None
-    (seen,) = look(scene.gaussians, chosen.cameras, [target], side=640, config=BlendConfig())
+    (seen,) = score_views(scene.gaussians, chosen.cameras, [target], side=640, config=BlendConfig())
     free = FreeSpace(scene.gaussians).seen_by(scene.views.cameras)
     centers = chosen.cameras.centers
     return {
@@ -134,9 +134,9 @@ def main() -> None:
                 seconds[count].append(time.perf_counter() - start)
                 covered[count].append(views.chosen[-1].covered)
                 shells[count].append(measured(scene, target, views))
-                told = {name: int(good.sum()) for name, good in shells[count][-1].items()}
+                describe_view = {name: int(good.sum()) for name, good in shells[count][-1].items()}
                 print(
-                    f"{scene.name} {target.name}: {len(views)} of {views.judged} of {count}, {told}; "
+                    f"{scene.name} {target.name}: {len(views)} of {views.judged} of {count}, {describe_view}; "
                     f"frames {frames['greedy'][-1]:.3f}, {frames['uniform'][-1]:.3f}",
                     flush=True,
                 )
@@ -147,14 +147,15 @@ def main() -> None:
         )
     for count in counts:
         total = len(shells[count]) + len(failed[count])
-        told = []
+        describe_view = []
         for name in ("visible", "share", "alpha", "free"):
             enough = sum(each[name].sum() >= COUNT - 1 for each in shells[count])
             mean = np.concatenate([each[name] for each in shells[count]]).mean()
-            told.append(f"{name} {enough / total:.2f} ({mean:.3f} of views)")
+            describe_view.append(f"{name} {enough / total:.2f} ({mean:.3f} of views)")
         every = sum(np.logical_and.reduce(list(each.values())).sum() >= COUNT - 1 for each in shells[count])
         print(
-            f"shells of {count}: in 7 of 8 views {', '.join(told)}; all of it {every / total:.2f} of {total} objects; "
+            f"shells of {count}: in 7 of 8 views {', '.join(describe_view)}; all of it {every / total:.2f} of "
+            f"{total} objects; "
             f"covered {np.mean(covered[count]):.3f}; {np.median(seconds[count]):.2f} s, most {max(seconds[count]):.2f}"
         )
         for line in failed[count]:

@@ -14,11 +14,11 @@ from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.frames import frames_on
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.pictures import view_pictures, view_sheet
-from gsencoder.infer.views.scores import coverage, look
+from gsencoder.infer.views.scores import coverage, score_views
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.infer.views.shells import shell_cameras, up_of
 from gsencoder.infer.views.targets import Target, target_of, targets_of
-from gsencoder.infer.views.utility import Values, worth
+from gsencoder.infer.views.utility import CoverageObjective, view_utility
 from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
 
 pytestmark = pytest.mark.slow
@@ -88,7 +88,7 @@ def test_a_target_by_itself_is_seen_whole_and_fills_what_it_should() -> None:
     # A plate of side 0.4 two units in front of a camera.
     plate = splat(sheet((0, 0, 2.0), (0, 1), (0.2, 0.2), 0.02), 0.012)
     cameras = looking_cameras(np.zeros((1, 3)), np.array([[0, 0, 1.0]]), np.array([0, -1.0, 0]), 200.0, 160, 120)
-    (seen,) = look(plate, cameras, [target_of("plate", plate, np.arange(len(plate)))])
+    (seen,) = score_views(plate, cameras, [target_of("plate", plate, np.arange(len(plate)))])
     assert seen.visible[0] == pytest.approx(1)
     assert seen.inside[0] == 1
     # At least the means' square, at most that with two standard deviations on every side.
@@ -108,7 +108,7 @@ def test_what_stands_before_a_target_hides_it_by_its_share() -> None:
         # A screen at half the distance whose right edge covers none, half, or all of the plate.
         screen = sheet((edge / 2 - 0.5, 0, 1.0), (0, 1), (0.5, 0.5), 0.02)
         both = splat(np.concatenate([plate, screen]), 0.012)
-        (seen,) = look(both, cameras, [target_of("plate", both, np.arange(len(plate)))])
+        (seen,) = score_views(both, cameras, [target_of("plate", both, np.arange(len(plate)))])
         visible.append(seen.visible[0])
     assert visible[0] > 0.98
     # The screen's rim is twice as wide on the plate.
@@ -123,9 +123,9 @@ def test_views_of_two_targets_are_judged_as_each_by_itself() -> None:
         "other", scene.gaussians, np.arange(len(scene.gaussians) - len(target.rows), len(scene.gaussians))
     )
     cameras = corner_cameras(5)
-    both = look(scene.gaussians, cameras, [target, other])
+    both = score_views(scene.gaussians, cameras, [target, other])
     for place, one in enumerate((target, other)):
-        (alone,) = look(scene.gaussians, cameras, [one])
+        (alone,) = score_views(scene.gaussians, cameras, [one])
         for name in ("visible", "share", "inside", "alpha", "blur", "target", "context"):
             assert (getattr(both[place], name) == getattr(alone, name)).all()
 
@@ -163,7 +163,7 @@ def test_gains_never_grow_and_the_choice_is_near_the_best_of_all() -> None:
     assert scene.gaussians is not None
     cameras = corner_cameras(10, 160, 120)
     config = ViewsConfig(count=3, candidates=10, cover_weight=1.0, context_weight=0.5, spread_weight=1.0)
-    values = Values(cameras, [target], look(scene.gaussians, cameras, [target]), config)
+    values = CoverageObjective(cameras, [target], score_views(scene.gaussians, cameras, [target]), config)
     order, gains = values.greedy(10)
     assert (np.diff(gains) <= 1e-12).all()
     assert sorted(order.tolist()) == list(range(10))
@@ -176,13 +176,13 @@ def test_gains_never_grow_and_the_choice_is_near_the_best_of_all() -> None:
 def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
     scene, target = cube_in_room()
     assert scene.gaussians is not None
-    (seen,) = look(scene.gaussians, corner_cameras(1), [target])
+    (seen,) = score_views(scene.gaussians, corner_cameras(1), [target])
     config = ViewsConfig()
 
     def value(**changed: float) -> float:
         base = {"visible": 1.0, "share": 0.2, "inside": 1.0, "alpha": 1.0, "blur": 0.0} | changed
         arrays = {name: np.array([number]) for name, number in base.items()}
-        return float(worth(replace(seen, **arrays), config)[0])
+        return float(view_utility(replace(seen, **arrays), config)[0])
 
     shares = [value(share=share) for share in (0.0, 0.01, 0.05, 0.1, 0.3)]
     assert shares == sorted(shares)
@@ -204,7 +204,7 @@ def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
 def test_a_target_fills_enough_from_the_least_share_on_and_too_much_beyond_the_most() -> None:
     scene, target = cube_in_room()
     assert scene.gaussians is not None
-    (seen,) = look(scene.gaussians, corner_cameras(1), [target])
+    (seen,) = score_views(scene.gaussians, corner_cameras(1), [target])
     config = ViewsConfig(least_share=0.1, most_share=0.5)
     full = {name: np.ones(1) for name in ("visible", "inside", "alpha")} | {"blur": np.zeros(1)}
     for share, expected in (
@@ -216,7 +216,7 @@ def test_a_target_fills_enough_from_the_least_share_on_and_too_much_beyond_the_m
         (0.75, 0.5),
         (0.9, 0.2),
     ):
-        assert worth(replace(seen, share=np.array([share]), **full), config)[0] == pytest.approx(expected)
+        assert view_utility(replace(seen, share=np.array([share]), **full), config)[0] == pytest.approx(expected)
 
 
 def test_a_set_is_worth_its_views_and_what_they_cover_of_targets_context_and_directions(
@@ -231,14 +231,14 @@ def test_a_set_is_worth_its_views_and_what_they_cover_of_targets_context_and_dir
     config = ViewsConfig(count=3, candidates=6, cover_weight=1.0, context_weight=0.5, spread_weight=0.25)
     seen = []
     for target, others in zip((first, second), (7, 0), strict=True):
-        (one,) = look(scene.gaussians, cameras, [target])
+        (one,) = score_views(scene.gaussians, cameras, [target])
         weights = {"target": rng.random((6, 9)), "context": rng.random((6, others))}
         seen.append(replace(one, **{name: value.astype(np.float32) for name, value in weights.items()}))
-    values = Values(cameras, [first, second], seen, config)
+    values = CoverageObjective(cameras, [first, second], seen, config)
     for views in ([0], [1, 4], [0, 2, 5]):
         total, covered = 0.0, 0.0
         for target, each in zip((first, second), seen, strict=True):
-            own = worth(each, config)
+            own = view_utility(each, config)
             good = own / max(own.max(), 0.1)
             away = cameras.centers.astype(np.float64) - target.center
             away /= np.linalg.norm(away, axis=1, keepdims=True)
@@ -260,15 +260,15 @@ def test_a_view_adds_something_from_a_small_share_of_the_first_one_on_or_of_the_
     scene, target = cube_in_room()
     assert scene.gaussians is not None
     cameras = corner_cameras(4, 32, 24)
-    (seen,) = look(scene.gaussians, cameras, [target])
+    (seen,) = score_views(scene.gaussians, cameras, [target])
     least = max(CONSTANTS.min_relative_gain * best, CONSTANTS.min_gain)
     config = ViewsConfig(count=4, candidates=4, cover_weight=0.0, context_weight=0.0, spread_weight=0.0)
     full = {"share": config.most_share / 2, "inside": 1.0, "alpha": 1.0, "blur": 0.0}
     arrays = {name: np.full(4, value) for name, value in full.items()}
     # All else being perfect, a view is worth what it shows of the target.
     visible = np.array([0.9 * least, 1.1 * least, best, 2 * least])
-    values = Values(cameras, [target], [replace(seen, visible=visible, **arrays)], config)
-    np.testing.assert_allclose(values.worths[0], visible)
+    values = CoverageObjective(cameras, [target], [replace(seen, visible=visible, **arrays)], config)
+    np.testing.assert_allclose(values.utilities[0], visible)
     order, gains = values.greedy(4)
     assert order.tolist() == [2, 3, 1]
     np.testing.assert_allclose(gains * config.count, visible[order])
@@ -320,11 +320,11 @@ def test_frames_of_a_film_are_taken_from_all_along_it() -> None:
     turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     film = around(np.array([0.3, 0.2, 0.8]), 1.0 + 0.3 * np.abs(turns - np.pi) / np.pi, turns)
     free = FreeSpace(scene.gaussians).without(target.rows)
-    taken = frames_on(film, scene.gaussians, [target], 16, [free])
-    assert len(taken) == 16
-    assert len(np.unique(taken)) == 16
+    photograph_at = frames_on(film, scene.gaussians, [target], 16, [free])
+    assert len(photograph_at) == 16
+    assert len(np.unique(photograph_at)) == 16
     # The nearest stand together on one side.
-    assert np.ptp(turns[taken]) > 0.8
+    assert np.ptp(turns[photograph_at]) > 0.8
 
 
 def test_targets_take_turns_at_the_frames() -> None:
@@ -335,11 +335,11 @@ def test_targets_take_turns_at_the_frames() -> None:
     cameras = joined(around(large.center, np.full(20, 1.2), at), around(target.center, np.full(20, 1.2), at))
     free = FreeSpace(scene.gaussians)
     spaces = [free.without(each.rows) for each in (large, target)]
-    taken = frames_on(cameras, scene.gaussians, [large, target], 8, spaces)
-    assert len(taken) == 8
+    photograph_at = frames_on(cameras, scene.gaussians, [large, target], 8, spaces)
+    assert len(photograph_at) == 8
     for each, space in zip((large, target), spaces, strict=True):
         (best,) = frames_on(cameras, scene.gaussians, [each], 1, [space])
-        assert best in taken
+        assert best in photograph_at
 
 
 def test_views_that_add_nothing_are_left_out_and_that_is_said() -> None:

@@ -16,7 +16,7 @@ from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.localize.localize import LocalizeConfig, box_to_json, localize, select_features
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
-from gsencoder.infer.views.pictures import told, view_pictures
+from gsencoder.infer.views.pictures import describe_view, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
 from gsencoder.infer.views.targets import Target, best_boxes, targets_of
 from gsencoder.infer.views.tokens import Fit, feature_tokens, token_blends, tower_grid
@@ -97,7 +97,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
                 write_tokens(target / TOKENS, scene, views, config)
     screen = console(config.quiet)
     for number, each in enumerate(views.chosen):
-        screen.print(f"{number:2d}  {told(each)}")
+        screen.print(f"{number:2d}  {describe_view(each)}")
     screen.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))
 
 

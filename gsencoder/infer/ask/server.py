@@ -166,7 +166,7 @@ class VlmServer:
             )
         except Exception as error:  # settings of proxies and certificates raise whatever they like
             reason = self._key.clean(cause(error), MAX_MESSAGE)
-            raise InputError(f"vlm: no connection can be set up ({reason}){_proxies()}") from self._shown(error)
+            raise InputError(f"vlm: no connection can be set up ({reason}){_proxies()}") from self._downscaled(error)
 
     def ask(self, body: Mapping[str, Any]) -> Reply:
         """One answer.
@@ -193,7 +193,7 @@ class VlmServer:
         if self._guard.fault:
             raise self._fault(self._guard.fault, ServerError)
         if failed:
-            raise self._failure(failed[0], heard) from self._shown(failed[0])
+            raise self._failure(failed[0], heard) from self._downscaled(failed[0])
         if not heard.parts:
             raise self._fault("sent nothing that is a chat completion; such addresses mostly end in /v1", ServerError)
         if not heard.finish:
@@ -272,7 +272,7 @@ class VlmServer:
     def _fault(self, message: str, kind: type[InputError]) -> InputError:
         return kind(self._key.clean(f"the server at {self.url}: ") + self._key.clean(message, MAX_MESSAGE))
 
-    def _shown(self, error: BaseException) -> BaseException | None:
+    def _downscaled(self, error: BaseException) -> BaseException | None:
         """An error as the cause of ours, unless a traceback of it could show the key."""
         return None if self._key.is_in("".join(traceback.format_exception(error))) else error
 

@@ -20,11 +20,11 @@ from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.frames import frames_on
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.photographs import photograph_cameras
-from gsencoder.infer.views.scores import Looks, as_photographs, look
-from gsencoder.infer.views.selection import Chosen, Sight, ViewsConfig, ViewSet
+from gsencoder.infer.views.scores import ViewScores, replace_with_photographs, score_views
+from gsencoder.infer.views.selection import SelectedView, TargetScore, ViewsConfig, ViewSet
 from gsencoder.infer.views.shells import shell_cameras, up_of
 from gsencoder.infer.views.targets import Target, check_targets
-from gsencoder.infer.views.utility import Values
+from gsencoder.infer.views.utility import CoverageObjective
 from gsencoder.render import BlendConfig
 from gsencoder.types import Cameras, Gaussians, Scene
 
@@ -52,28 +52,28 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
     free = FreeSpace(gaussians)
     judged = replace(CONSTANTS.score_blend, near=min(CONSTANTS.score_blend.near, free.cell / 2))
     if config.method == "uniform":
-        found = _uniform(scene, gaussians, config)
+        candidates = _uniform(scene, gaussians, config)
     else:
-        found = _candidates(scene, gaussians, targets, free, config, judged)
-    cameras = found.cameras
-    looks = look(gaussians, cameras, targets, side=config.judged_side, config=judged)
+        candidates = _candidates(scene, gaussians, targets, free, config, judged)
+    cameras = candidates.cameras
+    scores = score_views(gaussians, cameras, targets, side=config.judged_side, config=judged)
     if scene.views is not None and scene.views.images is not None:
-        taken = np.array([frame is not None for frame in found.frames])
-        looks = tuple(as_photographs(each, taken) for each in looks)
-    values = Values(cameras, targets, looks, config)
+        is_photograph = np.array([frame is not None for frame in candidates.frames])
+        scores = tuple(replace_with_photographs(each, is_photograph) for each in scores)
+    values = CoverageObjective(cameras, targets, scores, config)
     if config.method == "uniform":
         order, gains = np.arange(len(cameras)), None
     else:
         order, gains = values.greedy(config.count)
-    _tell(scene, targets, looks, order, config)
+    _warn_about(scene, targets, scores, order, config)
     sights = [
         tuple(
-            Sight(
+            TargetScore(
                 target=target.name,
-                worth=float(worth[view]),
+                utility=float(utility[view]),
                 **{name: float(getattr(each, name)[view]) for name in ("visible", "share", "inside", "alpha", "blur")},
             )
-            for target, each, worth in zip(targets, looks, values.worths, strict=True)
+            for target, each, utility in zip(targets, scores, values.utilities, strict=True)
         )
         for view in order
     ]
@@ -81,41 +81,41 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
     return ViewSet(
         cameras=cameras.select(order),
         chosen=tuple(
-            Chosen(
-                name=found.names[view],
-                frame=found.frames[view],
-                clearance=float(room[place]),
-                gain=None if gains is None else float(gains[place]),
-                covered=values.covered(order[: place + 1]),
-                sights=sights[place],
+            SelectedView(
+                name=candidates.names[view],
+                frame=candidates.frames[view],
+                clearance=float(room[position]),
+                gain=None if gains is None else float(gains[position]),
+                covered=values.covered(order[: position + 1]),
+                sights=sights[position],
             )
-            for place, view in enumerate(order)
+            for position, view in enumerate(order)
         ),
         judged=len(cameras),
         near=judged.near,
     )
 
 
-def _tell(
+def _warn_about(
     scene: Scene,
     targets: Sequence[Target],
-    looks: Sequence[Looks],
+    scores: Sequence[ViewScores],
     order: Int64[np.ndarray, " n"],
     config: ViewsConfig,
 ) -> None:
     """Warns of what a user would not expect."""
     if len(order) < config.count:
-        told = "no other shows more of what was found" if targets else "there are no more"
+        reason = "no other shows more of what was found" if targets else "there are no more"
         warnings.warn(
-            f"views: {len(order)} of {config.count} in scene {scene.name}: {told}", SceneWarning, stacklevel=3
+            f"views: {len(order)} of {config.count} in scene {scene.name}: {reason}", SceneWarning, stacklevel=3
         )
-    for target, each in zip(targets, looks, strict=True):
+    for target, each in zip(targets, scores, strict=True):
         seen = (each.visible * each.inside)[order].max(initial=0)
         if seen < CONSTANTS.min_visible:
             warnings.warn(f"views: no view shows more than {seen:.0%} of {target.name}", SceneWarning, stacklevel=3)
 
 
-class _Found(NamedTuple):
+class _Candidates(NamedTuple):
     """Candidates: where they are, what they are called, and which frames they are."""
 
     cameras: Cameras
@@ -123,7 +123,7 @@ class _Found(NamedTuple):
     frames: list[int | None]
 
 
-def _uniform(scene: Scene, gaussians: Gaussians, config: ViewsConfig) -> _Found:
+def _uniform(scene: Scene, gaussians: Gaussians, config: ViewsConfig) -> _Candidates:
     """Evenly spread frames, or cameras around a splat that has none."""
     if scene.views is None or not len(scene.views):
         around = orbit_cameras(
@@ -134,10 +134,10 @@ def _uniform(scene: Scene, gaussians: Gaussians, config: ViewsConfig) -> _Found:
             fov_degrees=config.fov,
             up=scene.up,
         )
-        return _Found(around, [f"orbit {number:02d}" for number in range(len(around))], [None] * len(around))
+        return _Candidates(around, [f"orbit {number:02d}" for number in range(len(around))], [None] * len(around))
     chosen = evenly(len(scene.views), config.count)
     names = [scene.views.names[view] for view in chosen]
-    return _Found(_shown(scene.views.cameras.select(chosen), config), names, [int(view) for view in chosen])
+    return _Candidates(_downscaled(scene.views.cameras.select(chosen), config), names, [int(view) for view in chosen])
 
 
 def _candidates(
@@ -147,7 +147,7 @@ def _candidates(
     free: FreeSpace,
     config: ViewsConfig,
     judged: BlendConfig,
-) -> _Found:
+) -> _Candidates:
     own = scene.views.cameras if scene.views is not None and len(scene.views) else None
     if config.source == "frames" and own is None:
         raise InputError(f"views: scene {scene.name} has no cameras of its own; take choose.source=shells")
@@ -159,21 +159,21 @@ def _candidates(
         room = config.candidates if config.source == "frames" else config.candidates // 2
         if scene.views.images is not None and room >= 2 * len(targets):
             large = photograph_cameras(scene.views)
-            for target, space, part in zip(targets, spaces, _shared_out(room // 2, len(targets)), strict=True):
+            for target, space, part in zip(targets, spaces, _split_evenly(room // 2, len(targets)), strict=True):
                 best = frames_on(own, gaussians, [target], part, [space])
                 near, rows = closeups(large.select(best), gaussians, target, width=config.width, height=config.height)
                 parts.append(near)
                 names += [f"{scene.views.names[view]} near {target.name}" for view in best[rows]]
                 frames += best[rows].tolist()
-        taken = frames_on(own, gaussians, targets, room - len(frames), spaces)
-        parts.append(_shown(own.select(taken), config))
-        names += [scene.views.names[view] for view in taken]
-        frames += taken.tolist()
+        photograph_at = frames_on(own, gaussians, targets, room - len(frames), spaces)
+        parts.append(_downscaled(own.select(photograph_at), config))
+        names += [scene.views.names[view] for view in photograph_at]
+        frames += photograph_at.tolist()
     if config.source != "frames":
         if own is not None:
             watchers = frames_on(own, gaussians, targets, max(CONSTANTS.free_space_cameras, len(targets)), spaces)
             free = free.seen_by(own.select(watchers), judged)
-        for target, room in zip(targets, _shared_out(config.candidates - len(frames), len(targets)), strict=True):
+        for target, room in zip(targets, _split_evenly(config.candidates - len(frames), len(targets)), strict=True):
             around = shell_cameras(
                 gaussians,
                 target,
@@ -190,27 +190,27 @@ def _candidates(
             parts.append(around)
             names += [f"around {target.name} {number:02d}" for number in range(len(around))]
             frames += [None] * len(around)
-    cameras = _joined(parts)
+    cameras = _concatenate(parts)
     if not len(cameras):
         raise InputError(
             f"views: there is no room for a camera around {', '.join(target.name for target in targets)} "
             f"(pictures of {config.width} x {config.height} pixels, {config.fov:g} degrees); "
             + ("choose.method=uniform looks at all of the splat" if own is None else "take choose.source=frames")
         )
-    return _Found(cameras, names, frames)
+    return _Candidates(cameras, names, frames)
 
 
-def _shown(frames: Cameras, config: ViewsConfig) -> Cameras:
+def _downscaled(frames: Cameras, config: ViewsConfig) -> Cameras:
     """Frames at the size of their pictures: photographs have far more pixels than anyone looks at."""
     return frames.resized(config.frame_side, enlarge=False)
 
 
-def _shared_out(total: int, parts: int) -> list[int]:
+def _split_evenly(total: int, parts: int) -> list[int]:
     """Whole numbers of one or more that come to a total, as equal as can be."""
     return [max(1, total // parts + (part < total % parts)) for part in range(parts)]
 
 
-def _joined(parts: Sequence[Cameras]) -> Cameras:
+def _concatenate(parts: Sequence[Cameras]) -> Cameras:
     return Cameras(
         **{
             name: np.concatenate([getattr(part, name) for part in parts])

@@ -1,4 +1,4 @@
-"""Which of the scene's own cameras could show a target, by rays and before any render."""
+"""Candidates among the scene's own cameras, ranked by rays before any render."""
 
 from collections.abc import Sequence
 
@@ -27,19 +27,21 @@ def frames_on(
         count: frames.
         spaces: what rays meet, one for each target, which is itself left out.
     """
-    ranked = [_ranked(cameras, gaussians, target, count, free) for target, free in zip(targets, spaces, strict=True)]
+    ranked = [
+        _rank_frames(cameras, gaussians, target, count, free) for target, free in zip(targets, spaces, strict=True)
+    ]
     turns = np.stack(ranked, axis=1).reshape(-1)
     first = np.sort(np.unique(turns, return_index=True)[1])[:count]
     return np.sort(turns[first])
 
 
-def _ranked(
+def _rank_frames(
     cameras: Cameras, gaussians: Gaussians, target: Target, count: int, free: FreeSpace
 ) -> Int64[np.ndarray, " n"]:
     """Frames in the order in which they are taken for a target, as many as are wanted."""
     count = min(count, len(cameras))
     half = (count + 1) // 2
-    filled = _filled(cameras, target)
+    filled = _fill_shares(cameras, target)
     rows = target.rows[evenly(len(target.rows), CONSTANTS.frame_rays)]
     points = gaussians.means[rows].astype(np.float64)
     shown = np.full(len(cameras), -1.0)
@@ -49,7 +51,7 @@ def _ranked(
     def judge(views: Int64[np.ndarray, " n"]) -> None:
         for start in range(0, len(views), CONSTANTS.frame_batch):
             block = views[start : start + CONSTANTS.frame_batch]
-            shown[block] = filled[block] * (blocked + (1 - blocked) * _open(cameras, block, points, free))
+            shown[block] = filled[block] * (blocked + (1 - blocked) * _open_fraction(cameras, block, points, free))
 
     order = np.argsort(-filled, kind="stable")
     for start in range(0, len(order), CONSTANTS.frame_batch):
@@ -64,13 +66,13 @@ def _ranked(
     others = others[evenly(len(others), CONSTANTS.spread_frames * count)]
     judge(others[shown[others] < 0])
     others = others[shown[others] >= enough]
-    taken = np.concatenate([best[:half], others[evenly(len(others), count - half)]])
+    photograph_at = np.concatenate([best[:half], others[evenly(len(others), count - half)]])
     # Whatever is missing comes from those that show less, and at last from those that no ray was sent to.
     rest = np.lexsort((-filled, -shown))
-    return np.concatenate([taken, rest[~np.isin(rest, taken)]])[:count]
+    return np.concatenate([photograph_at, rest[~np.isin(rest, photograph_at)]])[:count]
 
 
-def _filled(cameras: Cameras, target: Target) -> Float64[np.ndarray, " V"]:
+def _fill_shares(cameras: Cameras, target: Target) -> Float64[np.ndarray, " V"]:
     """The share of each picture that a target's ball fills."""
     pixels, depths = (part[:, 0] for part in cameras.project(target.center[None], min_depth=CONSTANTS.min_frame_depth))
     radius = target.radius * cameras.Ks[:, 0, 0] / np.maximum(depths, CONSTANTS.min_frame_depth)
@@ -81,7 +83,7 @@ def _filled(cameras: Cameras, target: Target) -> Float64[np.ndarray, " V"]:
     return np.where(depths > -target.radius, filled, 0)
 
 
-def _open(
+def _open_fraction(
     cameras: Cameras, views: Int64[np.ndarray, " n"], points: Float64[np.ndarray, "p 3"], free: FreeSpace
 ) -> Float64[np.ndarray, " n"]:
     """The share of points that are in each picture with nothing between."""

@@ -1,4 +1,4 @@
-"""Where a camera can stand: what is known to be empty, how far away surfaces are, what a ray meets."""
+"""Free space for cameras: cells that are known to be empty, distances to surfaces, ray casting."""
 
 from copy import copy
 

@@ -1,4 +1,4 @@
-"""Numbered marks on what was found, by which a VLM can name it (Yang et al. 2023, "Set-of-Mark prompting")."""
+"""Numbered marks on targets, by which a VLM can refer to them (Yang et al. 2023, "Set-of-Mark prompting")."""
 
 import math
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from gsencoder.infer.draw.pictures import ink_on, label_font
 from gsencoder.infer.views.targets import Target
 from gsencoder.render import Blend
 
-SOLID = 0.5
+SOLID_WEIGHT = 0.5
 """A pixel shows a target from so much weight on."""
-LEAST_PIXELS = 12
+MIN_MARKED_PIXELS = 12
 """A target is marked where so many pixels show it."""
-COVERED = 0.25
+MAX_MARK_COVER = 0.25
 """A disc stands on its target if it hides no more of it than that, and beside it otherwise."""
 DIRECTIONS = 8
 """Ways from a target to places beside it."""
@@ -45,10 +45,10 @@ def draw_marks(
     for number, target in enumerate(targets, start=1):
         member = torch.zeros(blended.gaussians)
         member[torch.from_numpy(np.asarray(target.rows, np.int64))] = 1
-        shown = blended.render(member).reshape(blended.shape).numpy() >= SOLID
-        if shown.sum() >= LEAST_PIXELS:
-            taken = [disc for _, disc in placed.values()]
-            placed[number] = _place(shown, radius, taken)
+        shown = blended.render(member).reshape(blended.shape).numpy() >= SOLID_WEIGHT
+        if shown.sum() >= MIN_MARKED_PIXELS:
+            photograph_at = [disc for _, disc in placed.values()]
+            placed[number] = _mark_position(shown, radius, photograph_at)
     draw = ImageDraw.Draw(image)
     for number, (on, (x, y)) in placed.items():
         draw.line((*on, x, y), fill=(255, 255, 255), width=4)
@@ -60,15 +60,15 @@ def draw_marks(
     return np.asarray(image), frozenset(placed)
 
 
-def _place(
-    shown: Bool[np.ndarray, "h w"], radius: int, taken: Sequence[tuple[float, float]]
+def _mark_position(
+    shown: Bool[np.ndarray, "h w"], radius: int, photograph_at: Sequence[tuple[float, float]]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """The pixel of a target that its mark means, and where its disc stands; x and y of each."""
     pixels = np.argwhere(shown)[:, ::-1] + 0.5
     on = pixels[np.linalg.norm(pixels - pixels.mean(axis=0), axis=1).argmin()]
     size = np.array([shown.shape[1], shown.shape[0]], np.float64)
     inner = np.minimum(radius + 1.0, size / 2)
-    places = [on] if math.pi * radius**2 <= COVERED * len(pixels) else []
+    places = [on] if math.pi * radius**2 <= MAX_MARK_COVER * len(pixels) else []
     half = (pixels.max(axis=0) - pixels.min(axis=0)) / 2
     middle = (pixels.max(axis=0) + pixels.min(axis=0)) / 2
     for ring in (1.5, 4.0, 6.5):
@@ -76,11 +76,11 @@ def _place(
             way = np.array([math.cos(turn), math.sin(turn)])
             places.append(middle + way * (np.minimum(half, 4 * radius) + ring * radius))
     inside = [np.clip(place, inner, size - inner) for place in places]
-    others = np.array(taken, np.float64).reshape(-1, 2)
+    others = np.array(photograph_at, np.float64).reshape(-1, 2)
 
     def faults(place: Float64[np.ndarray, "2"]) -> tuple[bool, bool]:
         near = np.linalg.norm(others - place, axis=1).min(initial=math.inf) < 2 * radius + 2
-        return bool(near), bool((np.linalg.norm(pixels - place, axis=1) <= radius).mean() > COVERED)
+        return bool(near), bool((np.linalg.norm(pixels - place, axis=1) <= radius).mean() > MAX_MARK_COVER)
 
     # Of equal places the first: on the target, then nearest to it.
     x, y = min(inside, key=faults)

@@ -1,4 +1,4 @@
-"""Photographs for the frames of a scene whose features were kept without them, and what cameras show of them."""
+"""Photographs for the frames of a scene that was stored without them, and windows cut from them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,12 +14,12 @@ from gsencoder.types import Cameras, Scene, Views
 ANGLE, PLACE = 0.01, 1e-3
 """How far two readings of one camera may be from each other: radians or parts of a focal length, and parts of the
 distance between cameras."""
-TOLD = 3
-ROUNDED = 0.5
+MAX_NAMED = 3
+POSE_TOLERANCE_PIXELS = 0.5
 """A window that ends so near to the photograph's edges is all of it, pixels: sizes of smaller frames are rounded."""
 
 
-class Photographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
+class FramePhotographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
     """Pictures of a scene in the order and the sizes of other cameras, read on access."""
 
     def __init__(self, views: Views, rows: Int64[np.ndarray, " n"], cameras: Cameras) -> None:
@@ -30,11 +30,11 @@ class Photographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
-            return Photographs(self._views, self._rows[index], self._cameras.select(index))
+            return FramePhotographs(self._views, self._rows[index], self._cameras.select(index))
         size = int(self._cameras.widths[index]), int(self._cameras.heights[index])
-        return resized_picture(self.taken(index), size)
+        return resized_picture(self.photograph_at(index), size)
 
-    def taken(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    def photograph_at(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         """A picture in the size that it was taken in."""
         assert self._views.images is not None
         return self._views.images[int(self._rows[index])]
@@ -42,13 +42,13 @@ class Photographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
     @property
     def cameras(self) -> Cameras:
         """The cameras in the sizes that the pictures were taken in."""
-        taken = self._views.cameras.select(self._rows)
-        return self._cameras.resized_to(taken.widths, taken.heights)
+        photograph_at = self._views.cameras.select(self._rows)
+        return self._cameras.resized_to(photograph_at.widths, photograph_at.heights)
 
 
 def photograph_cameras(views: Views) -> Cameras:
     """The cameras of views in the sizes that their photographs were taken in."""
-    return views.images.cameras if isinstance(views.images, Photographs) else views.cameras
+    return views.images.cameras if isinstance(views.images, FramePhotographs) else views.cameras
 
 
 def resized_picture(picture: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
@@ -67,50 +67,52 @@ def photograph_of(views: Views, frame: int, cameras: Cameras, view: int) -> UInt
         view: which of these.
     """
     assert views.images is not None
-    picture = views.images.taken(frame) if isinstance(views.images, Photographs) else views.images[frame]
+    picture = views.images.photograph_at(frame) if isinstance(views.images, FramePhotographs) else views.images[frame]
     image = Image.fromarray(picture)
     own, other = views.cameras.Ks[frame].astype(np.float64), cameras.Ks[view].astype(np.float64)
     size = np.array([cameras.widths[view], cameras.heights[view]])
     # Pixels of the frame's camera: where the window begins, and how large it is; then pixels as they were taken.
     zoom = np.diag(own)[:2] / np.diag(other)[:2]
     begins = own[:2, 2] - zoom * other[:2, 2]
-    taken = np.array(image.size) / (views.cameras.widths[frame], views.cameras.heights[frame])
-    low, high = (np.clip(taken * edge, 0, image.size) for edge in (begins, begins + zoom * size))
-    if max(np.abs(low).max(), np.abs(high - image.size).max()) < ROUNDED:
+    photograph_at = np.array(image.size) / (views.cameras.widths[frame], views.cameras.heights[frame])
+    low, high = (np.clip(photograph_at * edge, 0, image.size) for edge in (begins, begins + zoom * size))
+    if max(np.abs(low).max(), np.abs(high - image.size).max()) < POSE_TOLERANCE_PIXELS:
         return resized_picture(picture, tuple(size.tolist()))
     return np.asarray(image.resize(tuple(size.tolist()), Image.Resampling.LANCZOS, box=(*low, *high)))
 
 
-def with_photographs(scene: Scene, taken: Scene) -> Scene:
+def with_photographs(scene: Scene, photographed: Scene) -> Scene:
     """A scene whose frames have the photographs that another reading of it has.
 
     Args:
         scene: with cameras; their names say which photograph is whose.
-        taken: the same scene with its photographs, and perhaps more of them, in whatever size.
+        photographed: the same scene with its photographs, and perhaps more of them, in whatever size.
 
     Raises:
         InputError: cameras or photographs are missing, or the cameras of a name are not the same.
     """
     if scene.views is None or not len(scene.views):
         raise InputError(f"photos: the features of {scene.name} have no cameras that photographs could belong to")
-    if taken.views is None or taken.views.images is None:
-        raise InputError(f"photos: scene {taken.name} has no photographs")
-    place = {name: row for row, name in enumerate(taken.views.names)}
+    if photographed.views is None or photographed.views.images is None:
+        raise InputError(f"photos: scene {photographed.name} has no photographs")
+    place = {name: row for row, name in enumerate(photographed.views.names)}
     missing = [name for name in scene.views.names if name not in place]
     if missing:
         raise InputError(
-            f"photos: scene {taken.name} has no photograph of {len(missing)} of {len(scene.views)} frames: "
-            f"{listed(missing, TOLD)}"
+            f"photos: scene {photographed.name} has no photograph of {len(missing)} of {len(scene.views)} frames: "
+            f"{listed(missing, MAX_NAMED)}"
         )
     rows = np.array([place[name] for name in scene.views.names], np.int64)
-    own, other = scene.views.cameras, taken.views.cameras.select(rows)
-    apart = [scene.views.names[view] for view in np.flatnonzero(_differ(own, other, taken.origin - scene.origin))]
+    own, other = scene.views.cameras, photographed.views.cameras.select(rows)
+    apart = [
+        scene.views.names[view] for view in np.flatnonzero(_differ(own, other, photographed.origin - scene.origin))
+    ]
     if apart:
         raise InputError(
-            f"photos: the cameras of scene {taken.name} are not those of the features: {len(apart)} of "
-            f"{len(scene.views)} differ, {listed(apart, TOLD)}; give the scene that the features were made from"
+            f"photos: the cameras of scene {photographed.name} are not those of the features: {len(apart)} of "
+            f"{len(scene.views)} differ, {listed(apart, MAX_NAMED)}; give the scene that the features were made from"
         )
-    return replace(scene, views=replace(scene.views, images=Photographs(taken.views, rows, own)))
+    return replace(scene, views=replace(scene.views, images=FramePhotographs(photographed.views, rows, own)))
 
 
 def _differ(own: Cameras, other: Cameras, offset: np.ndarray) -> np.ndarray:

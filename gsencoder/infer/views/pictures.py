@@ -1,4 +1,4 @@
-"""Chosen views as pictures: plain ones to show to a VLM, and a sheet for people that says why."""
+"""Selected views as pictures: plain ones for a VLM, and an annotated sheet for people."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,21 +8,21 @@ from gsencoder.core.errors import InputError
 from gsencoder.infer.draw.pictures import Picture, contact_sheet, draw_boxes
 from gsencoder.infer.views.marks import draw_marks
 from gsencoder.infer.views.photographs import photograph_of
-from gsencoder.infer.views.selection import Chosen, ViewSet
+from gsencoder.infer.views.selection import SelectedView, ViewSet
 from gsencoder.infer.views.targets import Target
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import render_image
 from gsencoder.types import Box, Scene
 
 PictureKind = Literal["photograph", "render"]
-LEAST_TOLD = 0.0005
+MIN_DESCRIBED_SHARE = 0.0005
 """Smaller shares of a picture are not told."""
 
 
 def picture_kinds(scene: Scene, views: ViewSet) -> tuple[PictureKind, ...]:
     """What shows each chosen view: the photograph, where it is a frame of a scene that has photographs, or a render."""
-    taken = scene.views is not None and scene.views.images is not None
-    return tuple("photograph" if taken and each.frame is not None else "render" for each in views.chosen)
+    photograph_at = scene.views is not None and scene.views.images is not None
+    return tuple("photograph" if photograph_at and each.frame is not None else "render" for each in views.chosen)
 
 
 def view_pictures(
@@ -80,13 +80,13 @@ def view_sheet(
         draw_boxes(picture, boxes, pose, K, origin=scene.origin)
         for picture, pose, K in zip(pictures, views.cameras.cam_from_world, views.cameras.Ks, strict=True)
     ]
-    titles = [f"{number}  {told(each)}" for number, each in enumerate(views.chosen)]
+    titles = [f"{number}  {describe_view(each)}" for number, each in enumerate(views.chosen)]
     return contact_sheet(drawn, titles, columns=columns)
 
 
-def told(chosen: Chosen) -> str:
+def describe_view(chosen: SelectedView) -> str:
     """A view in a line."""
-    shown = [sight for sight in chosen.sights if sight.share >= LEAST_TOLD]
+    shown = [sight for sight in chosen.sights if sight.share >= MIN_DESCRIBED_SHARE]
     sights = "; ".join(
         f"{sight.target} fills {sight.share:{'.0%' if sight.share >= 0.01 else '.1%'}}, "
         f"{sight.visible * sight.inside:.0%} of it seen"

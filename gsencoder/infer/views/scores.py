@@ -1,4 +1,4 @@
-"""What cameras really see of a target: small renders, occlusion included."""
+"""Scores of cameras by small renders: what they show of a target, occlusion included."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from gsencoder.types import Cameras, Gaussians
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Looks:
+class ViewScores:
     """What each of V cameras sees of one target.
 
     Attributes:
@@ -41,14 +41,14 @@ class Looks:
     context: Float32[np.ndarray, "V m"]
 
 
-def look(
+def score_views(
     gaussians: Gaussians,
     cameras: Cameras,
     targets: Sequence[Target],
     *,
     side: int = 160,
     config: BlendConfig = CONSTANTS.score_blend,
-) -> tuple[Looks, ...]:
+) -> tuple[ViewScores, ...]:
     """Judges cameras by small renders, one for each, in which every Gaussian hides what is behind it.
 
     Args:
@@ -61,9 +61,9 @@ def look(
     if not targets:
         return ()
     small = cameras.resized(side)
-    watched = [_Watched(gaussians, target) for target in targets]
+    watched = [_TargetProbe(gaussians, target) for target in targets]
 
-    def one(view: int) -> list[_Seen]:
+    def one(view: int) -> list[_TargetInView]:
         b = blend(gaussians, small, view, config=config)
         # Pixels that each Gaussian fills.
         weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians))
@@ -71,16 +71,18 @@ def look(
 
     # Whole views share the threads out better than parts of small ones.
     found = parallel(one, range(len(cameras)))
-    return tuple(_together([each[place] for each in found]) for place in range(len(targets)))
+    return tuple(_stack_scores([each[place] for each in found]) for place in range(len(targets)))
 
 
-def as_photographs(looks: Looks, taken: Bool[np.ndarray, " V"]) -> Looks:
+def replace_with_photographs(looks: ViewScores, photograph_at: Bool[np.ndarray, " V"]) -> ViewScores:
     """Looks where some cameras are shown as photographs: sharp and solid, however rough the splat is."""
-    return replace(looks, alpha=np.where(taken, 1.0, looks.alpha), blur=np.where(taken, 0.0, looks.blur))
+    return replace(
+        looks, alpha=np.where(photograph_at, 1.0, looks.alpha), blur=np.where(photograph_at, 0.0, looks.blur)
+    )
 
 
-class _Seen(NamedTuple):
-    """What one camera sees of one target; see `Looks`."""
+class _TargetInView(NamedTuple):
+    """What one camera sees of one target; see `ViewScores`."""
 
     visible: float
     share: float
@@ -91,14 +93,14 @@ class _Seen(NamedTuple):
     context: Float32[np.ndarray, " m"]
 
 
-def _together(seen: Sequence[_Seen]) -> Looks:
+def _stack_scores(seen: Sequence[_TargetInView]) -> ViewScores:
     """All cameras' sight of one target."""
-    values = {name: np.array([getattr(each, name) for each in seen], np.float64) for name in _Seen._fields[:5]}
+    values = {name: np.array([getattr(each, name) for each in seen], np.float64) for name in _TargetInView._fields[:5]}
     target, context = (np.stack([getattr(each, name) for each in seen]) for name in ("target", "context"))
-    return Looks(**values, target=target, context=context)
+    return ViewScores(**values, target=target, context=context)
 
 
-class _Watched:
+class _TargetProbe:
     """A target, and what is needed again for every camera that looks at it."""
 
     def __init__(self, gaussians: Gaussians, target: Target) -> None:
@@ -115,7 +117,7 @@ class _Watched:
 
     def seen(
         self, b: Blend, weights: Float64[np.ndarray, " N"], small: Cameras, view: int, config: BlendConfig
-    ) -> _Seen:
+    ) -> _TargetInView:
         """What a camera sees of it."""
         alone = blend(self._alone, small, view, config=config).alpha
         shown = b.render(self._member)
@@ -127,7 +129,7 @@ class _Watched:
         pixels = float(small.Ks[view, 0, 0]) * self._sizes / np.maximum(depths, config.near)
         target, context = (weights[rows].astype(np.float32) for rows in self._samples)
         inside = small.in_image(*small.project(self._alone.means.astype(np.float64), view), view)
-        return _Seen(
+        return _TargetInView(
             visible=min(float(shown[solid].sum()) / whole, 1.0) if whole > CONSTANTS.min_weight else 0.0,
             share=float(shown.mean()),
             inside=float(inside.mean()),

@@ -1,4 +1,4 @@
-"""What is asked of a choice of views, and what comes of it."""
+"""Settings and result of a choice of views."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -6,10 +6,10 @@ from typing import Literal
 from gsencoder.core.errors import InputError
 from gsencoder.types import Cameras
 
-MOST_CANDIDATES = 4096
-MOST_PIXELS = 8192
-MOST_WEIGHT = 1e6
-WIDEST = 120.0
+MAX_CANDIDATES = 4096
+MAX_PIXELS = 8192
+MAX_WEIGHT = 1e6
+MAX_FOV = 120.0
 """Gaussians are projected as if the picture were flat around each; degrees up to which that looks right."""
 JUDGED_SIDES = (40, 1024)
 """Smaller pictures show small targets too large, because no Gaussian is drawn smaller than a pixel; larger ones cost
@@ -45,22 +45,22 @@ class ViewsConfig:
     spread_weight: float = field(default=0.2, metadata={"help": "what seeing it from many directions is worth"})
 
     def __post_init__(self) -> None:
-        if self.count < 1 or not 1 <= self.candidates <= MOST_CANDIDATES:
+        if self.count < 1 or not 1 <= self.candidates <= MAX_CANDIDATES:
             raise InputError(
-                f"count, candidates: expected 1 or more, and at most {MOST_CANDIDATES} candidates, "
+                f"count, candidates: expected 1 or more, and at most {MAX_CANDIDATES} candidates, "
                 f"got {self.count}, {self.candidates}"
             )
         if self.method == "uniform" and self.source == "shells":
             raise InputError("source: expected frames or both with method=uniform, which spreads frames evenly")
         if self.method == "greedy" and self.count > self.candidates:
             raise InputError(f"count: expected 1 to candidates={self.candidates}, got {self.count}")
-        if not (1 <= self.width <= MOST_PIXELS and 1 <= self.height <= MOST_PIXELS and 1 <= self.fov <= WIDEST):
+        if not (1 <= self.width <= MAX_PIXELS and 1 <= self.height <= MAX_PIXELS and 1 <= self.fov <= MAX_FOV):
             raise InputError(
-                f"width, height, fov: expected at most {MOST_PIXELS} pixels and 1 to {WIDEST} degrees, "
+                f"width, height, fov: expected at most {MAX_PIXELS} pixels and 1 to {MAX_FOV} degrees, "
                 f"got {self.width}, {self.height}, {self.fov}"
             )
-        if not 1 <= self.frame_side <= MOST_PIXELS:
-            raise InputError(f"frame_side: expected 1 to {MOST_PIXELS} pixels, got {self.frame_side}")
+        if not 1 <= self.frame_side <= MAX_PIXELS:
+            raise InputError(f"frame_side: expected 1 to {MAX_PIXELS} pixels, got {self.frame_side}")
         if not JUDGED_SIDES[0] <= self.judged_side <= JUDGED_SIDES[1]:
             raise InputError(
                 f"judged_side: expected {JUDGED_SIDES[0]} to {JUDGED_SIDES[1]} pixels, got {self.judged_side}"
@@ -70,18 +70,18 @@ class ViewsConfig:
                 f"least_share, most_share: expected shares that rise, got {self.least_share}, {self.most_share}"
             )
         for name in ("cover_weight", "context_weight", "spread_weight"):
-            if not 0 <= getattr(self, name) <= MOST_WEIGHT:
-                raise InputError(f"{name}: expected 0 to {MOST_WEIGHT:g}, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) <= MAX_WEIGHT:
+                raise InputError(f"{name}: expected 0 to {MAX_WEIGHT:g}, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sight:
-    """What one view shows of one target; see `view_judge.Looks`.
+class TargetScore:
+    """What one view shows of one target; see `ViewScores`.
 
     Attributes:
         target: its name.
-        visible, share, inside, alpha, blur: as judged; alpha 1 and blur 0 where a photograph is shown.
-        worth: what these come to, 0 to 1.
+        visible, share, inside, alpha, blur: as in `ViewScores`; alpha 1 and blur 0 where a photograph is shown.
+        utility: of the view for this target alone, 0 to 1.
     """
 
     target: str
@@ -90,11 +90,11 @@ class Sight:
     inside: float
     alpha: float
     blur: float
-    worth: float
+    utility: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Chosen:
+class SelectedView:
     """Why a view was chosen.
 
     Attributes:
@@ -112,7 +112,7 @@ class Chosen:
     clearance: float
     gain: float | None
     covered: float | None
-    sights: tuple[Sight, ...]
+    sights: tuple[TargetScore, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,7 +127,7 @@ class ViewSet:
     """
 
     cameras: Cameras
-    chosen: tuple[Chosen, ...]
+    chosen: tuple[SelectedView, ...]
     judged: int
     near: float
 

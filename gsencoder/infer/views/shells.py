@@ -1,4 +1,4 @@
-"""Cameras that could look at a target, on shells around it."""
+"""Candidate cameras on shells around a target."""
 
 import math
 
@@ -63,14 +63,14 @@ def shell_cameras(
     tried = np.flatnonzero(good)
     if not len(tried):
         return looking_cameras(centers[tried], -outward[tried], vertical, focal, width, height)
-    backed = _backed(target, centers[tried], vertical, free)
+    backed = _background_fraction(target, centers[tried], vertical, free)
     enough = np.sort(backed)[::-1][min(count, len(backed)) - 1]
     kept = tried[backed >= enough]
     kept = kept[evenly(len(kept), count)]
     return looking_cameras(centers[kept], -outward[kept], vertical, focal, width, height)
 
 
-def _backed(
+def _background_fraction(
     target: Target, centers: Float64[np.ndarray, "n 3"], vertical: Float64[np.ndarray, "3"], free: FreeSpace
 ) -> Float64[np.ndarray, " n"]:
     """Share of the rays through a target, and beside it, that end at something, for each camera. They begin before the

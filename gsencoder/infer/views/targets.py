@@ -1,4 +1,4 @@
-"""What views are chosen for: the Gaussians of boxes that were found."""
+"""Targets of a choice of views: the Gaussians of boxes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

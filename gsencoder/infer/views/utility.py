@@ -1,8 +1,8 @@
-"""What views are worth, by themselves and together.
+"""The utility of views, by themselves and as a set.
 
-The worth of a set is a sum with diminishing returns: of what each view shows by itself (`worth`), of how well the
-targets' Gaussians and their surroundings are covered, and of how spread the directions are. The greedy choice is then
-within 1 − 1/e of the best one (Nemhauser, Wolsey and Fisher 1978).
+The utility of a set is a sum with diminishing returns: of what each view shows by itself (`view_utility`), of how well
+the targets' Gaussians and their surroundings are covered, and of how spread the directions are. The greedy choice is
+then within 1 − 1/e of the best one (Nemhauser, Wolsey and Fisher 1978).
 """
 
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.infer.views.constants import CONSTANTS
-from gsencoder.infer.views.scores import Looks, coverage, directions
+from gsencoder.infer.views.scores import ViewScores, coverage, directions
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras
 
 
-def worth(looks: Looks, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
-    """What each view is worth for one target by itself, 0 to 1.
+def view_utility(looks: ViewScores, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
+    """Utility of each view for one target by itself, 0 to 1.
 
     Half comes from filling at least `least_share` of the picture, in proportion below it, half from filling up to half
     of `most_share`; a target that fills more than `most_share` counts less. All of it is scaled by how much of the
@@ -33,26 +33,26 @@ def worth(looks: Looks, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
     return np.asarray(size * sharp * looks.visible * (0.5 + 0.5 * looks.inside) * alpha**2)
 
 
-class Values:
-    """What sets of candidates are worth."""
+class CoverageObjective:
+    """The utility of sets of candidates, and its greedy maximization."""
 
     def __init__(
-        self, cameras: Cameras, targets: Sequence[Target], looks: Sequence[Looks], config: ViewsConfig
+        self, cameras: Cameras, targets: Sequence[Target], looks: Sequence[ViewScores], config: ViewsConfig
     ) -> None:
-        self.worths = [worth(each, config) for each in looks]
+        self.utilities = [view_utility(each, config) for each in looks]
         self._count = config.count
         self._weights = (config.cover_weight, config.context_weight, config.spread_weight)
-        self._kept = []
-        for target, each, value in zip(targets, looks, self.worths, strict=True):
+        self._terms = []
+        for target, each, value in zip(targets, looks, self.utilities, strict=True):
             # How well a view sees something counts as far as it is a good view.
             good = (value / max(float(value.max(initial=0)), CONSTANTS.min_best_utility))[:, None]
             away = directions(cameras, target)
             towards = np.clip(away @ away.T, 0, 1)
-            self._kept.append((coverage(each.target) * good, coverage(each.context) * good, towards * good))
+            self._terms.append((coverage(each.target) * good, coverage(each.context) * good, towards * good))
         self._raw = [coverage(each.target) for each in looks]
 
     def covered(self, views: Int64[np.ndarray, " n"]) -> float | None:
-        """How well views show the targets' Gaussians together; see `Chosen`."""
+        """How well views show the targets' Gaussians together; see `SelectedView`."""
         if not self._raw:
             return None
         return float(np.mean([raw[views].max(axis=0).mean() for raw in self._raw]))
@@ -60,26 +60,26 @@ class Values:
     def of(self, views: Sequence[int] | Int64[np.ndarray, " n"]) -> float:
         """What a set is worth: the sum that `greedy` makes large."""
         chosen = list(views)
-        value = float(np.mean([worth[chosen].sum() for worth in self.worths]) / self._count)
-        for parts in self._kept:
+        value = float(np.mean([view_utility[chosen].sum() for view_utility in self.utilities]) / self._count)
+        for parts in self._terms:
             for weight, part in zip(self._weights, parts, strict=True):
                 if part.shape[1]:
-                    value += weight / len(self._kept) * float(part[chosen].max(axis=0).mean())
+                    value += weight / len(self._terms) * float(part[chosen].max(axis=0).mean())
         return value
 
     def greedy(self, count: int) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
         """Views in the order of their gains, and these; of equal ones the first. Those that add nothing are left out,
         but for the first."""
-        modular = np.mean(self.worths, axis=0) / self._count
-        best = [[np.zeros(part.shape[1]) for part in parts] for parts in self._kept]
+        modular = np.mean(self.utilities, axis=0) / self._count
+        best = [[np.zeros(part.shape[1]) for part in parts] for parts in self._terms]
         order: list[int] = []
         gains: list[float] = []
         for _ in range(min(count, len(modular))):
             gain = modular.copy()
-            for parts, now in zip(self._kept, best, strict=True):
+            for parts, now in zip(self._terms, best, strict=True):
                 for weight, part, level in zip(self._weights, parts, now, strict=True):
                     if weight and part.shape[1]:
-                        gain += weight / len(self._kept) * np.maximum(part - level, 0).mean(axis=1)
+                        gain += weight / len(self._terms) * np.maximum(part - level, 0).mean(axis=1)
             gain[order] = -np.inf
             view = int(gain.argmax())
             if order and gain[view] <= max(CONSTANTS.min_relative_gain * gains[0], CONSTANTS.min_gain / self._count):
@@ -88,6 +88,6 @@ class Values:
             gains.append(float(gain[view]))
             best = [
                 [np.maximum(level, part[view]) for part, level in zip(parts, now, strict=True)]
-                for parts, now in zip(self._kept, best, strict=True)
+                for parts, now in zip(self._terms, best, strict=True)
             ]
         return np.array(order, np.int64), np.array(gains)

@@ -9,11 +9,24 @@ from PIL import Image
 
 from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.views.pictures import picture_kinds, view_sheet
-from gsencoder.infer.views.selection import ViewSet
+from gsencoder.infer.views.selection import TargetScore, ViewSet
 from gsencoder.types import Box, Scene
 from gsencoder.types.poses import move_origin
 
 SHEET = "sheet.png"
+
+
+def score_to_json(score: TargetScore) -> dict[str, Any]:
+    """What a view shows of a target, under the keys of views.json."""
+    return {
+        "target": score.target,
+        "visible": score.visible,
+        "share": score.share,
+        "inside": score.inside,
+        "alpha": score.alpha,
+        "blur": score.blur,
+        "worth": score.utility,
+    }
 
 
 def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
@@ -31,9 +44,7 @@ def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
                 "clearance": each.clearance,
                 "gain": each.gain,
                 "covered": each.covered,
-                "sights": [
-                    {name: getattr(sight, name) for name in type(sight).__dataclass_fields__} for sight in each.sights
-                ],
+                "sights": [score_to_json(score) for score in each.sights],
                 "cam_from_world": pose.tolist(),
                 "K": views.cameras.Ks[number].tolist(),
                 "width": int(views.cameras.widths[number]),
