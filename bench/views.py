@@ -134,9 +134,9 @@ def main() -> None:
                 seconds[count].append(time.perf_counter() - start)
                 covered[count].append(views.chosen[-1].covered)
                 shells[count].append(measured(scene, target, views))
-                describe_view = {name: int(good.sum()) for name, good in shells[count][-1].items()}
+                told = {name: int(good.sum()) for name, good in shells[count][-1].items()}
                 print(
-                    f"{scene.name} {target.name}: {len(views)} of {views.judged} of {count}, {describe_view}; "
+                    f"{scene.name} {target.name}: {len(views)} of {views.judged} of {count}, {told}; "
                     f"frames {frames['greedy'][-1]:.3f}, {frames['uniform'][-1]:.3f}",
                     flush=True,
                 )
@@ -147,14 +147,14 @@ def main() -> None:
         )
     for count in counts:
         total = len(shells[count]) + len(failed[count])
-        describe_view = []
+        told = []
         for name in ("visible", "share", "alpha", "free"):
             enough = sum(each[name].sum() >= COUNT - 1 for each in shells[count])
             mean = np.concatenate([each[name] for each in shells[count]]).mean()
-            describe_view.append(f"{name} {enough / total:.2f} ({mean:.3f} of views)")
+            told.append(f"{name} {enough / total:.2f} ({mean:.3f} of views)")
         every = sum(np.logical_and.reduce(list(each.values())).sum() >= COUNT - 1 for each in shells[count])
         print(
-            f"shells of {count}: in 7 of 8 views {', '.join(describe_view)}; all of it {every / total:.2f} of "
+            f"shells of {count}: in 7 of 8 views {', '.join(told)}; all of it {every / total:.2f} of "
             f"{total} objects; "
             f"covered {np.mean(covered[count]):.3f}; {np.median(seconds[count]):.2f} s, most {max(seconds[count]):.2f}"
         )

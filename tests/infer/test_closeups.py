@@ -56,10 +56,10 @@ def test_a_close_up_shows_each_point_where_the_photograph_has_it() -> None:
         shown = ((at > 2) & (at < np.array([318, 238]))).all(axis=1)
         assert shown.mean() > 0.9
         column, row = at[shown].astype(int).T
-        describe_view = picture[row, column]
+        told = picture[row, column]
         wanted = places(scene.views.cameras, int(frame), points[shown]) / (64, 48) * 255
-        assert np.abs(describe_view[:, :2] - wanted).max() < 2
-        assert (describe_view[:, 2] == 20 * frame).all()
+        assert np.abs(told[:, :2] - wanted).max() < 2
+        assert (told[:, 2] == 20 * frame).all()
 
 
 def test_windows_keep_their_shape_stay_in_the_frame_and_leave_room_around_the_target() -> None:

@@ -96,9 +96,9 @@ def status(code: int, message: str) -> Callable[[Handler, Any], None]:
     ],
 )
 def test_each_fault_of_a_server_is_an_error_in_its_own_words(
-    behave: Callable[[Handler, Any], None], describe_view: str, stream: bool
+    behave: Callable[[Handler, Any], None], told: str, stream: bool
 ) -> None:
-    with serving(behave) as server, pytest.raises(InputError, match=describe_view):
+    with serving(behave) as server, pytest.raises(InputError, match=told):
         ask(server.url, stream=stream, timeout=0.5)
 
 
@@ -129,7 +129,7 @@ def test_answers_that_are_none_are_errors(value: Any) -> None:
         (events("fine") + b'data: {"error": {"message": "GPU fell over"}}\n\n', "GPU fell over|^$"),
     ],
 )
-def test_streams_that_end_early_are_errors(data: bytes, describe_view: str) -> None:
+def test_streams_that_end_early_are_errors(data: bytes, told: str) -> None:
     def behave(handler: Handler, _: Any) -> None:
         handler.raw(200, data, "text/event-stream")
 
@@ -138,7 +138,7 @@ def test_streams_that_end_early_are_errors(data: bytes, describe_view: str) -> N
             # What follows the end is not waited for.
             assert ask(server.url).text == "fine"
         else:
-            with pytest.raises(InputError, match=describe_view):
+            with pytest.raises(InputError, match=told):
                 ask(server.url)
 
 
@@ -208,12 +208,10 @@ def finished(finish: str, **message: Any) -> dict[str, Any]:
         (finished("length", content="", reasoning_content="hmm"), "empty .*it thought until vlm.max_tokens"),
     ],
 )
-def test_answers_that_a_model_keeps_back_are_about_the_question_and_not_the_server(
-    whole: Any, describe_view: str
-) -> None:
+def test_answers_that_a_model_keeps_back_are_about_the_question_and_not_the_server(whole: Any, told: str) -> None:
     with (
         serving(lambda handler, _: handler.reply(200, whole)) as server,
-        pytest.raises(InputError, match=describe_view) as error,
+        pytest.raises(InputError, match=told) as error,
     ):
         ask(server.url, stream=False)
     assert not isinstance(error.value, ServerError)
@@ -347,14 +345,14 @@ def test_prompts_hold_the_question_and_the_names_of_the_marks() -> None:
 
 
 def test_prompts_say_what_the_pictures_are() -> None:
-    describe_view = {
+    told = {
         kinds: prompt_text("answer", "x", [], marks=(), kinds=kinds).splitlines()[0]
         for kinds in (("render",) * 2, ("photograph",) * 2, ("render", "photograph"))
     }
-    assert "They are rendered" in describe_view[("render",) * 2]
-    assert "They are photographs" in describe_view[("photograph",) * 2]
-    assert "Some are photographs" in describe_view[("render", "photograph")]
-    assert "black" not in describe_view[("photograph",) * 2]
+    assert "They are rendered" in told[("render",) * 2]
+    assert "They are photographs" in told[("photograph",) * 2]
+    assert "Some are photographs" in told[("render", "photograph")]
+    assert "black" not in told[("photograph",) * 2]
 
 
 @pytest.mark.parametrize(
@@ -368,9 +366,9 @@ def test_prompts_say_what_the_pictures_are() -> None:
     ],
 )
 def test_prompts_without_what_they_need_are_refused(
-    task: Any, question: str, names: list[str], marked: bool, describe_view: str
+    task: Any, question: str, names: list[str], marked: bool, told: str
 ) -> None:
-    with pytest.raises(InputError, match=describe_view):
+    with pytest.raises(InputError, match=told):
         prompt_text(task, question, names, marks=(1,) if marked else (), kinds=RENDERS)
 
 

@@ -320,11 +320,11 @@ def test_frames_of_a_film_are_taken_from_all_along_it() -> None:
     turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     film = around(np.array([0.3, 0.2, 0.8]), 1.0 + 0.3 * np.abs(turns - np.pi) / np.pi, turns)
     free = FreeSpace(scene.gaussians).without(target.rows)
-    photograph_at = frames_on(film, scene.gaussians, [target], 16, [free])
-    assert len(photograph_at) == 16
-    assert len(np.unique(photograph_at)) == 16
+    taken = frames_on(film, scene.gaussians, [target], 16, [free])
+    assert len(taken) == 16
+    assert len(np.unique(taken)) == 16
     # The nearest stand together on one side.
-    assert np.ptp(turns[photograph_at]) > 0.8
+    assert np.ptp(turns[taken]) > 0.8
 
 
 def test_targets_take_turns_at_the_frames() -> None:
@@ -335,11 +335,11 @@ def test_targets_take_turns_at_the_frames() -> None:
     cameras = joined(around(large.center, np.full(20, 1.2), at), around(target.center, np.full(20, 1.2), at))
     free = FreeSpace(scene.gaussians)
     spaces = [free.without(each.rows) for each in (large, target)]
-    photograph_at = frames_on(cameras, scene.gaussians, [large, target], 8, spaces)
-    assert len(photograph_at) == 8
+    taken = frames_on(cameras, scene.gaussians, [large, target], 8, spaces)
+    assert len(taken) == 8
     for each, space in zip((large, target), spaces, strict=True):
         (best,) = frames_on(cameras, scene.gaussians, [each], 1, [space])
-        assert best in photograph_at
+        assert best in taken
 
 
 def test_views_that_add_nothing_are_left_out_and_that_is_said() -> None:

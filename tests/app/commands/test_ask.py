@@ -216,12 +216,12 @@ def test_questions_in_another_language_have_its_words() -> None:
     ],
 )
 def test_what_cannot_be_asked_ends_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], describe_view: str
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
 ) -> None:
     assert ask(features, tmp_path / "out", *words) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1
-    assert describe_view in lines[0]
+    assert told in lines[0]
     assert not (tmp_path / "out").exists()
 
 
@@ -252,10 +252,10 @@ def test_a_batch_that_a_fault_ends_keeps_its_answers_and_goes_on(
     with serving(fails_at_the_third) as server:
         words = (f"questions={file}", f"vlm.base_url={server.url}")
         assert ask(features, out, *words) == 2
-        describe_view = capsys.readouterr().err
-        assert "question 7: the server" in describe_view
-        assert "fell over" in describe_view
-        assert "2 of 3 answers are kept in" in describe_view
+        told = capsys.readouterr().err
+        assert "question 7: the server" in told
+        assert "fell over" in told
+        assert "2 of 3 answers are kept in" in told
         assert not out.exists()
         kept = read_answers(tmp_path / "answers.answers" / "answers.jsonl")
         assert [row["answer"] for row in kept.values()] == ["1", "2"]
@@ -286,9 +286,9 @@ def test_an_answer_that_is_nested_too_deep_is_an_error_in_one_line(
         answers.write_text(row[:-1] + ', "x": ' + "[" * depth + "]" * depth + "}\n")
         capsys.readouterr()
         assert ask(features, tmp_path / "out", *words) == 2
-    describe_view = capsys.readouterr().err
-    assert "Traceback" not in describe_view
-    assert "give resume=false to ask anew" in describe_view
+    told = capsys.readouterr().err
+    assert "Traceback" not in told
+    assert "give resume=false to ask anew" in told
 
 
 def crate_refused(handler: Handler, body: Any) -> None:
@@ -309,9 +309,9 @@ def test_a_question_that_is_refused_keeps_no_other_from_its_answer(
         words = (f"questions={file}", f"vlm.base_url={server.url}")
         batch(file, cube, crate, lost, wall)
         assert ask(features, out, *words) == 2
-        describe_view = capsys.readouterr().err
-        assert "2 of 4 questions have no answer: question crate: the server" in describe_view
-        assert "no crates" in describe_view
+        told = capsys.readouterr().err
+        assert "2 of 4 questions have no answer: question crate: the server" in told
+        assert "no crates" in told
         assert len(server.requests) == 3
         # The file is mended and its lines change places: nothing is asked twice, nothing takes another's folder.
         server.behave = answer("now it is fine")
@@ -363,9 +363,9 @@ def test_warnings_of_a_batch_name_the_question(
 ) -> None:
     file = batch(tmp_path / "q.jsonl", {"id": "a", "question": "How large?"}, {"id": "b", "question": "How high?"})
     assert ask(features, tmp_path / "out", f"questions={file}", "dry_run=true") == 0
-    describe_view = capsys.readouterr().err
+    told = capsys.readouterr().err
     for name in ("a", "b"):
-        assert f"warning: question {name}: the question names nothing to look for" in describe_view
+        assert f"warning: question {name}: the question names nothing to look for" in told
     rows = [json.loads(line) for line in (tmp_path / "out" / "answers.jsonl").read_text().splitlines()]
     assert all("names nothing to look for" in row["warnings"][0] for row in rows)
 
@@ -457,12 +457,12 @@ def test_other_settings_ask_anew(features: Path, tmp_path: Path) -> None:
     ],
 )
 def test_files_of_questions_that_are_wrong_say_where(
-    tmp_path: Path, content: bytes, describe_view: str, no_jaxtyping: None
+    tmp_path: Path, content: bytes, told: str, no_jaxtyping: None
 ) -> None:
     (tmp_path / "q.jsonl").write_bytes(content)
     with pytest.raises(InputError) as caught:
         read_questions(tmp_path / "q.jsonl")
-    assert describe_view in str(caught.value)
+    assert told in str(caught.value)
     with pytest.raises(InputError, match="is no file"):
         read_questions(tmp_path / "other.jsonl")
 
@@ -528,6 +528,6 @@ def test_a_real_server_refuses_another_model_in_its_own_words(
 ) -> None:
     url, _ = real_server
     assert ask(features, tmp_path / "out", f"vlm.base_url={url}", "vlm.model=other", "question=Is it the cube?") == 2
-    describe_view = capsys.readouterr().err
-    assert "refuses the request" in describe_view or "has no model of that name" in describe_view
-    assert "other" in describe_view
+    told = capsys.readouterr().err
+    assert "refuses the request" in told or "has no model of that name" in told
+    assert "other" in told

@@ -63,7 +63,7 @@ def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(
         assert cli.main(words) == 130
     assert not out.exists()
     with monkeypatch.context() as patched:
-        patched.setattr(reconstruct, "start_of", never)
+        patched.setattr(reconstruct, "initial_gaussians", never)
         assert cli.main(words) == 0
     results = summary_of(out)["results"]
     assert {name: results[name] for name in ("seeds", "source")} == {

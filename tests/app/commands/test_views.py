@@ -84,10 +84,10 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], describe_view: str
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
 ) -> None:
     assert cli.main(["views", str(features), *words, f"out={tmp_path / 'out'}"]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1
-    assert describe_view in lines[0]
+    assert told in lines[0]
     assert not (tmp_path / "out").exists()
