@@ -1,119 +1,277 @@
-"""The documents are true: links and paths lead somewhere, names can be imported, commands have their options."""
+"""The documents are true: links, paths, names and make targets exist; code blocks and command lines fit the package."""
 
 import ast
 import importlib
+import importlib.util
+import inspect
 import re
+import shlex
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
 
+import gsencoder
 from gsencoder.app.commands import COMMANDS
-from gsencoder.app.settings.compose import choices_of, read_words
+from gsencoder.app.settings.compose import Choices, choices_of, overrides, read_words
 from gsencoder.core.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
-# docs/commands.md adds a command of its own; tests/app/test_commands_page.py runs it.
-PAGES = sorted({*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")} - {ROOT / "docs" / "commands.md"})
+PACKAGE = ROOT / "gsencoder"
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(
+    (ROOT / "docs").glob("*.md")
+)
+HISTORY = ("CHANGELOG.md", "decisions.md", "measurements.md")
+"""Pages that also speak of options and modules that are gone."""
+
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|…|\*")
+"""NAME, OUT, …, * stand for something that the reader puts in."""
+TOP_FOLDERS = "gsencoder|tests|bench|docs|conf|examples"
+SUBFOLDERS = "|".join(sorted(path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"))
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
-def pages(pattern: re.Pattern[str], *, code: bool) -> list[tuple[str, re.Match[str]]]:
-    """Every match of a pattern in the pages, with the page's name; outside code blocks unless `code`."""
-    texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
-    if not code:
-        texts = {page: FENCE.sub("", text) for page, text in texts.items()}
-    return [(str(page.relative_to(ROOT)), match) for page, text in texts.items() for match in pattern.finditer(text)]
+@cache
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
 
 
-def anchor(heading: str) -> str:
+@cache
+def prose_of(page: Path) -> str:
+    """A page without its code blocks."""
+    return FENCE.sub("", text_of(page))
+
+
+@cache
+def inline_code_of(page: Path) -> tuple[str, ...]:
+    """What stands between backticks in the prose."""
+    return tuple(re.findall(r"`([^`]+)`", prose_of(page)))
+
+
+def blocks_of(page: Path, *languages: str) -> list[str]:
+    return [code for language, code in FENCE.findall(text_of(page)) if language in languages]
+
+
+def anchor_of(heading: str) -> str:
     """The anchor that GitHub gives a heading."""
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
-def names(cases: list[tuple[str, re.Match[str]]], group: int) -> list[tuple[str, str]]:
-    return sorted({(page, match[group]) for page, match in cases})
+def links_of(page: Path) -> list[str]:
+    links = re.findall(r"!?\[[^\]]*\]\(([^)\s]+)\)", prose_of(page))
+    return [link for link in links if not re.match(r"\w+:", link)]
 
 
-LINKS = names(pages(re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)"), code=False), 1)
-PATHS = names(pages(re.compile(r"`((?:gsencoder|tests|bench|docs|conf|examples)/[\w./]*\w)`"), code=False), 1)
-DOTTED = names(pages(re.compile(r"`(gsencoder(?:\.\w+)+)(?:\(.*?\))?`"), code=False), 1)
-PYTHON = [(page, match[2]) for page, match in pages(FENCE, code=True) if match[1] == "python"]
-SHELL = [
-    (page, " ".join(line.split("#")[0].split()))
-    for page, match in pages(FENCE, code=True)
-    if match[1] in ("bash", "sh", "")
-    for line in match[2].replace("\\\n", " ").splitlines()
-    if re.match(r"\s*(.*-m )?gsencoder \w", line)
-]
+def has_target(page: Path, link: str) -> bool:
+    path, _, fragment = link.partition("#")
+    target = page.parent / path if path else page
+    if not fragment:
+        return target.exists()
+    return target.is_file() and fragment in map(anchor_of, re.findall(r"^#+ (.*)$", prose_of(target), re.MULTILINE))
 
 
-@pytest.mark.parametrize(("page", "link"), LINKS)
-def test_a_link_leads_somewhere(page: str, link: str) -> None:
-    if re.match(r"\w+://", link):
-        pytest.skip("outside")
-    path, _, part = link.partition("#")
-    target = (ROOT / page).parent / path if path else ROOT / page
-    assert target.exists()
-    if part:
-        headings = re.findall(r"^#+ (.*)$", FENCE.sub("", target.read_text(encoding="utf-8")), re.MULTILINE)
-        assert part in [anchor(heading) for heading in headings]
+@each_page
+def test_links_lead_to_files_and_headings(page: Path) -> None:
+    assert [link for link in links_of(page) if not has_target(page, link)] == []
 
 
-@pytest.mark.parametrize(("page", "path"), PATHS)
-def test_a_path_exists(page: str, path: str) -> None:
-    assert (ROOT / path).exists() or "NAME" in path
+def paths_of(page: Path) -> set[str]:
+    """Paths of the repository; in inline code those of the package may leave out its name (`fusion/fuse.py`)."""
+    paths = set(re.findall(rf"(?<![\w./-])(?:{TOP_FOLDERS})/[\w.*/-]+\.\w+", text_of(page)))
+    for code in inline_code_of(page):
+        if re.fullmatch(rf"(?:{TOP_FOLDERS})/[\w./-]*", code):
+            paths.add(code)
+        elif re.fullmatch(rf"(?:{SUBFOLDERS})/[\w./-]*", code):
+            paths.add(f"gsencoder/{code}")
+    return {path for path in paths if not PLACEHOLDER.search(path)}
 
 
-def resolve(name: str) -> object:
-    """The module, function, class or attribute of a dotted name."""
-    parts = name.split(".")
-    for count in range(len(parts), 0, -1):
-        try:
-            found: object = importlib.import_module(".".join(parts[:count]))
-        except ModuleNotFoundError:
-            continue
-        for part in parts[count:]:
-            found = getattr(found, part, None) or found.__dataclass_fields__[part]  # type: ignore[attr-defined]
-        return found
-    raise ModuleNotFoundError(name)
+@each_page
+def test_paths_exist(page: Path) -> None:
+    assert sorted(path for path in paths_of(page) if not (ROOT / path).exists()) == []
 
 
-@pytest.mark.parametrize(("page", "name"), DOTTED)
-def test_a_dotted_name_can_be_imported(page: str, name: str) -> None:
-    if "NAME" not in name:
-        resolve(name)
-
-
-@pytest.mark.parametrize(("page", "code"), PYTHON, ids=lambda text: text if text.endswith(".md") else "")
-def test_python_code_compiles_and_its_imports_are_there(page: str, code: str) -> None:
-    for node in ast.walk(ast.parse(code, page)):
-        if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "gsencoder":
-            for alias in node.names:
-                resolve(f"{node.module}.{alias.name}")
+def is_module(name: str) -> bool:
+    """Whether a dotted name is a module; nothing but the packages above it is imported."""
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
 
 
 @cache
-def choices(command: str):  # type: ignore[no-untyped-def]
+def resolve(name: str) -> object:
+    """The object of a dotted name; of a module that exists, its name alone.
+
+    Raises:
+        AttributeError: there is no such object.
+    """
+    parts = name.split(".")
+    depth = max(count for count in range(1, len(parts) + 1) if is_module(".".join(parts[:count])))
+    if depth == len(parts):
+        return name
+    value: object = importlib.import_module(".".join(parts[:depth]))
+    for part in parts[depth:]:
+        # A field without a default is no attribute of its dataclass.
+        value = getattr(value, "__dataclass_fields__", {}).get(part) or getattr(value, part)
+    return value
+
+
+def resolves(name: str) -> bool:
+    try:
+        resolve(name)
+    except AttributeError:
+        return False
+    return True
+
+
+def dotted_names_of(page: Path) -> set[str]:
+    """Names below `gsencoder`, and attributes of public classes and of the types (`Cameras.project`)."""
+    names = set(re.findall(r"(?<![\w./-])gsencoder(?:\.[A-Za-z_]\w*)+", prose_of(page)))
+    for code in inline_code_of(page):
+        match = re.match(r"([A-Z]\w*)\.(\w+)", code)
+        for home in ("gsencoder", "gsencoder.types"):
+            if match and resolves(f"{home}.{match[1]}"):
+                names.add(f"{home}.{match[0]}")
+    return {name for name in names if not PLACEHOLDER.search(name)}
+
+
+@each_page
+def test_dotted_names_can_be_imported(page: Path) -> None:
+    assert sorted(name for name in dotted_names_of(page) if not resolves(name)) == []
+
+
+def imports_of(tree: ast.AST) -> dict[str, str]:
+    """Dotted names of the package by the names that Python code gives them."""
+    names = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "gsencoder":
+            names |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names if alias.name.split(".")[0] == "gsencoder"]
+            names |= {module: module for module in modules}
+    return names
+
+
+def calls_that_do_not_bind(tree: ast.AST) -> Iterator[str]:
+    """Calls of imported functions and classes of the package that their signatures refuse."""
+    names = imports_of(tree)
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name) or node.func.id not in names:
+            continue
+        function = resolve(names[node.func.id])
+        starred = any(isinstance(each, ast.Starred) for each in node.args) or any(
+            not each.arg for each in node.keywords
+        )
+        if not callable(function) or starred:
+            continue
+        try:
+            signature = inspect.signature(function)
+        except ValueError:  # Exceptions have none.
+            continue
+        try:
+            signature.bind(*node.args, **{str(each.arg): each.value for each in node.keywords})
+        except TypeError as error:
+            yield f"{ast.unparse(node)}: {error}"
+
+
+@each_page
+def test_python_blocks_import_and_call_what_is_there(page: Path) -> None:
+    for code in blocks_of(page, "python"):
+        tree = ast.parse(code)
+        assert [name for name in imports_of(tree).values() if not resolves(name)] == []
+        assert list(calls_that_do_not_bind(tree)) == []
+
+
+def test_a_call_that_does_not_bind_is_reported() -> None:
+    source = "from gsencoder import load_splat\nload_splat('a.ply', 'b')\nload_splat('a.ply')\nload_splat(file='a.ply')"
+    assert len(list(calls_that_do_not_bind(ast.parse(source)))) == 2
+
+
+def command_lines_of(page: Path) -> list[str]:
+    """What follows `gsencoder` in shell blocks and in inline code."""
+    lines = [line for block in blocks_of(page, "bash", "sh", "") for line in block.replace("\\\n", " ").splitlines()]
+    matches = (re.search(r"(?:^|\s)gsencoder\s+(\w.*)", line) for line in [*lines, *inline_code_of(page)])
+    return [match[1] for match in matches if match]
+
+
+@cache
+def choices(command: str) -> Choices:
     return choices_of(COMMANDS[command].load()[0])
 
 
-@pytest.mark.parametrize(("page", "line"), SHELL)
-def test_a_command_line_has_commands_and_options_that_are_there(page: str, line: str) -> None:
-    words = re.split(r"(?:^|\s)gsencoder ", line, maxsplit=1)[1].split(" ")
-    command = words[0].strip("`")
-    if command == "COMMAND":
-        return
-    assert command in COMMANDS
-    for word in re.findall(r"""(?:^|\s)([\w./]+=)(?:'[^']*'|"[^"]*"|\S*)""", " ".join(words[1:])):
-        try:
-            read_words([f"{word}x"], choices(command), sweep="-m" in words)
-        except InputError as error:
-            pytest.fail(str(error))
+def complaint(line: str, made_on_the_page: set[str]) -> str:
+    """What is wrong with a command line; empty where nothing is."""
+    command, *words = shlex.split(line, comments=True)
+    if command in made_on_the_page or PLACEHOLDER.fullmatch(command):
+        return ""
+    if command not in COMMANDS:
+        return f"{command}: no such command"
+    sweep = "-m" in words
+    # A key alone (`query=`) and a placeholder (`form=FORM`) stand for any value.
+    settings = [word for word in words if re.match(r"[\w./]+=", word)]
+    any_value = {word for word in settings if PLACEHOLDER.search(word.partition("=")[2]) or word.endswith("=")}
+    try:
+        read_words(sorted(any_value), choices(command), sweep=sweep)
+        _, given = read_words([word for word in settings if word not in any_value], choices(command), sweep=sweep)
+        overrides(
+            {key: value for key, value in given.items() if not key.startswith("hydra")}, choices(command), sweep=sweep
+        )
+    except InputError as error:
+        return f"{line}: {error}"
+    return ""
+
+
+@each_page
+def test_command_lines_have_commands_options_and_choices_that_are_there(page: Path) -> None:
+    # tests/app/test_commands_page.py runs the command that docs/commands.md makes.
+    made_on_the_page = set(re.findall(r'Command\(name="(\w+)"', text_of(page)))
+    complaints = [complaint(line, made_on_the_page) for line in command_lines_of(page)]
+    assert list(filter(None, complaints)) == []
+
+
+def test_a_wrong_command_line_is_reported() -> None:
+    good = ["fuse SCENE teacher=palette out=features  # a comment", "localize features query=", "views --help"]
+    assert [complaint(line, set()) for line in good] == ["", "", ""]
+    for bad in ("fuze SCENE", "fuse SCENE teecher=palette", "fuse SCENE teacher=palett", "fuse SCENE out=a out=b"):
+        assert complaint(bad, set())
+
+
+@cache
+def all_keys() -> frozenset[str]:
+    """Options and choices of all commands, with and without their sections."""
+    keys = {key for command in COMMANDS for key in (*choices(command).options, *choices(command).groups)}
+    return frozenset(keys | {re.split(r"[./]", key)[-1] for key in keys} | {"experiment"})
+
+
+@each_page
+def test_options_in_the_text_are_those_of_a_command(page: Path) -> None:
+    if page.name not in HISTORY and page.name != "commands.md":
+        keys = (re.match(r"([a-z_][\w./]*)=(?!=)", code) for code in inline_code_of(page))
+        assert sorted({match[1] for match in keys if match} - all_keys()) == []
+
+
+@each_page
+def test_make_targets_exist(page: Path) -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    asked = set(re.findall(r"(?:^|\s|`)make ((?:[A-Z]+=\S+ )?[a-z][\w-]*)(?=`|\s+#|$)", text_of(page), re.MULTILINE))
+    assert {name.split()[-1] for name in asked} <= targets
+
+
+def test_modules_in_the_table_of_moves_are_gone_from_their_old_places() -> None:
+    moves = re.findall(r"^\| `([\w.]+)` \| `(gsencoder[\w.]+)` \|$", text_of(ROOT / "CHANGELOG.md"), re.MULTILINE)
+    assert len(moves) > 100
+    for old, new in moves:
+        # `infer.views` was a module and is a folder.
+        assert not (PACKAGE / f"{old.replace('.', '/')}.py").exists()
+        assert is_module(new)
 
 
 def test_the_documents_are_looked_at() -> None:
-    assert len(PAGES) > 5
-    assert len(LINKS) > 5
-    assert len(SHELL) > 20
-    assert len(PYTHON) > 1
+    for contents, at_least in ((links_of, 20), (paths_of, 80), (dotted_names_of, 150), (command_lines_of, 30)):
+        assert sum(len(contents(page)) for page in PAGES) >= at_least  # type: ignore[operator]
+    assert sum(len(blocks_of(page, "python")) for page in PAGES) >= 4
+    assert {"fuse", "encode", "localize"} <= set(gsencoder.__all__)
