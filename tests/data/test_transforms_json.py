@@ -317,6 +317,16 @@ def test_mutated_text_gives_a_scene_or_an_input_error(tmp_path: Path, no_jaxtypi
     loads_or_complains(tmp_path)
 
 
+def test_a_depth_beyond_float32_is_refused_where_it_is_read(tmp_path: Path, no_jaxtyping: None) -> None:
+    scene = write_transforms(tmp_path, 2, depth=True)
+    rewrite(tmp_path, {**scene, "depth_unit_scale_factor": 1e37})
+    views = load_scene(tmp_path).views
+    assert views is not None
+    assert views.depths is not None
+    with pytest.raises(InputError, match=r"depth/000.png: depth of .* world units; check the depth scale"):
+        views.depths[0]
+
+
 @pytest.mark.parametrize("key", ["file_path", "depth_file_path", "mask_path", "instance_file_path"])
 @pytest.mark.parametrize("unit", ["a", "a/", "../", "é/"])
 def test_a_path_longer_than_any_file_has_is_refused_at_once(tmp_path: Path, key: str, unit: str) -> None:
