@@ -25,7 +25,7 @@ from synthetic_teacher import SyntheticTeacher
 import gsencoder
 from gsencoder import encode, fuse, load_weights, localize
 from gsencoder.data.synthetic.room import make_room
-from gsencoder.models.weights import SHIPPED
+from gsencoder.models.weights import SHIPPED_WEIGHTS
 from gsencoder.text.table import load_text_table
 
 PACKAGE = str(Path(gsencoder.__file__).parent)
@@ -72,7 +72,7 @@ def main() -> None:
     assert scene.gaussians is not None
     teacher = ExpensiveTeacher(channels=96, rank=8)
     encoder, outputs, _ = load_weights("house_cpu")
-    words = load_text_table(SHIPPED / "house_cpu" / "words.safetensors")
+    words = load_text_table(SHIPPED_WEIGHTS / "house_cpu" / "words.safetensors")
     features = encode(scene.gaussians, encoder, outputs)
     encoded = replace(scene, features={features.space.name: features})
     with tempfile.TemporaryDirectory() as folder:

@@ -1,10 +1,12 @@
 """Imports go down only and never in a circle; what a torch-free runtime needs does not import torch."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -222,3 +224,17 @@ def test_a_torch_free_module_does_not_import_torch(module: str) -> None:
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr or f"{module} imports torch"
+
+
+@pytest.mark.parametrize("folder", ["bench", "examples"])
+def test_what_scripts_import_from_the_package_is_there(folder: str) -> None:
+    missing = []
+    for path in sorted((PACKAGE.parent / folder).glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("gsencoder"):
+                continue
+            module = importlib.import_module(node.module or "")
+            for alias in node.names:
+                if not hasattr(module, alias.name) and find_spec(f"{node.module}.{alias.name}") is None:
+                    missing.append(f"{path.name} line {node.lineno}: {node.module}.{alias.name}")
+    assert missing == []

@@ -1,9 +1,11 @@
 """The checkpoint of a fusion: the teacher's maps and the sums so far, from which an interrupted run continues."""
 
+import hashlib
 import json
 import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -11,10 +13,28 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.runtime.tracking import Track
+from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
+from gsencoder.types import FeatureBasis, Gaussians, Views
 
 SETTINGS_FILE, SUMS_FILE = "settings.json", "sums.safetensors"
+
+
+@runtime_checkable
+class RunningSums(Protocol):
+    """What a checkpoint saves of the sums over views (`fusion.lift.FeatureSums`, which needs torch).
+
+    Attributes:
+        sums: of the first `views` views.
+        weights: the same.
+        views: how many views were added.
+    """
+
+    sums: Float32[np.ndarray, "N columns"]
+    weights: Float32[np.ndarray, " N"]
+    views: int
 
 
 class FusionCheckpoint:
@@ -85,6 +105,61 @@ class FusionCheckpoint:
     @property
     def _advice(self) -> str:
         return f"delete {self.folder} to start anew"
+
+
+def open_checkpoint(
+    folder: Path,
+    config: Mapping[str, Any],
+    teacher: Teacher,
+    gaussians: Gaussians,
+    views: Views,
+    rows: Sequence[int],
+    basis: FeatureBasis | None,
+) -> FusionCheckpoint:
+    """Opens the checkpoint in a folder, which belongs to one scene, one teacher, one set of settings and one basis.
+
+    Args:
+        folder: of the maps and the sums.
+        config: settings of the fusion, as JSON values.
+        teacher: what is lifted.
+        gaussians: what is lifted onto.
+        views: of the scene; photographs count by their names alone.
+        rows: the views that are lifted, in this order.
+        basis: one that was given to the fusion; one that it fits itself depends on nothing else.
+
+    Raises:
+        InputError: as `FusionCheckpoint`.
+    """
+    settings: dict[str, Any] = {"fuse": dict(config), "teacher": teacher.settings(), "views": list(rows)}
+    if basis is not None:
+        settings["basis"] = hashlib.sha256(basis.mean.tobytes() + basis.components.tobytes()).hexdigest()[:16]
+    digest = hashlib.sha256(repr(views.names).encode("utf-8", "backslashreplace"))
+    for name in ("cam_from_world", "Ks", "widths", "heights"):
+        digest.update(np.ascontiguousarray(getattr(views.cameras, name)).tobytes())
+    settings["scene"] = {"gaussians": fingerprint(gaussians)[:16], "views": digest.hexdigest()[:16]}
+    return FusionCheckpoint(folder, settings)
+
+
+def remaining_views(
+    rows: Sequence[int], sums: RunningSums, checkpoint: FusionCheckpoint | None, track: Track
+) -> Iterator[int]:
+    """The views that are not in the sums yet. Between two of them the sums are saved, when that is due.
+
+    Args:
+        rows: of all views, in the order in which they are added.
+        sums: to which the caller adds each view before it takes the next; those of an interrupted run are put in first.
+        checkpoint: where sums are saved; None = nowhere.
+        track: wraps the loop to show progress.
+
+    Raises:
+        InputError: the checkpoint is damaged.
+    """
+    if checkpoint is not None and (earlier := checkpoint.load_sums(*sums.sums.shape)) is not None:
+        sums.views, sums.sums, sums.weights = earlier
+    for view in track(rows[sums.views :], "lifting views"):
+        yield view
+        if checkpoint is not None and checkpoint.due():
+            checkpoint.save_sums(sums.views, sums.sums, sums.weights)
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

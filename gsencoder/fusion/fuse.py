@@ -6,12 +6,11 @@ Views stream one at a time; sums are kept in the coordinates of a basis, so that
 of views or with the teacher's width.
 """
 
-import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
@@ -20,9 +19,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import evenly
 from gsencoder.core.runtime.clock import Clock, timed
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
-from gsencoder.fusion.checkpoint import FusionCheckpoint
+from gsencoder.fusion.checkpoint import open_checkpoint, remaining_views
 from gsencoder.fusion.lift import FeatureSums, map_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
@@ -107,8 +105,11 @@ def fuse(
     gaussians, views = _checked(scene, teacher, basis)
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))
     rows = tuple(int(view) for view in evenly(len(views), config.views or len(views)))
-    checkpoint = _checkpoint(work, gaussians, views, teacher, config, rows, basis)
-    maps = timed("teacher")(partial((teacher if checkpoint is None else checkpoint.cached(teacher)).feature_map, views))
+    checkpoint = None
+    if work is not None:
+        checkpoint = open_checkpoint(work, asdict(config), teacher, gaussians, views, rows, basis)
+    source = teacher if checkpoint is None else checkpoint.cached(teacher)
+    maps = timed("teacher")(partial(source.feature_map, views))
 
     with Clock().running() as clock:
         if basis is not None:
@@ -161,51 +162,6 @@ def _checked(scene: Scene, teacher: Teacher, basis: FeatureBasis | None) -> tupl
     if len(scene.views) == 0:
         raise InputError(f"fuse: scene {scene.name} has no views left")
     return scene.gaussians, scene.views
-
-
-def _checkpoint(
-    work: Path | None,
-    gaussians: Gaussians,
-    views: Views,
-    teacher: Teacher,
-    config: FuseConfig,
-    rows: tuple[int, ...],
-    basis: FeatureBasis | None,
-) -> FusionCheckpoint | None:
-    """The checkpoint in `work`, which belongs to this scene, these settings and this basis alone."""
-    if work is None:
-        return None
-    settings: dict[str, Any] = {"fuse": asdict(config), "teacher": teacher.settings(), "views": list(rows)}
-    if basis is not None:
-        settings["basis"] = hashlib.sha256(basis.mean.tobytes() + basis.components.tobytes()).hexdigest()[:16]
-    return FusionCheckpoint(work, settings | {"scene": _scene_digests(gaussians, views)})
-
-
-def _scene_digests(gaussians: Gaussians, views: Views) -> dict[str, str]:
-    """Digests of the Gaussians and of the cameras; photographs count by their names alone."""
-    digest = hashlib.sha256(repr(views.names).encode("utf-8", "backslashreplace"))
-    for name in ("cam_from_world", "Ks", "widths", "heights"):
-        digest.update(np.ascontiguousarray(getattr(views.cameras, name)).tobytes())
-    return {"gaussians": fingerprint(gaussians)[:16], "views": digest.hexdigest()[:16]}
-
-
-def remaining_views(
-    rows: tuple[int, ...], sums: FeatureSums, checkpoint: FusionCheckpoint | None, track: Track
-) -> Iterator[int]:
-    """The views that are not in the sums yet. Between two of them the sums are saved, when that is due.
-
-    Args:
-        rows: of all views, in the order in which they are added.
-        sums: to which the caller adds each view before it takes the next; those of an interrupted run are put in first.
-        checkpoint: where sums are saved; None = nowhere.
-        track: wraps the loop to show progress.
-    """
-    if checkpoint is not None:
-        sums.restore(checkpoint)
-    for view in track(rows[sums.views :], "lifting views"):
-        yield view
-        if checkpoint is not None and checkpoint.due():
-            checkpoint.save_sums(sums.views, sums.sums, sums.weights)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

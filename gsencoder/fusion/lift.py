@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float32
 
 from gsencoder.core.runtime.clock import timed
 from gsencoder.fusion.basis import encode
-from gsencoder.fusion.checkpoint import FusionCheckpoint
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import depth_image
@@ -49,16 +48,6 @@ class FeatureSums:
         width = columns if table is None else len(table)
         self.sums: Float32[np.ndarray, "N columns"] = np.zeros((gaussians, width), np.float32)
         self.weights: Float32[np.ndarray, " N"] = np.zeros(gaussians, np.float32)
-
-    def restore(self, checkpoint: FusionCheckpoint) -> None:
-        """Continues from the sums of an interrupted run, where the checkpoint holds any.
-
-        Raises:
-            InputError: the checkpoint is damaged.
-        """
-        earlier = checkpoint.load_sums(*self.sums.shape)
-        if earlier is not None:
-            self.views, self.sums, self.weights = earlier
 
     @timed("lift")
     def add(self, b: Blend, feature_map: FeatureMap, mask: Bool[np.ndarray, "H W"] | None) -> None:
