@@ -172,21 +172,21 @@ def step_parts(config: TrainCommandConfig, prepared: Path, steps: int) -> dict[s
         sampling=config.sampling,
         augmentation=config.augment,
         losses=config.loss,
-        rarity=folder.load_rarity(),
+        class_balance=folder.load_class_balance(),
         seed=0,
     )
     dataset = SampleDataset(folder.scenes(sorted(path.stem for path in (prepared / "scenes").iterdir())), recipe)
     spent: dict[str, float] = {}
-    timed(samples, "choose_part", spent, "selection")
+    timed(samples, "choose_crop", spent, "selection")
     timed(samples, "augment", spent, "augmentation")
     timed(samples, "encoder_inputs", spent, "plan")
-    timed(samples, "restrict", spent, "rows of B")
+    timed(samples, "restrict_rows", spent, "rows of B")
     encoder = GaussianEncoder(config.model, outputs.channels).train()
     optimizer = torch.optim.AdamW(encoder.parameters(), lr=1e-3, fused=True)
-    distillation = Distillation(encoder, config.loss, torch.from_numpy(recipe.rarity.codebook))
+    distillation = Distillation(encoder, config.loss, torch.from_numpy(recipe.class_balance.codebook))
     dtype = autocast_dtype(config.train.precision, torch.device("cpu"))
     gaussians = 0
-    # The first visit to a scene opens its file and looks up the kinds of its targets.
+    # The first visit to a scene opens its file and looks up the classes of its targets.
     first = -len(dataset.scenes)
     for step in range(first, steps):
         if step == 0:

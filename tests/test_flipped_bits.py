@@ -32,7 +32,7 @@ from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.adapter_heads import load_heads, save_heads
 from gsencoder.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.prepare import RARITY_FILE, SPACE_FILE
+from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE
 from gsencoder.types import FeatureSpace, Scene, Views
 
 FLIPS = 60
@@ -92,11 +92,11 @@ def prepared_file(folder: Path, name: str) -> Made:
         one = dataset.scenes(names)[0]
         rows = np.arange(len(one))
         views = [one.view(view) for view in range(len(one.cameras))]
-        header = (one.cameras, one.metres_per_unit, one.up, one.view_names, dataset.holds(Path("wall_0")))
+        header = (one.cameras, one.metres_per_unit, one.up, one.view_names, dataset.has_scene(Path("wall_0")))
         return header, one.gaussians(rows), one.weights, one.targets(rows), views
 
-    readers = {"scene": read, SPACE_FILE: dataset.load_space, RARITY_FILE: dataset.load_rarity}
-    return dataset.path_of(names[0]) if name == "scene" else folder / name, readers[name]
+    readers = {"scene": read, SPACE_FILE: dataset.load_space, CLASS_BALANCE_FILE: dataset.load_class_balance}
+    return dataset.scene_path(names[0]) if name == "scene" else folder / name, readers[name]
 
 
 def training(folder: Path) -> Made:
@@ -156,7 +156,7 @@ KINDS: dict[str, Callable[[Path], Made]] = {
     "adapter heads": heads,
     "prepared scene": lambda folder: prepared_file(folder, "scene"),
     "space of prepared scenes": lambda folder: prepared_file(folder, SPACE_FILE),
-    "counts of prepared scenes": lambda folder: prepared_file(folder, RARITY_FILE),
+    "counts of prepared scenes": lambda folder: prepared_file(folder, CLASS_BALANCE_FILE),
     "training": training,
     "reconstruction": reconstruction,
     "sums of a fusion": sums,

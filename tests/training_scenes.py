@@ -106,10 +106,10 @@ def prepared(folder: Path, *, count: int = 3, teacher: Teacher | None = None) ->
     dataset = PreparedDataset(folder, {"made": "for a test"})
     names = [f"wall_{number}" for number in range(count)]
     chosen: Teacher = teacher
-    dataset.find_space([Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
+    dataset.fit_space([Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
     for number in range(count):
         dataset.prepare(scene(number), teacher, PREPARE, source=Path(f"wall_{number}"))
-    dataset.find_rarity(names, untracked)
+    dataset.count_classes(names, untracked)
     return dataset, names
 
 
@@ -120,7 +120,7 @@ def samples(dataset: PreparedDataset, names: Sequence[str], **changes: Any) -> S
         "sampling": SamplingConfig(views=2, gaussians=200),
         "augmentation": AugmentConfig(turn=10.0),
         "losses": LOSSES,
-        "rarity": dataset.load_rarity(),
+        "class_balance": dataset.load_class_balance(),
         "seed": 3,
     }
     return SampleDataset(dataset.scenes(names), SampleRecipe(**{**recipe, **changes}))

@@ -24,7 +24,7 @@ from gsencoder.render import blend
 from gsencoder.render.images import render_image
 from gsencoder.train.class_balance import nearest_codes
 from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.trainer import Validated
+from gsencoder.train.trainer import ValidationResult
 
 PICTURED_SCENES = 3
 """Held-out scenes of which a view is drawn at each validation during training."""
@@ -126,7 +126,7 @@ def validate_names(
     outputs: OutputSpace,
     codebook: Float32[np.ndarray, "C channels"],
     config: EncodeConfig = EncodeConfig(),
-) -> Validated:
+) -> ValidationResult:
     """Runs `validate_encoder` in the form that `gsencoder.train.train` expects.
 
     Its scores are "names", the accuracy averaged over classes, and "cosine_named", the mean cosine over named
@@ -134,7 +134,7 @@ def validate_names(
     """
     accuracy = validate_encoder(scenes, encoder, outputs, codebook, config, pictured=PICTURED_SCENES)
     pictures = {} if accuracy.sheet is None else {"features": accuracy.sheet}
-    return Validated({"names": accuracy.score, "cosine_named": accuracy.cosine_named}, pictures)
+    return ValidationResult({"names": accuracy.score, "cosine_named": accuracy.cosine_named}, pictures)
 
 
 def draw_middle_view(

@@ -1,9 +1,10 @@
-"""A teacher's adapter heads on disk: small perceptrons that lead from its backbone's features to other spaces.
+"""Adapter heads of a teacher on disk: small MLPs from the features of its backbone to other feature spaces.
 
-RADIO's adapters turn backbone features into those of CLIP, SigLIP, DINO or SAM. Distilled features must serve them as
-the teacher's own do, so the render loss may be taken behind them (SplatDistill Eq. 4). A file holds, for each head, its
-layers, and mean and scale of what it gives for the teacher's features. Both sides of the loss are decoded from the
-dataset's basis before: where the basis has dropped what a head looks at, a larger `prepare.fusion.max_rank` keeps it.
+RADIO's adapters map backbone features to those of CLIP, SigLIP, DINO or SAM. Distilled features must work with them as
+the teacher's features do, so the render loss can be computed on the outputs of the heads (SplatDistill Eq. 4). For each
+head a file holds its layers, and the mean and the scale of its outputs for the teacher's features. Both sides of the
+loss are decoded from the dataset's basis first; if the basis drops components that a head needs, raise
+`prepare.fusion.max_rank`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,19 +19,19 @@ from torch import Tensor, nn
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import Archive, open_archive, write_archive
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.losses import Head
+from gsencoder.train.losses import AdapterHead
 
-KINDS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
+LAYER_TYPES: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
     "linear": (nn.Linear, ("weight", "bias")),
     "layernorm": (nn.LayerNorm, ("weight", "bias")),
     "gelu": (nn.GELU, ()),
     "relu": (nn.ReLU, ()),
 }
-"""Layers that a head may have, and their parameters."""
+"""The layer types that a head may have, with the names of their parameters."""
 
 
-class Decode(nn.Module):
-    """From standard units to the teacher's own vectors, differentiable."""
+class FeatureDecoder(nn.Module):
+    """Decodes features in standard units to vectors of the teacher's space; differentiable."""
 
     mean: Tensor
     components: Tensor
@@ -47,7 +48,7 @@ class Decode(nn.Module):
 
 
 class Residual(nn.Sequential):
-    """x + f(x), f being the layers one after the other."""
+    """A residual block: x + f(x), where f applies the layers in sequence."""
 
     def forward(self, x: Float[Tensor, "n C"]) -> Float[Tensor, "n C"]:
         out: Tensor = x + super().forward(x)
@@ -55,81 +56,95 @@ class Residual(nn.Sequential):
 
 
 def save_heads(path: Path, heads: Mapping[str, tuple[nn.Sequential, np.ndarray, float]]) -> None:
-    """Writes heads: for each name its layers (linear, layer norms, GELU, ReLU, and `Residual` blocks of such), and the
-    mean and the scale of its outputs.
+    """Writes adapter heads to a file.
+
+    Args:
+        path: the file.
+        heads: for each name, the layers (linear, layer norm, GELU, ReLU, or `Residual` blocks of these), and the mean
+            [E] and scale of their outputs.
 
     Raises:
-        InputError: a layer of another kind, or the disk is full.
+        InputError: a layer of another type, or the disk is full.
     """
     arrays: dict[str, np.ndarray] = {}
     header = []
     for name, (layers, mean, scale) in heads.items():
         arrays[f"{name}.mean"] = mean.astype(np.float32)
-        header.append({"name": name, "layers": _describe(layers, name, arrays), "scale": float(scale)})
+        header.append({"name": name, "layers": _describe_layers(layers, name, arrays), "scale": float(scale)})
     write_archive(path, arrays, {"heads": header})
 
 
-def _describe(layers: nn.Sequential, name: str, arrays: dict[str, np.ndarray]) -> list[Any]:
-    """The kinds of layers, blocks as lists of such; parameters go into `arrays`."""
-    kinds: list[Any] = []
+def _describe_layers(layers: nn.Sequential, name: str, arrays: dict[str, np.ndarray]) -> list[Any]:
+    """The names of the layers' types, residual blocks as nested lists; parameters are added to `arrays`."""
+    layer_types: list[Any] = []
     for number, layer in enumerate(layers):
-        own = f"{name}.{number}"
+        key = f"{name}.{number}"
         if isinstance(layer, Residual):
-            kinds.append(_describe(layer, own, arrays))
+            layer_types.append(_describe_layers(layer, key, arrays))
             continue
-        kind = next((kind for kind, (cls, _) in KINDS.items() if type(layer) is cls), None)
-        if kind is None:
-            raise InputError(f"heads: {own}: expected {', '.join(KINDS)} or Residual, got {type(layer).__name__}")
-        kinds.append(kind)
-        for parameter in KINDS[kind][1]:
-            arrays[f"{own}.{parameter}"] = getattr(layer, parameter).detach().float().numpy()
-    return kinds
+        layer_type = next((layer_type for layer_type, (cls, _) in LAYER_TYPES.items() if type(layer) is cls), None)
+        if layer_type is None:
+            raise InputError(f"heads: {key}: expected {', '.join(LAYER_TYPES)} or Residual, got {type(layer).__name__}")
+        layer_types.append(layer_type)
+        for parameter in LAYER_TYPES[layer_type][1]:
+            arrays[f"{key}.{parameter}"] = getattr(layer, parameter).detach().float().numpy()
+    return layer_types
 
 
-def load_heads(path: Path, outputs: OutputSpace) -> list[tuple[Head, nn.Module]]:
-    """Heads for features of an output space, each with what decodes standard units for it.
+def load_heads(path: Path, outputs: OutputSpace) -> list[tuple[AdapterHead, nn.Module]]:
+    """Loads adapter heads for features of an output space.
+
+    Returns:
+        The heads, each with a decoder from standard units to its input.
 
     Raises:
-        InputError: missing, damaged, or for features of another width.
+        InputError: the file is missing or damaged, or is for features with another number of channels.
     """
-    decode = Decode(outputs)
-    found: list[tuple[Head, nn.Module]] = []
+    decode = FeatureDecoder(outputs)
+    heads: list[tuple[AdapterHead, nn.Module]] = []
     with open_archive(path) as file:
         for entry in file.value("heads", list):
-            name, kinds, scale = entry.get("name"), entry.get("layers"), entry.get("scale")
-            if not isinstance(name, str) or not isinstance(kinds, list) or not kinds or not isinstance(scale, float):
+            name, layer_types, scale = entry.get("name"), entry.get("layers"), entry.get("scale")
+            if (
+                not isinstance(name, str)
+                or not isinstance(layer_types, list)
+                or not layer_types
+                or not isinstance(scale, float)
+            ):
                 raise InputError(f"expected heads with name, layers and scale, got {str(entry)[:80]}")
-            layers, width = _read(file, kinds, name, outputs.space.channels)
+            layers, width = _read_layers(file, layer_types, name, outputs.space.channels)
             mean = torch.from_numpy(file.array(f"{name}.mean", "float32", (width,)).copy())
-            found.append((Head(nn.Sequential(*layers), mean, scale), decode))
-    return found
+            heads.append((AdapterHead(nn.Sequential(*layers), mean, scale), decode))
+    return heads
 
 
-def _read(file: Archive, kinds: Sequence[Any], name: str, width: int) -> tuple[list[nn.Module], int]:
-    """The layers of a list of kinds, for inputs of a width, and the width of what they give."""
+def _read_layers(file: Archive, layer_types: Sequence[Any], name: str, width: int) -> tuple[list[nn.Module], int]:
+    """Reads layers with inputs of `width` channels; returns them and the number of channels of their outputs."""
     layers: list[nn.Module] = []
-    for number, kind in enumerate(kinds):
-        own = f"{name}.{number}"
-        if isinstance(kind, list):
-            inner, out = _read(file, kind, own, width)
+    for number, layer_type in enumerate(layer_types):
+        key = f"{name}.{number}"
+        if isinstance(layer_type, list):
+            inner, out = _read_layers(file, layer_type, key, width)
             if out != width:
-                raise InputError(f"{own}: expected a residual block that gives {width} channels, got {out}")
+                raise InputError(f"{key}: expected a residual block with {width} output channels, got {out}")
             layers.append(Residual(*inner))
-        elif kind == "linear":
-            weight = file.array(f"{own}.weight", "float32", (own, width))
+        elif layer_type == "linear":
+            weight = file.array(f"{key}.weight", "float32", (key, width))
             linear = nn.Linear(width, len(weight))
             width = len(weight)
-            bias = file.array(f"{own}.bias", "float32", (width,))
+            bias = file.array(f"{key}.bias", "float32", (width,))
             linear.weight.data, linear.bias.data = torch.from_numpy(weight.copy()), torch.from_numpy(bias.copy())
             layers.append(linear)
-        elif kind == "layernorm":
+        elif layer_type == "layernorm":
             norm = nn.LayerNorm(width)
-            for parameter in KINDS[kind][1]:
-                value = file.array(f"{own}.{parameter}", "float32", (width,))
+            for parameter in LAYER_TYPES[layer_type][1]:
+                value = file.array(f"{key}.{parameter}", "float32", (width,))
                 getattr(norm, parameter).data = torch.from_numpy(value.copy())
             layers.append(norm)
-        elif kind in KINDS:
-            layers.append(KINDS[kind][0]())
+        elif layer_type in LAYER_TYPES:
+            layers.append(LAYER_TYPES[layer_type][0]())
         else:
-            raise InputError(f"{own}: expected {', '.join(KINDS)} or a list of such, got {str(kind)[:20]!r}")
+            raise InputError(
+                f"{key}: expected {', '.join(LAYER_TYPES)} or a list of these, got {str(layer_type)[:20]!r}"
+            )
     return layers, width

@@ -1,4 +1,4 @@
-"""Random changes to a splat that leave what it shows the same: turned, mirrored, scaled, shaken, in other light."""
+"""Random augmentation of splats: rotation, mirroring, scaling, jitter of the centers, and changes of color."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -18,19 +18,23 @@ _DIRECTIONS = 64
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AugmentConfig:
-    """How much a training sample may differ from its scene; zeros leave it as it is."""
+    """Strengths of the random changes to a training sample; 0 = none."""
 
-    turn: float = field(default=180.0, metadata={"help": "largest rotation about the scene's up, degrees either way"})
-    tilt: float = field(default=3.0, metadata={"help": "standard deviation of the tilt of up, degrees"})
-    mirror: float = field(default=0.5, metadata={"help": "share of samples that are mirrored"})
-    scale: float = field(default=0.1, metadata={"help": "largest change of size, as a share"})
-    jitter: float = field(default=0.1, metadata={"help": "standard deviation of each center's shift, in voxels"})
-    drop: float = field(default=0.2, metadata={"help": "largest share of Gaussians that are left out"})
-    light: float = field(default=0.2, metadata={"help": "largest change of brightness, as a share"})
-    tint: float = field(
-        default=0.08, metadata={"help": "largest change of each color channel, and of black, as a share"}
+    turn: float = field(
+        default=180.0, metadata={"help": "largest rotation about the up axis in either direction, degrees"}
     )
-    noise: float = field(default=0.02, metadata={"help": "standard deviation of each Gaussian's color, white being 1"})
+    tilt: float = field(default=3.0, metadata={"help": "standard deviation of the tilt of the up axis, degrees"})
+    mirror: float = field(default=0.5, metadata={"help": "probability of mirroring"})
+    scale: float = field(default=0.1, metadata={"help": "largest relative change of size"})
+    jitter: float = field(default=0.1, metadata={"help": "standard deviation of the shift of each center, voxels"})
+    drop: float = field(default=0.2, metadata={"help": "largest share of Gaussians that is dropped at random"})
+    light: float = field(default=0.2, metadata={"help": "largest relative change of brightness"})
+    tint: float = field(
+        default=0.08, metadata={"help": "largest relative change of each color channel, and largest shift of black"}
+    )
+    noise: float = field(
+        default=0.02, metadata={"help": "standard deviation of the noise added to each Gaussian's color; white = 1"}
+    )
 
     def __post_init__(self) -> None:
         for name in ("turn", "tilt", "jitter", "noise"):
@@ -41,8 +45,8 @@ class AugmentConfig:
                 raise InputError(f"{name}: expected at most 360 degrees, got {getattr(self, name)}")
         for name in ("mirror", "drop", "scale", "light", "tint"):
             if not 0 <= getattr(self, name) <= (1 if name == "mirror" else 0.9):
-                most = 1 if name == "mirror" else 0.9
-                raise InputError(f"{name}: expected a share from 0 to {most}, got {getattr(self, name)}")
+                limit = 1 if name == "mirror" else 0.9
+                raise InputError(f"{name}: expected a number from 0 to {limit}, got {getattr(self, name)}")
 
 
 def augment(
@@ -53,14 +57,14 @@ def augment(
     voxel: float,
     up: Float64[np.ndarray, "3"] | None = None,
 ) -> Gaussians:
-    """One random version, row by row the same Gaussians.
+    """Applies random changes to a splat; row i of the result is Gaussian i.
 
     Args:
-        gaussians: world units.
-        rng: everything random comes from it.
-        config: how much may change; `drop` is not done here, since rows would go (see `gsencoder.train.crops`).
-        voxel: the unit of `jitter`, world units.
-        up: the axis of `turn`; the world's z where it is not known.
+        gaussians: the splat, world units.
+        rng: source of all random numbers.
+        config: strengths of the changes; `drop` is applied by `samples.make_sample`, since it removes rows.
+        voxel: unit of `jitter`, world units.
+        up: axis of `turn`, a unit vector; None = the z axis of the world.
     """
     axis = np.array([0.0, 0.0, 1.0]) if up is None else up / np.linalg.norm(up)
     rotation = Rotation.from_rotvec(axis * math.radians(rng.uniform(-config.turn, config.turn)))
@@ -114,22 +118,22 @@ def _turn_sh(sh: Float32[np.ndarray, "N K 3"], to_from: np.ndarray) -> Float32[n
     degree = math.isqrt(sh.shape[1]) - 1
     if degree == 0:
         return sh
-    place = np.arange(_DIRECTIONS) + 0.5
-    z, around = 1 - 2 * place / _DIRECTIONS, place * math.pi * (1 + 5**0.5)
-    circle = np.sqrt(1 - z * z)
-    directions = np.stack((circle * np.cos(around), circle * np.sin(around), z), axis=1)
-    there = sh_basis(torch.from_numpy(directions), degree).numpy()
-    back = sh_basis(torch.from_numpy(directions @ to_from), degree).numpy()
-    matrix = np.linalg.lstsq(there, back, rcond=None)[0]
+    i = np.arange(_DIRECTIONS) + 0.5
+    z, azimuth = 1 - 2 * i / _DIRECTIONS, i * math.pi * (1 + 5**0.5)
+    radius = np.sqrt(1 - z * z)
+    directions = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1)
+    basis = sh_basis(torch.from_numpy(directions), degree).numpy()
+    unturned_basis = sh_basis(torch.from_numpy(directions @ to_from), degree).numpy()
+    matrix = np.linalg.lstsq(basis, unturned_basis, rcond=None)[0]
     return np.einsum("kj,njc->nkc", matrix, sh).astype(np.float32)
 
 
 def _relight(
     sh: Float32[np.ndarray, "N K 3"], rng: np.random.Generator, config: AugmentConfig
 ) -> Float32[np.ndarray, "N K 3"]:
-    """Brighter or darker, tinted, with noise; colors are ½ + SH_C0·dc, and all degrees are scaled alike."""
+    """Changes brightness and tint and adds noise; colors are ½ + SH_C0·dc, and all degrees are scaled equally."""
     gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
-    changed = sh * gain
-    black = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
-    changed[:, 0] += (black + rng.normal(0, config.noise, (len(sh), 3))) / SH_C0
-    return changed.astype(np.float32)
+    relit = sh * gain
+    black_shift = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
+    relit[:, 0] += (black_shift + rng.normal(0, config.noise, (len(sh), 3))) / SH_C0
+    return relit.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Which Gaussians of a scene a training sample holds: those in the frusta of a few views, and no more than fit."""
+"""Crops: selection of the Gaussians of a training sample, those in the frusta of a few views up to a maximum number."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,35 +10,43 @@ from jaxtyping import Bool, Float32, Int64
 from gsencoder.core.errors import InputError
 from gsencoder.types import Cameras
 
-_AROUND = 4
-"""Times the size of a crop: so many of the nearest Gaussians are held against the frusta before all are."""
+_CANDIDATES_PER_GAUSSIAN = 4
+"""Gaussians nearest to the center that are tested against the frusta first, as a multiple of the size of a crop."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SamplingConfig:
-    """How a sample is cut out of a scene (SplatDistill sec. 3.3, "view-dependent selection")."""
+    """Selection of the Gaussians and views of a sample (SplatDistill sec. 3.3, "view-dependent selection")."""
 
     scope: Literal["frusta", "scene"] = field(
-        default="frusta", metadata={"help": "Gaussians in the frusta of the target views, or of the whole scene"}
+        default="frusta",
+        metadata={"help": "candidates: Gaussians in the frusta of the target views, or all of the scene"},
     )
-    views: int = field(default=4, metadata={"help": "target views of a sample; render losses are taken in them"})
-    gaussians: int = field(default=30_000, metadata={"help": "most Gaussians of a sample, nearest first; 0 = all"})
+    views: int = field(
+        default=4, metadata={"help": "number of target views of a sample, in which the render loss is computed"}
+    )
+    gaussians: int = field(
+        default=30_000,
+        metadata={"help": "largest number of Gaussians of a sample, nearest to its center first; 0 = all"},
+    )
     smallest: int = field(
-        default=4_000, metadata={"help": "crops are of sizes from this up to the most, in equal ratios; 0 = all of one"}
+        default=4_000,
+        metadata={"help": "smallest size of a crop; sizes are log-uniform up to `gaussians`; 0 = all of that size"},
     )
     rare_centers: float = field(
-        default=0.8, metadata={"help": "share of crops whose center is of any kind of target alike, not just anywhere"}
+        default=0.8,
+        metadata={"help": "share of crops whose center is drawn evenly over target classes instead of over Gaussians"},
     )
 
     def __post_init__(self) -> None:
         if self.views < 1:
             raise InputError(f"views: expected at least 1 target view, got {self.views}")
         if self.gaussians < 0:
-            raise InputError(f"gaussians: expected 0 (all) or more, got {self.gaussians}")
+            raise InputError(f"gaussians: expected 0 (no limit) or more, got {self.gaussians}")
         if self.smallest < 0:
             raise InputError(f"smallest: expected 0 (crops of one size) or more, got {self.smallest}")
         if not 0 <= self.rare_centers <= 1:
-            raise InputError(f"rare_centers: expected a share in [0, 1], got {self.rare_centers}")
+            raise InputError(f"rare_centers: expected a number in [0, 1], got {self.rare_centers}")
 
 
 def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras, *, near: float = 0.01) -> Bool[np.ndarray, " N"]:
@@ -62,8 +70,10 @@ def seen_by(point: Float32[np.ndarray, "3"], cameras: Cameras, *, near: float = 
     return cameras.in_image(*cameras.project(point[None]), near=near)[:, 0]
 
 
-def nearest(means: Float32[np.ndarray, "n 3"], center: Float32[np.ndarray, "3"], count: int) -> Int64[np.ndarray, " m"]:
-    """The `count` rows nearest to a point, in ascending order of rows; all of them where there are no more."""
+def nearest_rows(
+    means: Float32[np.ndarray, "n 3"], center: Float32[np.ndarray, "3"], count: int
+) -> Int64[np.ndarray, " m"]:
+    """The `count` rows nearest to a point, in ascending order; all rows if there are not more."""
     if len(means) <= count:
         return np.arange(len(means))
     distances = np.square(means - center).sum(axis=1)
@@ -71,85 +81,87 @@ def nearest(means: Float32[np.ndarray, "n 3"], center: Float32[np.ndarray, "3"],
 
 
 def crop_size(config: SamplingConfig, rng: np.random.Generator) -> int:
-    """How many Gaussians a crop holds at most; 0 = all. Small crops show small things often; large ones show what a
-    door or a sofa can be told by."""
+    """Draws the largest number of Gaussians of a crop; 0 = no limit.
+
+    Small crops show small objects often; large ones show the context by which a door or a sofa is recognized.
+    """
     if not 0 < config.smallest < config.gaussians:
         return config.gaussians
     return round(config.smallest * (config.gaussians / config.smallest) ** rng.random())
 
 
-def choose_part(
+def choose_crop(
     means: Float32[np.ndarray, "N 3"],
     cameras: Cameras,
-    chances: Float32[np.ndarray, " N"],
+    center_weights: Float32[np.ndarray, " N"],
     config: SamplingConfig,
     size: int,
     rng: np.random.Generator,
 ) -> tuple[tuple[int, ...], Int64[np.ndarray, " n"]]:
-    """Target views, and the rows of the sample that is cut for them.
+    """Chooses target views and the Gaussians of a sample.
 
-    Without a limit the views are drawn first, and everything in their frusta is taken, as in the paper. With one, the
-    center of the crop is drawn first and the views are among those that look at it: views that look elsewhere would
+    Without a limit of size the views are drawn first and all Gaussians in their frusta are taken, as in the paper. With
+    a limit the center of the crop is drawn first, and the views are drawn from those that see it: other views would
     show nothing of the sample.
 
     Args:
-        means: of the whole scene.
-        cameras: of all its views.
-        chances: of each Gaussian to be the center of a crop; 0 = has no target, and never is.
-        config: see there.
-        size: most Gaussians (`crop_size`); 0 = all.
-        rng: everything random comes from it.
+        means: centers of all Gaussians of the scene.
+        cameras: all cameras of the scene.
+        center_weights: for each Gaussian, its weight in drawing the center of a crop; 0 for those without a target.
+        config: settings of sampling.
+        size: largest number of Gaussians (`crop_size`); 0 = no limit.
+        rng: source of all random numbers.
 
     Returns:
-        Views without repetition (all that there are, where there are no more than asked for), and rows, ascending.
+        Distinct views, fewer than `config.views` if no more are suitable, and rows in ascending order.
 
     Raises:
         InputError: no Gaussian lies in the frustum of any view.
     """
-    everywhere = config.scope == "scene"
+    full_scene = config.scope == "scene"
     if not 0 < size < len(means):
         drawn = rng.permutation(len(cameras))
         views = drawn[: config.views]
-        rows = np.arange(len(means)) if everywhere else np.flatnonzero(in_frusta(means, cameras.select(views)))
+        rows = np.arange(len(means)) if full_scene else np.flatnonzero(in_frusta(means, cameras.select(views)))
         for view in drawn[config.views :]:
             if len(rows):
                 break
-            # A camera that looks into the void is no reason to stop; another takes its place.
+            # A view that sees nothing is replaced by another one.
             views = np.array([view])
             rows = np.flatnonzero(in_frusta(means, cameras.select(views)))
     else:
-        center = means[_draw(chances, config, rng)]
-        looking = np.flatnonzero(seen_by(center, cameras))
-        views = rng.permutation(looking if len(looking) else len(cameras))[: config.views]
-        rows = nearest(means, center, len(means) if everywhere else _AROUND * size)
-        if not everywhere:
-            chosen = cameras.select(views)
-            rows = rows[in_frusta(means[rows], chosen)]
+        center = means[_draw_center(center_weights, config, rng)]
+        seeing = np.flatnonzero(seen_by(center, cameras))
+        views = rng.permutation(seeing if len(seeing) else len(cameras))[: config.views]
+        rows = nearest_rows(means, center, len(means) if full_scene else _CANDIDATES_PER_GAUSSIAN * size)
+        if not full_scene:
+            selected = cameras.select(views)
+            rows = rows[in_frusta(means[rows], selected)]
             if len(rows) < size:
-                rows = np.flatnonzero(in_frusta(means, chosen))
-            if not len(rows):  # Nobody looks at the center, and these views see nothing: take whoever sees something.
+                rows = np.flatnonzero(in_frusta(means, selected))
+            if not len(rows):  # No view sees the center, and those drawn see no Gaussian at all: use all views.
                 views = rng.permutation(len(cameras))
                 rows = np.flatnonzero(in_frusta(means, cameras))
-        rows = rows[nearest(means[rows], center, size)]
+        rows = rows[nearest_rows(means[rows], center, size)]
     if not len(rows):
         raise InputError("sample: no Gaussian lies in the frustum of any view; check poses and units")
     return tuple(int(view) for view in views), rows
 
 
-def _draw(chances: Float32[np.ndarray, " N"], config: SamplingConfig, rng: np.random.Generator) -> int:
-    """The center of a crop."""
-    each = chances.astype(np.float64)
+def _draw_center(center_weights: Float32[np.ndarray, " N"], config: SamplingConfig, rng: np.random.Generator) -> int:
+    """Draws the row of the center of a crop."""
+    weights = center_weights.astype(np.float64)
     if rng.random() >= config.rare_centers:
-        each = (each > 0).astype(np.float64)
-    total = np.cumsum(each)
-    if not 0 < total[-1] < math.inf:
-        return int(rng.integers(len(chances)))
-    return int(min(np.searchsorted(total, rng.random() * total[-1], side="right"), len(chances) - 1))
+        weights = (weights > 0).astype(np.float64)
+    cumulative = np.cumsum(weights)
+    if not 0 < cumulative[-1] < math.inf:
+        return int(rng.integers(len(center_weights)))
+    return int(min(np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right"), len(center_weights) - 1))
 
 
-def thin_out(rows: Int64[np.ndarray, " n"], most: float, rng: np.random.Generator) -> Int64[np.ndarray, " m"]:
-    """Leaves out a random share of rows, at most `most` of them on average; never all."""
-    if not most:
+def drop_random(rows: Int64[np.ndarray, " n"], max_share: float, rng: np.random.Generator) -> Int64[np.ndarray, " m"]:
+    """Drops each row with one probability that is drawn between 0 and `max_share`; never drops all rows."""
+    if not max_share:
         return rows
-    kept = rows[rng.random(len(rows)) >= rng.uniform(0, most)]
-    return kept if len(kept) else rows
+    remaining = rows[rng.random(len(rows)) >= rng.uniform(0, max_share)]
+    return remaining if len(remaining) else rows

@@ -1,4 +1,4 @@
-"""One output space for a whole dataset: the mean, the scale and the basis that all its scenes share."""
+"""The output space of a dataset: mean, scale and basis that all its scenes share."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,8 +15,8 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import Scene, Views
 
-MOST_CELLS = 4096
-"""Cells of one map that the moments are taken from."""
+MAX_CELLS_PER_MAP = 4096
+"""Approximate limit of the cells of one teacher map that enter the moments."""
 
 
 def dataset_space(
@@ -26,45 +26,46 @@ def dataset_space(
     *,
     views: int,
 ) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
-    """Finds the space of a dataset.
+    """Computes the output space of a dataset.
 
-    A coded teacher's tables are put together; each distinct vector counts once. A dense teacher is asked for `views`
-    maps, evenly spread over the scenes and their views.
+    For a coded teacher the moments are those of the distinct vectors of all its tables. For a dense teacher they are
+    those of `views` maps, evenly distributed over the scenes and their views.
 
     Args:
-        scenes: all that will be trained on.
+        scenes: all scenes to train on.
         open_scene: reads a scene without making Gaussians, and builds its teacher.
-        config: share of the energy to keep, largest rank, channels below which there is no basis.
-        views: maps of a dense teacher that are looked at.
+        config: share of the energy that the basis keeps, its largest rank, and the number of channels up to which there
+            is no basis.
+        views: number of maps of a dense teacher to use.
 
     Returns:
-        The space, and for a coded teacher its vectors in standard units.
+        The space, and for a coded teacher its vectors in standard units, else None.
 
     Raises:
-        InputError: no scenes, or teachers of several spaces.
+        InputError: there are no scenes, or their teachers have different spaces.
     """
     if not scenes:
         raise InputError("training: no scenes to train on")
     tables: list[np.ndarray] = []
     moments: Moments | None = None
     teacher: Teacher | None = None
-    share = np.linspace(0, views, len(scenes) + 1).round().astype(int)
+    view_bounds = np.linspace(0, views, len(scenes) + 1).round().astype(int)
     for number, path in enumerate(scenes):
-        if teacher is not None and teacher.table is None and share[number] == share[number + 1]:
+        if teacher is not None and teacher.table is None and view_bounds[number] == view_bounds[number + 1]:
             continue
-        scene, found = open_scene(path)
-        if teacher is not None and found.space != teacher.space:
+        scene, scene_teacher = open_scene(path)
+        if teacher is not None and scene_teacher.space != teacher.space:
             raise InputError(
-                f"training: scenes of several feature spaces: ({teacher.space.describe()}) and, in {path}, "
-                f"({found.space.describe()})"
+                f"training: expected one feature space for all scenes, got several feature spaces: "
+                f"({teacher.space.describe()}), and in {path} ({scene_teacher.space.describe()})"
             )
-        teacher = found
+        teacher = scene_teacher
         if teacher.table is not None:
             tables.append(teacher.table)
             continue
         moments = moments or Moments(teacher.space.channels)
         assert scene.views is not None
-        _look(moments, teacher, scene.views, max(1, int(share[number + 1] - share[number])))
+        _add_maps(moments, teacher, scene.views, max(1, int(view_bounds[number + 1] - view_bounds[number])))
     assert teacher is not None
     if tables:
         return _coded_space(np.unique(np.concatenate(tables), axis=0), teacher, config)
@@ -72,11 +73,12 @@ def dataset_space(
     return _dense_space(moments, teacher, config), None
 
 
-def _look(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:
+def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:
+    """Adds cells of the maps of `count` evenly spaced views to the moments."""
     for view in evenly(len(views), count):
         rows = map_rows(teacher.feature_map(views, int(view)))
         rows = rows[np.isfinite(rows[:, 0])]
-        moments.add(rows[:: max(1, len(rows) // MOST_CELLS)])
+        moments.add(rows[:: max(1, len(rows) // MAX_CELLS_PER_MAP)])
 
 
 def _coded_space(
@@ -84,14 +86,14 @@ def _coded_space(
 ) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"]]:
     mean = teacher.mean if teacher.mean is not None else table.mean(axis=0)
     scale = _scale(np.square(table - mean, dtype=np.float64).sum(axis=1).mean(), teacher)
-    wanted = config.basis and teacher.space.channels > config.narrow
-    basis = table_basis(table, mean, teacher.space, energy=config.table_energy) if wanted else None
+    use_basis = config.basis and teacher.space.channels > config.narrow
+    basis = table_basis(table, mean, teacher.space, energy=config.table_energy) if use_basis else None
     space = OutputSpace(space=teacher.space, mean=mean, scale=scale, basis=basis)
     return space, space.standardize(encode(basis, table) if basis is not None else table)
 
 
 def _dense_space(moments: Moments, teacher: Teacher, config: FuseConfig) -> OutputSpace:
-    # The mean of what was looked at, and not one that the teacher states: moments are taken about it.
+    # The mean of the sampled maps, even if the teacher states another one: the covariance is about it.
     mean, covariance = moments.mean.astype(np.float32), moments.covariance()
     scale = _scale(np.trace(covariance), teacher)
     basis = None
@@ -103,14 +105,14 @@ def _dense_space(moments: Moments, teacher: Teacher, config: FuseConfig) -> Outp
 
 
 def _scale(variance: float, teacher: Teacher) -> float:
-    """Root of the mean squared distance from the mean.
+    """The root mean square distance from the mean, given the variance.
 
     Raises:
-        InputError: there is none, so there is nothing to tell apart.
+        InputError: the variance is 0: all features are equal.
     """
     if not variance > 0:
         raise InputError(
             f"training: the teacher ({teacher.space.describe()}) gives the same features everywhere in these scenes; "
-            "there is nothing to learn. Look at their pictures, and at what the teacher says of them (`gsencoder fuse`)"
+            "there is nothing to learn. Check the images, and the teacher's features of these scenes (`gsencoder fuse`)"
         )
     return float(np.sqrt(variance))

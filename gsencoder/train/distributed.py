@@ -1,7 +1,7 @@
-"""One process or many, on one machine or many: who this process is, and sums over all of them.
+"""Distributed training with torch.distributed: the rank of this process, the process group, and sums over processes.
 
-torchrun and SLURM (srun, submitit) give a process its rank through the environment; without either there is one.
-Nothing else in the package asks how many there are.
+torchrun and SLURM (srun, submitit) give a process its rank through environment variables; without either there is one
+process. No other module reads these variables.
 """
 
 import gc
@@ -24,12 +24,12 @@ STOPPED_ELSEWHERE = "training: another process stopped; its own message says why
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessRank:
-    """A process among those that train together.
+    """The rank of a process in a distributed training.
 
     Attributes:
-        rank: its number.
-        world_size: how many there are.
-        local_rank: its number on its machine.
+        rank: its number among all processes, from 0.
+        world_size: number of processes.
+        local_rank: its number among the processes of its machine.
     """
 
     rank: int = 0
@@ -38,93 +38,101 @@ class ProcessRank:
 
     @property
     def is_first(self) -> bool:
-        """Whether this is the process that writes and speaks."""
+        """Whether this is the process that writes files and prints."""
         return self.rank == 0
 
 
 def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, str]:
-    """The rank that an environment gives, and where processes meet ("tcp://…", or "env://" under torchrun).
+    """Reads the rank of this process from environment variables of torchrun or SLURM.
+
+    Returns:
+        The rank, and the init_method for `torch.distributed`: "tcp://…" under SLURM, "env://" under torchrun, else "".
 
     Raises:
-        InputError: an environment that contradicts itself.
+        InputError: the variables contradict each other.
     """
     if "RANK" in environment and "WORLD_SIZE" in environment:
         names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
-        rank, size, local = (_number(environment, name, "0") for name in names)
-        meeting = "env://"
-    elif "SLURM_STEP_ID" in environment and _number(environment, "SLURM_NTASKS", "1") > 1:
-        # Without a step this is the batch script itself, which runs once however many tasks the job has.
+        rank, size, local = (_read_number(environment, name, "0") for name in names)
+        init_method = "env://"
+    elif "SLURM_STEP_ID" in environment and _read_number(environment, "SLURM_NTASKS", "1") > 1:
+        # Without a step this is the batch script itself, which runs once for any number of tasks.
         names = ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_LOCALID")
-        rank, size, local = (_number(environment, name, "0") for name in names)
+        rank, size, local = (_read_number(environment, name, "0") for name in names)
         nodes = environment.get("SLURM_STEP_NODELIST") or environment.get("SLURM_JOB_NODELIST", "")
         host = environment.get("MASTER_ADDR") or first_host(nodes)
-        # Jobs that share a machine must not meet at one port; their numbers differ.
-        port = environment.get("MASTER_PORT") or str(20_000 + _number(environment, "SLURM_JOB_ID", "0") % 20_000)
-        meeting = f"tcp://{host}:{port}"
+        # Jobs that share a machine need different ports; their job ids differ.
+        port = environment.get("MASTER_PORT") or str(20_000 + _read_number(environment, "SLURM_JOB_ID", "0") % 20_000)
+        init_method = f"tcp://{host}:{port}"
     else:
         return ProcessRank(), ""
     if not 0 <= rank < size:
         raise InputError(f"{names[0]}={rank} is not below {names[1]}={size}; start all processes with one launcher")
-    return ProcessRank(rank=rank, world_size=size, local_rank=local), meeting
+    return ProcessRank(rank=rank, world_size=size, local_rank=local), init_method
 
 
-def gpu_of(process: ProcessRank, meeting: str) -> int:
-    """The number of this process's GPU among those that it sees.
+def gpu_index(process: ProcessRank, init_method: str) -> int:
+    """The index of this process's GPU among those that it sees.
 
-    Where SLURM gives each task a GPU of its own, a task sees that one alone.
+    It is 0 where SLURM binds one GPU to each task, so that a task sees only that one.
     """
-    bound = meeting.startswith("tcp://") and torch.cuda.device_count() == 1
-    return 0 if bound else process.local_rank
+    is_bound = init_method.startswith("tcp://") and torch.cuda.device_count() == 1
+    return 0 if is_bound else process.local_rank
 
 
 def first_host(nodes: str) -> str:
-    """The first machine of a SLURM list such as `a[03-07,9],b1`.
+    """The first host of a SLURM node list such as `a[03-07,9],b1`.
 
     Raises:
-        InputError: an empty list.
+        InputError: the list is empty.
     """
-    found = re.match(r"([^\[,\s]+)(?:\[([^\]]*)\])?([^\[,\s]*)", nodes)
-    if not found:
-        raise InputError("SLURM: the list of machines (SLURM_STEP_NODELIST) is empty; set MASTER_ADDR")
-    before, numbers, after = found.groups()
-    return before + (re.split(r"[-,]", numbers)[0] if numbers else "") + after
+    match = re.match(r"([^\[,\s]+)(?:\[([^\]]*)\])?([^\[,\s]*)", nodes)
+    if not match:
+        raise InputError("SLURM: the node list (SLURM_STEP_NODELIST) is empty; set MASTER_ADDR")
+    prefix, numbers, suffix = match.groups()
+    return prefix + (re.split(r"[-,]", numbers)[0] if numbers else "") + suffix
 
 
-def _number(environment: Mapping[str, str], name: str, default: str) -> int:
+def _read_number(environment: Mapping[str, str], name: str, default: str) -> int:
     value = environment.get(name, default)
     if not value.isdigit():
-        raise InputError(f"{name}: expected a whole number in the environment, got {value!r}")
+        raise InputError(f"{name}: expected a whole number in the environment variable, got {value!r}")
     return int(value)
 
 
 @contextmanager
-def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[tuple[ProcessRank, torch.device]]:
-    """Meets the other processes for the block; yields the rank and the device of this one.
+def join_processes(
+    device: Device = "auto", *, timeout_hours: float = 24.0
+) -> Iterator[tuple[ProcessRank, torch.device]]:
+    """Joins the process group for the block.
 
     Args:
-        device: "auto" (a GPU for each process of a machine where torch sees any, else the CPU), "cpu" or "cuda".
-        timeout_hours: how long to wait for the others: preparation may keep one busy. A process that dies is noticed by
-            the launcher, not by this.
+        device: "auto" (one GPU per process if torch sees any, else the CPU), "cpu" or "cuda".
+        timeout_hours: longest wait for other processes, which may be preparing scenes. A process that dies is noticed
+            by the launcher, not here.
+
+    Yields:
+        The rank and the device of this process.
 
     Raises:
-        InputError: no such device, or the others cannot be met.
+        InputError: there is no such device, or the other processes cannot be reached.
     """
-    process, meeting = rank_from_environment(os.environ)
-    chosen = choose_device(device, gpu_of(process, meeting))
+    process, init_method = rank_from_environment(os.environ)
+    chosen = choose_device(device, gpu_index(process, init_method))
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
     if process.world_size == 1:
         yield process, chosen
         return
     backend = "nccl" if chosen.type == "cuda" else "gloo"
-    # Its functions take the group that exists when they are imported as a default argument, and would keep it forever;
-    # DistributedDataParallel imports them. A group that is still there when the interpreter ends may abort the process.
+    # This module, which DistributedDataParallel needs, is imported before the group exists: default arguments of its
+    # functions would hold the group until the interpreter ends, which may abort the process.
     from torch.distributed import nn  # noqa: F401
 
     try:
         distributed.init_process_group(
             backend,
-            init_method=meeting,
+            init_method=init_method,
             rank=process.rank,
             world_size=process.world_size,
             timeout=timedelta(hours=timeout_hours),
@@ -132,16 +140,16 @@ def joined(device: Device = "auto", *, timeout_hours: float = 24.0) -> Iterator[
     except (RuntimeError, ValueError) as error:
         message = " ".join(str(error).split())[:200]
         ranks = f"process {process.rank} of {process.world_size}"
-        raise InputError(f"training: {ranks} cannot meet the others: {message}") from error
+        raise InputError(f"training: {ranks} cannot reach the others: {message}") from error
     yield process, chosen
-    # Not after an error: the others may be waiting for a sum, and leaving the group would wait for them.
-    # A network that was wrapped refers to itself and to the group, which ends with its last reference.
+    # Not after an error: other processes may be waiting in a reduction, and leaving the group would wait for them.
+    # A wrapped network holds a reference cycle with the group, which must be collected before the group is destroyed.
     gc.collect()
     distributed.destroy_process_group()
 
 
 def sum_over_processes(values: Tensor) -> Tensor:
-    """The sum of each entry over all processes; what was given where there is one."""
+    """Sums each entry over all processes, in place; with one process the values are unchanged."""
     if distributed.is_available() and distributed.is_initialized():
         distributed.all_reduce(values)
     return values
@@ -149,11 +157,12 @@ def sum_over_processes(values: Tensor) -> Tensor:
 
 @contextmanager
 def fail_together() -> Iterator[None]:
-    """A block that processes go through on their own, one of them perhaps doing all the work. They leave it together,
-    and if one of them fails in it, all do: none is left waiting.
+    """Synchronizes processes at the end of a block that they run independently, or that one of them runs for all.
+
+    If one process fails in the block, all fail, so that none waits forever.
 
     Raises:
-        Exception: this process's own.
+        Exception: the error of this process.
         InputError: another process failed.
     """
     failure: Exception | None = None

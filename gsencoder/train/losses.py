@@ -1,10 +1,10 @@
-"""The losses of distillation (SplatDistill Eqs. 3–5): unreduced, so that a step divides once, by global counts.
+"""The losses of distillation (SplatDistill Eqs. 3–5), as weighted sums, so that a step divides once by global weights.
 
-All of them work in standard units (`OutputSpace`), about the space's mean: raw CLIP-like vectors are nearly parallel,
-and a cosine between them hardly tells names apart.
+All losses work in standard units about the mean of the space (`OutputSpace`): raw CLIP-like vectors are nearly
+parallel, and the cosine between them hardly distinguishes names.
 
-Eq. 4 of the paper prints the render of G_fused, which has no parameters; what trains is the render of the predicted
-features, and that is what stands here.
+Eq. 4 of the paper is written with the render of G_fused, which has no parameters. It is computed here with the render
+of the predicted features, which can be trained.
 """
 
 from collections.abc import Sequence
@@ -19,66 +19,75 @@ from gsencoder.core.errors import InputError
 from gsencoder.render import Blend
 
 EPS = 1e-12
-MOST_RARITY = 4.0
-"""Kinds of a million Gaussians then still count 1e-24 times as much as one."""
+MAX_RARITY = 4.0
+"""Limit of the power of class frequencies: with it a Gaussian of a class of 10⁶ already weighs 1e-24."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossConfig:
-    """What is compared, and how much it counts."""
+    """Weights and parameters of the loss terms."""
 
     cosine: float = field(default=0.9, metadata={"help": "α: weight of 1 − cosine in the matching loss"})
-    smooth_l1: float = field(default=0.1, metadata={"help": "β: weight of the smooth L1 distance in it"})
-    field_weight: float = field(default=1.0, metadata={"help": "λ of the loss on Gaussians"})
-    render_weight: float = field(default=0.2, metadata={"help": "λ of the loss on rendered cells; 0 = not rendered"})
+    smooth_l1: float = field(default=0.1, metadata={"help": "β: weight of the smooth L1 distance in the matching loss"})
+    field_weight: float = field(default=1.0, metadata={"help": "λ of the loss on Gaussians (L_3D)"})
+    render_weight: float = field(default=0.2, metadata={"help": "λ of the loss on rendered cells (L_render); 0 = off"})
     contrast_weight: float = field(
-        default=0.0, metadata={"help": "λ of telling a target's kind from the dataset's others; 0 = not asked"}
+        default=0.0, metadata={"help": "λ of the cross-entropy among target classes (L_contrast); 0 = off"}
     )
     temperature: float = field(
-        default=0.1, metadata={"help": "of the contrast: how much nearer its own kind must be, in typical distances²"}
+        default=0.1, metadata={"help": "temperature of the softmax in L_contrast, in squared typical distances"}
     )
     rarity: float = field(
-        default=0.5, metadata={"help": "targets of a kind with n Gaussians in the dataset count n^−this; 0 = all alike"}
+        default=0.5,
+        metadata={
+            "help": "power p of class weights: targets of a class with n Gaussians are weighted by n^−p; 0 = equally"
+        },
     )
-    min_alpha: float = field(default=0.5, metadata={"help": "cells less opaque than this are not compared"})
+    min_alpha: float = field(default=0.5, metadata={"help": "smallest opacity that a cell must have to enter L_render"})
     min_kept: float = field(
-        default=0.95, metadata={"help": "cells that lose more of their weight to the selection are not compared"}
+        default=0.95,
+        metadata={"help": "smallest share of a cell's weight that must be in the crop for the cell to enter L_render"},
     )
 
     def __post_init__(self) -> None:
         for name in ("cosine", "smooth_l1", "field_weight", "render_weight", "contrast_weight", "rarity"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if self.rarity > MOST_RARITY:
+        if self.rarity > MAX_RARITY:
             raise InputError(
-                f"rarity: expected at most {MOST_RARITY}, got {self.rarity}: all but the rarest would be 0"
+                f"rarity: expected at most {MAX_RARITY}, got {self.rarity}: only the rarest classes would keep a weight"
             )
         if not 0 < self.temperature < float("inf"):
             raise InputError(f"temperature: expected a positive number, got {self.temperature}")
         for name in ("min_alpha", "min_kept"):
             if not 0 < getattr(self, name) <= 1:
-                raise InputError(f"{name}: expected a share in (0, 1], got {getattr(self, name)}")
+                raise InputError(f"{name}: expected a number in (0, 1], got {getattr(self, name)}")
         if not (self.cosine + self.smooth_l1 > 0 or self.contrast_weight > 0):
-            raise InputError("cosine and smooth_l1: expected one above 0, there is no loss left")
+            raise InputError(
+                "cosine and smooth_l1: expected one above 0 unless contrast_weight is; there would be no loss"
+            )
         if not self.field_weight + self.render_weight + self.contrast_weight > 0:
             raise InputError(
-                "field_weight, render_weight and contrast_weight: expected one above 0, there is no loss left"
+                "field_weight, render_weight and contrast_weight: expected one above 0; there would be no loss"
             )
 
 
-class Head(nn.Module):
-    """A teacher's adapter head, frozen: from decoded features to another space, in standard units of that space.
+class AdapterHead(nn.Module):
+    """A frozen adapter head of a teacher: from decoded features to standard units of another feature space.
 
-    The network's features must serve these heads as the teacher's own do (SplatDistill sec. 3.3).
+    The distilled features must work with these heads as the teacher's features do (SplatDistill sec. 3.3).
     """
 
     mean: Tensor
 
     def __init__(self, body: nn.Module, mean: Float[Tensor, " E"], scale: float) -> None:
         """Args:
-        body: features [n, D] to vectors [n, E].
-        mean: of the head's outputs over the dataset.
-        scale: their root mean square distance from it.
+        body: network from features [n, D] to vectors [n, E].
+        mean: mean of the outputs of `body` for the teacher's features.
+        scale: root mean square distance of these outputs from their mean.
+
+        Raises:
+            InputError: the scale is not a positive number.
         """
         super().__init__()
         if not 0 < scale < float("inf"):
@@ -95,24 +104,23 @@ class Head(nn.Module):
 def match_loss(
     predicted: Float[Tensor, "n C"], target: Float[Tensor, "n C"], config: LossConfig
 ) -> Float[Tensor, " n"]:
-    """α·(1 − cos)·min(1, |target| / √C) + β·smooth-L1, averaged over channels (Eq. 3), for each row.
+    """The matching loss of each row (Eq. 3): α·(1 − cos)·min(1, |target| / √C) + β·smooth-L1, averaged over channels.
 
-    √C is the length of a typical target in standard units. Near the mean a target's direction is noise (it is where
-    "other" lies), so the cosine counts in proportion there.
+    √C is the root mean square length of targets in standard units. Near the mean, where "other" lies, the direction of
+    a target is mostly noise, so its cosine is weighted by the target's relative length.
     """
     predicted, target = predicted.float(), target.float()
     lengths = torch.sqrt((target * target).sum(dim=1) + EPS)
     cosines = (predicted * target).sum(dim=1) / (lengths * torch.sqrt((predicted * predicted).sum(dim=1) + EPS))
-    sure = (lengths / target.shape[1] ** 0.5).clamp(max=1)
+    confidence = (lengths / target.shape[1] ** 0.5).clamp(max=1)
     distance = functional.smooth_l1_loss(predicted, target, reduction="none").mean(dim=1)
-    return config.cosine * (1 - cosines) * sure + config.smooth_l1 * distance
+    return config.cosine * (1 - cosines) * confidence + config.smooth_l1 * distance
 
 
 def field_loss(
     predicted: Float[Tensor, "N C"], target: Float[Tensor, "N C"], weights: Float[Tensor, " N"], config: LossConfig
 ) -> Float[Tensor, ""]:
-    """L_3D (Eq. 3) before its division: Σ_i w_i · match_i over Gaussians; those of weight 0 were never seen and have no
-    target."""
+    """L_3D (Eq. 3) before division: Σ_i w_i · match_i over Gaussians; those of weight 0 have no target."""
     rows = torch.nonzero(weights).squeeze(1)
     losses = match_loss(predicted.index_select(0, rows), target.index_select(0, rows), config)
     return (losses * weights.index_select(0, rows)).sum()
@@ -125,17 +133,18 @@ def contrast_loss(
     codebook: Float[Tensor, "K C"],
     config: LossConfig,
 ) -> Float[Tensor, ""]:
-    """Σ_i w_i · cross-entropy of a target's kind among all kinds, softmax_k(−|predicted − c_k|² / (2·C·temperature)).
+    """L_contrast before division: Σ_i w_i · cross-entropy of the class of target i, with the class probabilities
+    softmax_k(−|predicted − c_k|² / (2·C·temperature)).
 
-    Where two kinds look alike, what fits both best under L_3D is their mean, which may be nearest to a third. This term
-    makes the likelier one win, by as much as the features are told apart by later: their nearest vector.
+    If two classes look alike, L_3D is smallest at a mean of both, which may be nearest to a third class. This term
+    moves the prediction towards the likelier of the two, so that it is also the nearest vector of the codebook.
 
     Args:
-        predicted: standard units.
-        codes: for each Gaussian the row of the codebook that its target is nearest to.
-        weights: in the loss; 0 where a Gaussian has no target, and whatever its code is is not looked at.
-        codebook: kinds of target, standard units.
-        config: for the temperature.
+        predicted: predicted features, standard units.
+        codes: for each Gaussian, the class of its target, which is a row of the codebook.
+        weights: weights in the loss; 0 for Gaussians without a target, whose codes are ignored.
+        codebook: vectors c_k of the target classes, standard units.
+        config: settings, of which the temperature is used.
     """
     rows = torch.nonzero(weights).squeeze(1)
     half = 0.5 * (codebook * codebook).sum(dim=1)
@@ -150,20 +159,20 @@ def render_loss(
     target: Float[Tensor, "P C"],
     weights: Float[Tensor, " P"],
     config: LossConfig,
-    heads: Sequence[tuple[Head, nn.Module]] = (),
+    heads: Sequence[tuple[AdapterHead, nn.Module]] = (),
 ) -> Float[Tensor, ""]:
-    """L_render (Eq. 4) before its division: Σ_p w_p · match((B f)_p / alpha_p, t_p) over cells of the teacher's grid.
+    """L_render (Eq. 4) before division: Σ_p w_p · match((B f)_p / alpha_p, t_p) over cells of the teacher's grid.
 
-    The division by alpha is by what of each cell the selection covers.
+    alpha_p is the weight of the crop's Gaussians in cell p, so the rendered features are weighted means.
 
     Args:
-        predicted: on the Gaussians of the sample.
-        blend: B over these Gaussians, rows of the cells that are compared.
-        target: the teacher's vectors there.
-        weights: of the rows.
-        config: weights of the terms.
-        heads: each with what decodes standard units to the teacher's space; the loss is summed over heads. Without
-            heads features are compared as they are.
+        predicted: predicted features f of the Gaussians of the sample, standard units.
+        blend: B over these Gaussians, with one row for each cell.
+        target: the teacher's vectors t in the cells, standard units.
+        weights: weights of the cells in the loss.
+        config: settings of the matching loss.
+        heads: adapter heads, each with a decoder from standard units to its input; the loss is summed over the outputs
+            of the heads. Without heads the features themselves are compared.
     """
     alpha = blend.alpha.clamp(min=EPS).unsqueeze(1)
     rendered = blend.render(predicted.float()) / alpha

@@ -1,4 +1,4 @@
-"""Making scenes ready for training: everything that does not depend on the encoder is worked out once, and kept."""
+"""Preparation of scenes for training: everything that does not depend on the encoder is computed once and stored."""
 
 import hashlib
 import json
@@ -25,30 +25,34 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
 from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 from gsencoder.render import blend
-from gsencoder.train.class_balance import Rarity, cluster_targets, count_targets
+from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.prepared_scene import PreparedScene, ViewRows, write_prepared
 from gsencoder.types import FeatureMap, Scene
 
-SPACE_FILE, SETTINGS_FILE, RARITY_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
-MAPS_PREFIX, MAPS_SECONDS = ".maps.", 24 * 3600.0
-"""Folders of maps of scenes that are being prepared; older ones were left by runs that were killed."""
-SAMPLED_TARGETS = 200_000
-"""Targets of all scenes together that clusters are sought in."""
+SPACE_FILE, DATASET_SETTINGS_FILE, CLASS_BALANCE_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
+MAPS_PREFIX, MAX_MAPS_AGE = ".maps.", 24 * 3600.0
+"""Prefix of the folders that cache teacher maps of scenes in preparation, and the age in seconds above which they were
+left by killed runs."""
+CLUSTERED_TARGETS = 200_000
+"""Approximate number of targets, over all scenes, from which classes of a dense teacher are clustered."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrepareConfig:
-    """How targets and the matrices of the render loss are made."""
+    """Settings of targets and of the matrices of the render loss."""
 
     fusion: FuseConfig = field(default_factory=FuseConfig)
     render_cell: int = field(
-        default=8, metadata={"help": "smallest cell of the render loss, pixels; finer teacher maps are averaged"}
+        default=8,
+        metadata={"help": "smallest side of a cell of the render loss, pixels; finer teacher maps are averaged"},
     )
     render_min_weight: float = field(
-        default=1e-3, metadata={"help": "smallest blending weight that is kept for the render loss"}
+        default=1e-3, metadata={"help": "smallest blending weight in the matrices of the render loss"}
     )
-    basis_views: int = field(default=256, metadata={"help": "maps of a dense teacher that its basis is found from"})
+    basis_views: int = field(
+        default=256, metadata={"help": "number of maps from which the basis of a dense teacher is computed"}
+    )
 
     def __post_init__(self) -> None:
         if self.render_cell < 1 or self.basis_views < 1:
@@ -62,54 +66,59 @@ class PrepareConfig:
 class PreparedDataset:
     """A folder of prepared scenes that share an output space.
 
-    Scenes are prepared one by one and appear whole or not at all, so that a run that was cut off goes on where it
-    stopped, and several processes may share the work.
+    The file of each scene is written atomically, so that an interrupted preparation can be continued, and several
+    processes can share the work.
     """
 
     def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
         """Args:
-        folder: made if it does not exist and settings are given.
-        settings: all that the preparation depends on; what the folder holds must have been made with the same. None =
-            what is there, whatever it was made with.
+        folder: the folder; created if it does not exist and settings are given.
+        settings: everything that the preparation depends on, compared with the settings stored in the folder. None =
+            open an existing dataset with any settings.
 
         Raises:
-            InputError: it was made with others, cannot be used, or holds nothing where it must.
+            InputError: the folder was prepared with other settings, cannot be read, or holds no prepared scenes and no
+                settings are given.
         """
         self.folder = folder
-        path = folder / SETTINGS_FILE
+        path = folder / DATASET_SETTINGS_FILE
         try:
             if settings is not None:
                 folder.mkdir(parents=True, exist_ok=True)
-            found: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+            stored: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{path}: cannot be used: {error}; give another folder as prepared=") from error
-        if path.is_file() and not isinstance(found, dict):
-            raise InputError(f"{path}: expected settings, got {str(found)[:40]}; give another folder as prepared=")
-        if found is None and settings is None:
-            raise InputError(f"{folder}: expected prepared scenes, found no {SETTINGS_FILE}")
-        if found is None and any(not entry.name.startswith(".") for entry in folder.iterdir()):
+        if path.is_file() and not isinstance(stored, dict):
+            raise InputError(f"{path}: expected settings, got {str(stored)[:40]}; give another folder as prepared=")
+        if stored is None and settings is None:
+            raise InputError(f"{folder}: expected prepared scenes, found no {DATASET_SETTINGS_FILE}")
+        if stored is None and any(not entry.name.startswith(".") for entry in folder.iterdir()):
             raise InputError(
-                f"{folder}: holds something else than prepared scenes (no {SETTINGS_FILE}); give another folder as "
-                "prepared="
+                f"{folder}: holds something else than prepared scenes (no {DATASET_SETTINGS_FILE}); "
+                "give another folder as prepared="
             )
-        wanted: dict[str, Any] = found if settings is None else json.loads(json.dumps(settings, default=str))
-        self.settings = wanted
-        if found is not None and found != wanted:
-            difference = first_difference(found, wanted)
+        expected: dict[str, Any] = stored if settings is None else json.loads(json.dumps(settings, default=str))
+        self.settings = expected
+        if stored is not None and stored != expected:
+            difference = first_difference(stored, expected)
             raise InputError(f"{folder}: was prepared with {difference}; give another folder as prepared=")
-        if found is None:
+        if stored is None:
             with atomic_file(path) as stream:
-                stream.write(json.dumps(wanted, indent=1).encode())
+                stream.write(json.dumps(expected, indent=1).encode())
 
-    def find_space(
+    def fit_space(
         self, scenes: Sequence[Path], open_scene: Callable[[Path], tuple[Scene, Teacher]], config: PrepareConfig
     ) -> None:
-        """Finds the output space of the training scenes, unless it has been found."""
+        """Computes and stores the output space of the training scenes, unless it is stored already.
+
+        Raises:
+            InputError: the folder holds scenes without their space, or see `dataset_space`.
+        """
         if (self.folder / SPACE_FILE).is_file():
             return
         if (self.folder / "scenes").is_dir() and any((self.folder / "scenes").iterdir()):
             raise InputError(
-                f"{self.folder}: holds scenes, and not the space that they were prepared for ({SPACE_FILE}); give "
+                f"{self.folder}: holds scenes, but not the space that they were prepared for ({SPACE_FILE}); give "
                 "another folder as prepared="
             )
         outputs, codebook = dataset_space(scenes, open_scene, config.fusion, views=config.basis_views)
@@ -119,103 +128,103 @@ class PreparedDataset:
         write_archive(self.folder / SPACE_FILE, arrays, header)
 
     def fingerprint(self) -> str:
-        """Of the output space: what was trained towards another one cannot go on towards this."""
+        """A hash of the output space, by which a resumed training checks that its targets are the same."""
         return hashlib.sha256((self.folder / SPACE_FILE).read_bytes()).hexdigest()[:16]
 
     def load_space(self) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
-        """The output space, and the vectors of a coded teacher's codes.
+        """Loads the output space, and for a coded teacher the vectors of its codes in standard units, else None.
 
         Raises:
-            InputError: missing or damaged.
+            InputError: the file is missing or damaged.
         """
         with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
             outputs = read_output_space(file)
             codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
         return outputs, codebook
 
-    def path_of(self, name: str) -> Path:
-        """The file of a scene; it is there once the scene has been prepared."""
+    def scene_path(self, name: str) -> Path:
+        """The path of a scene's file, which exists once the scene is prepared."""
         return self.folder / "scenes" / f"{name}.safetensors"
 
-    def holds(self, source: Path) -> bool:
-        """Whether the scene of this folder has been prepared.
+    def has_scene(self, source: Path) -> bool:
+        """Whether the scene at this path is prepared.
 
         Raises:
-            InputError: another scene of the same name has been.
+            InputError: another scene with the same name is.
         """
-        path = self.path_of(source.name)
+        path = self.scene_path(source.name)
         if not path.is_file():
             return False
-        with advised("remove the file, and it is prepared again"), open_archive(path) as file:
+        with advised("remove the file to prepare the scene again"), open_archive(path) as file:
             made_from = file.value("source", str)
         if made_from != str(source.resolve()):
             raise InputError(
-                f"{path}: was prepared from {made_from}, and this run means {source.resolve()}; scenes are told apart "
-                "by name: rename one, or give another folder as prepared="
+                f"{path}: was prepared from {made_from}, but this run uses {source.resolve()}; prepared scenes need "
+                "distinct names: rename one, or give another folder as prepared="
             )
         return True
 
     def prepare(self, scene: Scene, teacher: Teacher, config: PrepareConfig, *, source: Path = Path()) -> None:
-        """Fuses one scene and keeps its targets and matrices; the file appears whole or not at all.
+        """Prepares one scene, and writes its file atomically.
 
         Args:
-            scene: with Gaussians and views.
-            teacher: of the dataset's space.
-            config: see there.
-            source: where the scene was read from.
+            scene: the scene, with Gaussians and views.
+            teacher: a teacher of the dataset's space.
+            config: settings of the preparation.
+            source: the path that the scene was read from.
 
         Raises:
-            InputError: whatever `fuse` refuses, or the disk is full.
+            InputError: the scene cannot be fused, or the disk is full.
         """
         outputs, _ = self.load_space()
-        path = self.path_of(scene.name)
+        path = self.scene_path(scene.name)
         path.parent.mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self.folder, prefix=MAPS_PREFIX) as maps:
             prepare_scene(path, scene, CachedTeacher(teacher, Path(maps)), outputs, config, source=source)
 
-    def remove_leftovers(self) -> None:
-        """Removes maps that killed runs left behind."""
+    def remove_stale_maps(self) -> None:
+        """Removes caches of teacher maps that killed runs left."""
         for path in self.folder.glob(f"{MAPS_PREFIX}*"):
-            if time.time() - path.stat().st_mtime > MAPS_SECONDS:
+            if time.time() - path.stat().st_mtime > MAX_MAPS_AGE:
                 shutil.rmtree(path, ignore_errors=True)
 
-    def find_rarity(self, names: Sequence[str], track: Track) -> None:
-        """Counts how often each kind of target occurs in the training scenes, unless that has been done."""
-        if (self.folder / RARITY_FILE).is_file():
+    def count_classes(self, names: Sequence[str], track: Track) -> None:
+        """Counts the target classes of the training scenes and stores the counts, unless they are stored already."""
+        if (self.folder / CLASS_BALANCE_FILE).is_file():
             return
         _, codebook = self.load_space()
         scenes = self.scenes(names)
 
-        def seen_targets(scene: PreparedScene, most: int = 0) -> Float32[np.ndarray, "n channels"]:
+        def seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
             rows = np.flatnonzero(scene.weights)
-            targets = scene.targets(rows[:: -(-len(rows) // most)] if most else rows)
+            targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
             scene.close()
             return targets
 
         if codebook is None:
-            share = max(1, SAMPLED_TARGETS // len(scenes))
-            codebook = cluster_targets(np.concatenate([seen_targets(scene, share) for scene in scenes]))
-        rarity = count_targets((seen_targets(scene) for scene in track(scenes, "counting targets")), codebook)
-        write_archive(self.folder / RARITY_FILE, {"codebook": rarity.codebook, "counts": rarity.counts}, {})
+            scene_share = max(1, CLUSTERED_TARGETS // len(scenes))
+            codebook = cluster_targets(np.concatenate([seen_targets(scene, scene_share) for scene in scenes]))
+        balance = count_targets((seen_targets(scene) for scene in track(scenes, "counting targets")), codebook)
+        write_archive(self.folder / CLASS_BALANCE_FILE, {"codebook": balance.codebook, "counts": balance.counts}, {})
 
-    def load_rarity(self) -> Rarity:
-        """What `find_rarity` found.
+    def load_class_balance(self) -> ClassBalance:
+        """Loads the target classes and their frequencies, as stored by `count_classes`.
 
         Raises:
-            InputError: missing or damaged.
+            InputError: the file is missing or damaged.
         """
         channels = self.load_space()[0].channels
-        path = self.folder / RARITY_FILE
-        with advised("remove the file, and it is counted again"), open_archive(path) as file:
+        path = self.folder / CLASS_BALANCE_FILE
+        with advised("remove the file to count targets again"), open_archive(path) as file:
             codebook = file.array("codebook", "float32", ("C", channels))
             counts = file.array("counts", "float64", ("C",))
             if not len(counts) or not (counts >= 0).all():
-                raise InputError("expected kinds of target with counts from 0")
-            return Rarity(codebook=codebook, counts=counts)
+                raise InputError("expected one or more target classes with counts of 0 or more")
+            return ClassBalance(codebook=codebook, counts=counts)
 
     def scenes(self, names: Sequence[str]) -> list[PreparedScene]:
-        """Prepared scenes by name."""
-        return [PreparedScene(self.path_of(name)) for name in names]
+        """Opens prepared scenes by name."""
+        return [PreparedScene(self.scene_path(name)) for name in names]
 
 
 def prepare_scene(
@@ -227,18 +236,18 @@ def prepare_scene(
     *,
     source: Path = Path(),
 ) -> None:
-    """Writes a scene's Gaussians, fused targets, and for every view the rows of its render loss.
+    """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of every view.
 
     Args:
         path: the file.
-        scene: with Gaussians and views.
-        teacher: of the space of `outputs`.
-        outputs: the dataset's.
-        config: see there.
-        source: where the scene was read from.
+        scene: the scene, with Gaussians and views.
+        teacher: a teacher of the space of `outputs`.
+        outputs: output space of the dataset.
+        config: settings of the preparation.
+        source: the path that the scene was read from.
 
     Raises:
-        InputError: whatever `fuse` refuses.
+        InputError: the scene cannot be fused, or the disk is full.
     """
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -247,7 +256,7 @@ def prepare_scene(
     blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
     rows = []
     for view in range(len(scene.views)):
-        targets, valid, grid = _pooled(teacher.feature_map(scene.views, view), outputs, config.render_cell)
+        targets, valid, grid = _pool_map(teacher.feature_map(scene.views, view), outputs, config.render_cell)
         b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid))
         if scene.views.masks is not None:
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
@@ -256,12 +265,15 @@ def prepare_scene(
     write_prepared(path, scene, fused, outputs, rows, source=source)
 
 
-def _pooled(
+def _pool_map(
     feature_map: FeatureMap, outputs: OutputSpace, cell: int
 ) -> tuple[Float32[np.ndarray, "P channels"], Bool[np.ndarray, " P"], FeatureMap]:
-    """A map in standard units on cells of at least `cell` pixels, which cells have a vector, and a map of that grid.
+    """Pools a feature map to cells of about `cell` pixels or more, in standard units.
 
-    Cells over the right and lower border of the pooled grid are left out.
+    Cells that the pooled grid would have only a part of, at the right and lower border, are left out.
+
+    Returns:
+        The mean vectors of the cells, which of them have a vector, and an empty map with the grid of the cells.
     """
     affine = feature_map.grid_from_image
     side = 1 / float(np.sqrt(affine[0, 0] * affine[1, 1]))
@@ -271,7 +283,7 @@ def _pooled(
         raise InputError(f"prepare: a map of {feature_map.width}×{feature_map.height} has no cell of {cell} pixels")
     if feature_map.codes is not None:
         assert feature_map.table is not None
-        # Shares of the codes in each cell, and not vectors in each pixel: the same by linearity, and far smaller.
+        # By linearity the shares of the codes in each cell replace the mean over pixels, with far less memory.
         codes = feature_map.codes[: height * factor, : width * factor]
         line, column = np.divmod(np.arange(codes.size), codes.shape[1])
         cell_of = (line // factor) * width + column // factor
@@ -279,10 +291,10 @@ def _pooled(
         counts = np.bincount(cell_of * count + codes.ravel() + 1, minlength=height * width * count)
         shares = counts.reshape(height * width, count) / factor**2
         valid = shares[:, 0] == 0
-        vectors = (shares[:, 1:] @ _standard(feature_map.table, outputs)).astype(np.float32)
+        vectors = (shares[:, 1:] @ _standardize(feature_map.table, outputs)).astype(np.float32)
     else:
         assert feature_map.features is not None
-        grid = _standard(feature_map.features, outputs)[: height * factor, : width * factor]
+        grid = _standardize(feature_map.features, outputs)[: height * factor, : width * factor]
         vectors = grid.reshape(height, factor, width, factor, -1).mean(axis=(1, 3)).reshape(height * width, -1)
         valid = np.isfinite(vectors).all(axis=1)
     like = FeatureMap(
@@ -294,7 +306,8 @@ def _pooled(
     return np.where(valid[:, None], vectors, np.float32(0)), valid, like
 
 
-def _standard(vectors: np.ndarray, outputs: OutputSpace) -> np.ndarray:
+def _standardize(vectors: np.ndarray, outputs: OutputSpace) -> np.ndarray:
+    """Projects vectors [..., D] to the basis, if there is one, and converts them to standard units."""
     flat = vectors.reshape(-1, vectors.shape[-1])
     coordinates = encode(outputs.basis, flat) if outputs.basis is not None else flat
     return outputs.standardize(coordinates).reshape(*vectors.shape[:-1], -1)

@@ -1,4 +1,4 @@
-"""Scenes on disk to a prepared dataset: read, seed and fuse each, shared among the processes of a training."""
+"""Preparation of all scenes of a training from disk: reading, seeding and fusing, shared among processes."""
 
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
@@ -26,10 +26,12 @@ from gsencoder.types import Scene
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceConfig:
-    """Where the targets of a training come from: how scenes are read and seeded, and which teacher is fused."""
+    """The source of a training's targets: settings of reading, seeding, the teacher and preparation."""
 
-    splat: str = field(default="", metadata={"help": f"Gaussians of scenes with views; empty = seeds. {READABLE}"})
-    orbits: int = field(default=24, metadata={"help": "cameras put around a splat that has no views"})
+    splat: str = field(
+        default="", metadata={"help": f"file of the Gaussians of scenes with views; empty = make seeds. {READABLE}"}
+    )
+    orbits: int = field(default=24, metadata={"help": "number of cameras placed around a splat without views"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
@@ -40,22 +42,26 @@ class SourceConfig:
 
 
 def split_scenes(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[Path], list[Path]]:
-    """Scenes to train on, and those whose names match a pattern (with * and ? as in file names).
+    """Splits scenes into those to train on and those held out for validation.
+
+    Args:
+        paths: all scenes.
+        patterns: names of scenes to hold out, with * and ? as in file names.
 
     Raises:
-        InputError: a pattern that matches nothing, none left to train on, or two scenes of one name.
+        InputError: a pattern matches no scene, all scenes are held out, or two scenes have the same name.
     """
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"paths: two scenes are called {twice!r}; prepared scenes are told apart by name")
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"paths: two scenes are called {duplicate!r}; prepared scenes need distinct names")
     for pattern in patterns:
         if not any(fnmatch(name, pattern) for name in names):
-            raise InputError(f"holdout: no scene is called {pattern!r}; there are {', '.join(names[:5])}, …")
+            raise InputError(f"holdout: no scene is called {pattern!r}; the scenes are {', '.join(names[:5])}, …")
     held_out = [path for path in paths if any(fnmatch(path.name, pattern) for pattern in patterns)]
     training = [path for path in paths if path not in held_out]
     if not training:
-        raise InputError("holdout: matches every scene; none is left to train on")
+        raise InputError("holdout: matches every scene; at least one must remain for training")
     return training, held_out
 
 
@@ -70,60 +76,61 @@ def prepare_scenes(
     process: ProcessRank = ProcessRank(),
     track: Track = untracked,
 ) -> PreparedDataset:
-    """Prepares the scenes that are not in `folder` yet; the processes of a training share them.
+    """Prepares the scenes that are not in `folder` yet; the processes of a training share the work.
 
     Args:
         training: scenes whose targets define the output space and the class balance.
         held_out: scenes for validation.
-        words: the teacher's text table; None where it has none.
-        config: see there.
-        folder: of the prepared dataset; made if it does not exist.
-        voxel: edge of the encoder's grid in metres, by which the unit of a splat without one is estimated.
-        process: this process among those that train together.
-        track: progress.
+        words: text table of the teacher; None if it has none.
+        config: settings of reading, seeding, the teacher and preparation.
+        folder: folder of the prepared dataset; created if it does not exist.
+        voxel: edge length of the encoder's grid cells in metres, from which the unit of a splat is estimated if it is
+            unknown.
+        process: rank of this process.
+        track: wraps loops to show progress.
 
     Raises:
-        InputError: what is wrong with a scene, which is named, or with the folder; of any process.
+        InputError: in any process, a scene cannot be used, or the folder cannot.
     """
     sections = {name: plain(getattr(config, name)) for name in ("data", "seeds", "teacher", "prepare")}
     made_with: dict[str, Any] = {
         "scenes": {path.name: str(path.resolve()) for path in training},
-        "words": _digest(words),
+        "words": _text_table_digest(words),
         **sections,
         **{"splat": config.splat, "orbits": config.orbits, "voxel": voxel},
     }
-    read_views, read_scene = _readers(config, words, voxel)
+    read_views, read_scene = _scene_readers(config, words, voxel)
     with fail_together():
         if process.is_first:
             dataset = PreparedDataset(folder, made_with)
-            dataset.remove_leftovers()
-            dataset.find_space(training, read_views, config.prepare)
+            dataset.remove_stale_maps()
+            dataset.fit_space(training, read_views, config.prepare)
     dataset = PreparedDataset(folder, made_with)
-    missing = [path for path in [*training, *held_out] if not dataset.holds(path)]
+    missing = [path for path in [*training, *held_out] if not dataset.has_scene(path)]
     with fail_together():
-        pass  # No process may begin before all have listed what is missing.
+        pass  # No process may start to prepare before all have listed the missing scenes.
     with fail_together():
-        mine: Iterable[Path] = track(missing[process.rank :: process.world_size], "preparing scenes")
-        for path in mine:
+        assigned: Iterable[Path] = track(missing[process.rank :: process.world_size], "preparing scenes")
+        for path in assigned:
             scene, teacher = read_scene(path)
             with about(path):
                 dataset.prepare(scene, teacher, config.prepare, source=path)
     with fail_together():
         if process.is_first:
-            dataset.find_rarity([path.name for path in training], track)
+            dataset.count_classes([path.name for path in training], track)
     return dataset
 
 
 ReadScene = Callable[[Path], tuple[Scene, Teacher]]
 
 
-def _readers(config: SourceConfig, words: TextTable | None, voxel: float) -> tuple[ReadScene, ReadScene]:
-    """Two functions from a path to a scene and its teacher: the first gives views alone where a scene has them, to look
-    at maps; the second also Gaussians and a unit of length, under the name of the folder."""
+def _scene_readers(config: SourceConfig, words: TextTable | None, voxel: float) -> tuple[ReadScene, ReadScene]:
+    """Two functions from a path to a scene and its teacher. The first ensures only that the scene has views, which is
+    enough for teacher maps; the second also makes Gaussians, estimates the unit, and names the scene by its path."""
     shared: list[Teacher] = []
 
     def teacher_of(scene: Scene) -> Teacher:
-        # The labels teacher is made of the scene's own objects; every other one serves all scenes.
+        # The labels teacher depends on the objects of the scene; any other teacher is built once for all scenes.
         if isinstance(config.teacher, LabelsConfig):
             return build_teacher(config.teacher, scene, words)
         if not shared:
@@ -146,7 +153,7 @@ def _readers(config: SourceConfig, words: TextTable | None, voxel: float) -> tup
     return read_views, read_scene
 
 
-def _digest(words: TextTable | None) -> str:
+def _text_table_digest(words: TextTable | None) -> str:
     if words is None:
         return ""
     return hashlib.sha256(repr(words.names).encode() + words.embeddings.tobytes()).hexdigest()[:16]

@@ -1,8 +1,7 @@
-"""A scene made ready for training: one file with its Gaussians, their targets, and for every view the matrix B of the
-teacher's cells beside the teacher's vectors there.
+"""Prepared scenes on disk: files with Gaussians, their targets, and the rows of the render loss of every view.
 
-The file is memory-mapped: a sample reads the Gaussians and the views that it was given and nothing else, and the data
-workers of one machine share what was read. What is read is held against its checksums the first time.
+The file is memory-mapped: a sample reads only its Gaussians and views, and data workers on one machine share the page
+cache. Data is verified against checksums when it is first read.
 """
 
 import math
@@ -41,12 +40,12 @@ _ARRAYS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewRows:
-    """B of one view in rows of cells, and what the teacher saw there.
+    """The blending matrix B of one view, with a row for each cell of the teacher's grid, and the teacher's vectors.
 
     Attributes:
-        crow, col, weight: compressed rows, as in `gsencoder.render.Blend`.
-        targets: the teacher's vectors, standard units.
-        valid: cells in which the teacher has one.
+        crow, col, weight: B in compressed rows, as in `gsencoder.render.Blend`.
+        targets: the teacher's vectors in the cells, standard units.
+        valid: cells in which the teacher has a vector.
     """
 
     crow: Int64[np.ndarray, " P_plus_1"]
@@ -57,7 +56,7 @@ class ViewRows:
 
 
 class PreparedScene:
-    """One prepared file. It is opened when something is first asked for, so that scenes can be sent to workers."""
+    """A prepared scene, opened on first access, so that it can be sent to data workers."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, path.stem
@@ -68,14 +67,14 @@ class PreparedScene:
 
     @cached_property
     def _arrays(self) -> MappedArrays:
-        with self._whole():
+        with self._error_context():
             arrays = MappedArrays(self.path, _ARRAYS, self._closed)
             _check_arrays(arrays, len(self._header[0]))
         return arrays
 
     @cached_property
     def _header(self) -> tuple[Cameras, float | None, list[float] | None, tuple[str, ...]]:
-        with self._whole(), open_archive(self.path) as file:
+        with self._error_context(), open_archive(self.path) as file:
             names = tuple(str(name) for name in file.value("views", list))
             cameras, unit, up = (
                 read_cameras(file),
@@ -83,7 +82,7 @@ class PreparedScene:
                 file.value("up", list, None),
             )
             if len(names) != len(cameras):
-                raise InputError(f"{len(names)} names of views, and {len(cameras)} cameras")
+                raise InputError(f"expected as many names of views as cameras, got {len(names)} and {len(cameras)}")
             if unit is not None and not 0 < unit < math.inf:
                 raise InputError(f"metres_per_unit: expected a positive number, got {unit}")
             if up is not None and (len(up) != 3 or not all(isinstance(value, (int, float)) for value in up)):
@@ -91,12 +90,13 @@ class PreparedScene:
         return cameras, unit, up, names
 
     @contextmanager
-    def _whole(self) -> Iterator[None]:
-        with about(self.path), advised("remove the file, and it is prepared again"):
+    def _error_context(self) -> Iterator[None]:
+        """Adds the path and the remedy to errors of reading."""
+        with about(self.path), advised("remove the file to prepare the scene again"):
             yield
 
     def close(self) -> None:
-        """Lets go of the file, which is opened again when something is asked for."""
+        """Closes the file; the next access opens it again."""
         arrays: MappedArrays | None = self.__dict__.pop("_arrays", None)
         if arrays is not None:
             arrays.close()
@@ -132,59 +132,68 @@ class PreparedScene:
 
     @property
     def weights(self) -> Float32[np.ndarray, " N"]:
-        """How much each Gaussian was seen; 0 = never, and it has no target."""
+        """The fusion weight of each Gaussian; 0 = not seen in any view, and without a target."""
         return self._arrays.whole("weights")
 
     def gaussians(self, rows: np.ndarray) -> Gaussians:
-        """Some of the Gaussians, with degree-0 colors."""
-        with self._whole():
-            parts = {name: self._arrays.rows(name, rows) for name in ("means", "quats", "scales", "opacities", "sh_dc")}
-        sh = parts.pop("sh_dc")[:, None]
-        return Gaussians(**parts, sh=sh)
+        """Reads Gaussians by row, with degree-0 colors."""
+        with self._error_context():
+            columns = {
+                name: self._arrays.rows(name, rows) for name in ("means", "quats", "scales", "opacities", "sh_dc")
+            }
+        sh = columns.pop("sh_dc")[:, None]
+        return Gaussians(**columns, sh=sh)
 
     def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
-        """What the encoder should give for these Gaussians, standard units; zero where never seen."""
-        with self._whole():
+        """Reads targets of the encoder by row, standard units; zero for Gaussians without a target."""
+        with self._error_context():
             return self._arrays.rows("targets", rows).astype(np.float32)
 
     def view(self, view: int) -> ViewRows:
-        """One view's rows."""
+        """Reads the blending matrix and the teacher's vectors of one view."""
         first, last = (int(row) for row in self._arrays.whole("rows")[view : view + 2])
         crow = np.array(self._arrays.whole("crow")[first : last + 1])
         start, end = int(crow[0]), int(crow[-1])
-        with self._whole():
-            found = ViewRows(
+        with self._error_context():
+            view_rows = ViewRows(
                 crow=crow - start,
                 col=np.array(self._arrays.part("col", start, end)),
                 weight=self._arrays.part("weight", start, end).astype(np.float32),
                 targets=self._arrays.part("row_targets", first, last).astype(np.float32),
                 valid=self._arrays.part("row_valid", first, last).astype(bool),
             )
-            inside = (found.col >= 0) & (found.col < len(self))
-            if not inside.all() or not (found.weight >= 0).all() or not np.isfinite(found.targets).all():
-                raise InputError(f"view {self.view_names[view]!r} has entries that no Blend has")
-        return found
+            in_range = (view_rows.col >= 0) & (view_rows.col < len(self))
+            if not in_range.all() or not (view_rows.weight >= 0).all() or not np.isfinite(view_rows.targets).all():
+                raise InputError(f"view {self.view_names[view]!r}: its columns, weights or targets are out of range")
+        return view_rows
 
 
 def _check_arrays(arrays: MappedArrays, views: int) -> None:
-    """Whether the arrays fit together, and what is looked at of every Gaussian is sound. Entries of B and targets are
-    looked at where they are used: here that would read the whole file."""
-    stored = {name: arrays.shape(name) for name in _ARRAYS}
-    sizes = {name: shape[0] for name, shape in stored.items()}
-    columns = {name: shape[1:] for name, shape in stored.items()}
+    """Checks the shapes of all arrays, and the values of those that are read for all Gaussians.
+
+    Entries of B and targets are checked when they are read; checking them here would read the entire file.
+
+    Raises:
+        InputError: shapes or values are inconsistent.
+    """
+    shapes = {name: arrays.shape(name) for name in _ARRAYS}
+    sizes = {name: shape[0] for name, shape in shapes.items()}
+    columns = {name: shape[1:] for name, shape in shapes.items()}
     n, rows, crow = sizes["means"], arrays.whole("rows"), arrays.whole("crow")
     width = columns["targets"]
-    shapes = [("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ()), ("sh_dc", (3,)), ("weights", ())]
-    good = all(sizes[name] == n and columns[name] == wanted for name, wanted in [*shapes, ("targets", width)])
-    good &= columns["row_targets"] == width
-    good &= sizes["rows"] == views + 1 and bool((np.diff(rows) >= 0).all()) and rows[0] == 0
+    expected = [("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ()), ("sh_dc", (3,)), ("weights", ())]
+    consistent = all(
+        sizes[name] == n and columns[name] == trailing for name, trailing in [*expected, ("targets", width)]
+    )
+    consistent &= columns["row_targets"] == width
+    consistent &= sizes["rows"] == views + 1 and bool((np.diff(rows) >= 0).all()) and rows[0] == 0
     cells = int(rows[-1]) if sizes["rows"] else 0
-    good &= sizes["crow"] == cells + 1 and sizes["row_targets"] == sizes["row_valid"] == cells
-    good = bool(good) and crow[0] == 0 and bool((np.diff(crow) >= 0).all())
-    if not good or not crow[-1] == sizes["col"] == sizes["weight"]:
+    consistent &= sizes["crow"] == cells + 1 and sizes["row_targets"] == sizes["row_valid"] == cells
+    consistent = bool(consistent) and crow[0] == 0 and bool((np.diff(crow) >= 0).all())
+    if not consistent or not crow[-1] == sizes["col"] == sizes["weight"]:
         raise InputError("its arrays do not fit together")
     if not np.isfinite(arrays.whole("means")).all() or not (arrays.whole("weights") >= 0).all():
-        raise InputError("it has positions that are not finite, or weights below 0")
+        raise InputError("it has positions that are not finite, or weights that are negative or NaN")
 
 
 def write_prepared(
@@ -196,18 +205,18 @@ def write_prepared(
     *,
     source: Path,
 ) -> None:
-    """Writes a scene with its fused targets and the rows of all its views.
+    """Writes a prepared scene.
 
     Args:
-        path: of the file.
-        scene: with Gaussians and cameras.
-        features: fused, in the basis of `outputs`.
-        outputs: the dataset's.
-        views: one for each camera.
-        source: where the scene was read from.
+        path: the file.
+        scene: the scene, with Gaussians and cameras.
+        features: fused features, in the basis of `outputs`.
+        outputs: output space of the dataset.
+        views: matrix and teacher's vectors for each camera.
+        source: the path that the scene was read from.
 
     Raises:
-        InputError: features of another space, or the disk is full.
+        InputError: the features are of another space, or the disk is full.
     """
     assert scene.gaussians is not None
     assert scene.views is not None

@@ -1,5 +1,4 @@
-"""Rows of B in a sample: cells of the teacher's grid over the Gaussians that the sample holds, and what the teacher saw
-there."""
+"""Rows of the blending matrix for the render loss, restricted to a sample's Gaussians, with the teacher's vectors."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,21 +10,21 @@ from torch import Tensor
 
 from gsencoder.render import Blend, BlendConfig
 from gsencoder.render.rays import Lattice
-from gsencoder.train.class_balance import Rarity
+from gsencoder.train.class_balance import ClassBalance
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepared_scene import ViewRows
 
-MIN_LEFT = 0.5
-"""Share of a row's weight that must be left when Gaussians were thinned out at random."""
+MIN_REMAINING_WEIGHT = 0.5
+"""Smallest share of a row's weight that must remain after Gaussians are dropped at random."""
 
 
-class Rows(NamedTuple):
-    """Rows of B that are compared with a teacher's cells, over the Gaussians of a sample or a batch.
+class RenderRows(NamedTuple):
+    """Rows of B for the render loss, over the Gaussians of a sample or a batch.
 
     Attributes:
         crow, col, weight: compressed rows, as in `gsencoder.render.Blend`.
         targets: the teacher's vectors in the cells, standard units.
-        row_weights: of each row in the loss.
+        row_weights: weight of each row in the loss.
     """
 
     crow: Int64[Tensor, " P_plus_1"]
@@ -35,85 +34,85 @@ class Rows(NamedTuple):
     row_weights: Float[Tensor, " P"]
 
     def blend(self, gaussians: int) -> Blend:
-        """B itself. Its rows belong to no picture, so its lattice is a line of them."""
+        """The rows as a `Blend`. They are not the pixels of an image, so its lattice is a single column."""
         lattice = Lattice(height=len(self.crow) - 1, width=1, side=1, x0=0.5, y0=0.5, dx=1.0, dy=1.0)
         depths = self.weight.new_zeros(gaussians)
         return Blend(self.crow, self.col, self.weight, depths, lattice, BlendConfig())
 
 
-def restrict(
+def restrict_rows(
     view: ViewRows,
     gaussians: int,
     selected: Int64[np.ndarray, " s"],
-    kept: Int64[np.ndarray, " n"],
+    remaining: Int64[np.ndarray, " n"],
     config: LossConfig,
 ) -> ViewRows:
-    """The rows of B that a sample can be held against, over its Gaussians.
+    """Restricts the rows of B of a view to the Gaussians of a sample, and selects the rows to compare.
 
-    A row stays if the teacher saw something there, the whole scene fills it to `min_alpha`, and the selection has
-    `min_kept` of its weight. Of Gaussians that were left out at random afterwards the row is simply without, as long as
-    MIN_LEFT of its weight is there.
+    A row is selected if the teacher has a vector there, the full scene covers it with an alpha of `min_alpha` or more,
+    and at least the share `min_kept` of its weight is on selected Gaussians. Gaussians that were then dropped at random
+    are left out of the row, of whose weight at least MIN_REMAINING_WEIGHT must remain.
 
     Args:
-        view: over all Gaussians of the scene.
-        gaussians: how many these are.
-        selected: the Gaussians that the views were chosen for.
-        kept: those of them that the sample has; they become columns 0, 1, ….
-        config: see there.
+        view: rows over all Gaussians of the scene.
+        gaussians: number of Gaussians of the scene.
+        selected: the Gaussians of the crop.
+        remaining: those of them that the sample has after dropping some at random; they become columns 0, 1, ….
+        config: the thresholds.
     """
-    column = np.full(gaussians, -1, np.int32)
-    column[selected] = -2
-    column[kept] = np.arange(len(kept), dtype=np.int32)
-    place = column[view.col]
+    column_of = np.full(gaussians, -1, np.int32)
+    column_of[selected] = -2
+    column_of[remaining] = np.arange(len(remaining), dtype=np.int32)
+    column = column_of[view.col]
     alpha = _row_sums(view.weight, view.crow)
-    inside = _row_sums(np.where(place != -1, view.weight, 0), view.crow)
-    there = _row_sums(np.where(place >= 0, view.weight, 0), view.crow)
-    good = view.valid & (alpha >= config.min_alpha) & (inside >= config.min_kept * alpha)
-    # What is left after thinning out must still be more than a trace, or its average means nothing.
-    good &= there >= MIN_LEFT * alpha
-    entries = np.repeat(good, np.diff(view.crow)) & (place >= 0)
-    counts = np.add.reduceat(np.append(entries, False), view.crow[:-1])[good] if len(entries) else np.zeros(0, int)
+    selected_alpha = _row_sums(np.where(column != -1, view.weight, 0), view.crow)
+    remaining_alpha = _row_sums(np.where(column >= 0, view.weight, 0), view.crow)
+    usable = view.valid & (alpha >= config.min_alpha) & (selected_alpha >= config.min_kept * alpha)
+    # Of rows with less than this the weighted mean of the remaining Gaussians would say little.
+    usable &= remaining_alpha >= MIN_REMAINING_WEIGHT * alpha
+    entries = np.repeat(usable, np.diff(view.crow)) & (column >= 0)
+    counts = np.add.reduceat(np.append(entries, False), view.crow[:-1])[usable] if len(entries) else np.zeros(0, int)
     return ViewRows(
         crow=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-        col=place[entries],
+        col=column[entries],
         weight=view.weight[entries],
-        targets=view.targets[good],
-        valid=np.ones(int(good.sum()), bool),
+        targets=view.targets[usable],
+        valid=np.ones(int(usable.sum()), bool),
     )
 
 
 def _row_sums(values: np.ndarray, crow: np.ndarray) -> np.ndarray:
-    """Sums of compressed rows; empty rows are 0."""
+    """Sums of the entries of each compressed row; 0 for empty rows."""
     total = np.add.reduceat(np.append(values, np.float32(0)), crow[:-1])
     return np.where(np.diff(crow) > 0, total, 0)
 
 
-def rows_of(view: ViewRows, rarity: Rarity, power: float) -> Rows:
-    """Rows of one view as tensors; the weight of each in the loss is that of its target's kind to a power."""
-    return Rows(
+def make_render_rows(view: ViewRows, class_balance: ClassBalance, power: float) -> RenderRows:
+    """Converts rows of one view to tensors; the weight of each in the loss is n^−power of its target's class."""
+    return RenderRows(
         crow=torch.from_numpy(view.crow),
         col=torch.from_numpy(view.col),
         weight=torch.from_numpy(view.weight),
         targets=torch.from_numpy(view.targets),
-        row_weights=torch.from_numpy(rarity.weights(view.targets, power)),
+        row_weights=torch.from_numpy(class_balance.target_weights(view.targets, power)),
     )
 
 
-def no_rows(channels: int) -> Rows:
-    """A matrix of no rows."""
-    nothing = torch.zeros(0)
+def empty_rows(channels: int) -> RenderRows:
+    """A matrix without rows."""
+    empty = torch.zeros(0)
     crow, col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int32)
-    return Rows(crow=crow, col=col, weight=nothing, targets=nothing.view(0, channels), row_weights=nothing)
+    return RenderRows(crow=crow, col=col, weight=empty, targets=empty.view(0, channels), row_weights=empty)
 
 
-def join_rows(parts: Sequence[Rows], shifts: Sequence[int]) -> Rows:
-    """Rows below one another as one matrix; `shifts` are added to the columns of each."""
-    entries = np.cumsum([0, *(len(part.col) for part in parts)]).tolist()
-    crows = [part.crow[:-1] + entry for part, entry in zip(parts, entries, strict=False)]
-    return Rows(
+def join_rows(matrices: Sequence[RenderRows], shifts: Sequence[int]) -> RenderRows:
+    """Concatenates matrices along their rows; `shifts` are added to the column numbers of each."""
+    entries = np.cumsum([0, *(len(matrix.col) for matrix in matrices)]).tolist()
+    crows = [matrix.crow[:-1] + entry for matrix, entry in zip(matrices, entries, strict=False)]
+    return RenderRows(
         crow=torch.cat([*crows, torch.tensor(entries[-1:])]),
-        col=torch.cat([part.col + shift for part, shift in zip(parts, shifts, strict=True)]),
-        weight=torch.cat([part.weight for part in parts]),
-        targets=torch.cat([part.targets for part in parts]),
-        row_weights=torch.cat([part.row_weights for part in parts]),
+        col=torch.cat([matrix.col + shift for matrix, shift in zip(matrices, shifts, strict=True)]),
+        weight=torch.cat([matrix.weight for matrix in matrices]),
+        targets=torch.cat([matrix.targets for matrix in matrices]),
+        row_weights=torch.cat([matrix.row_weights for matrix in matrices]),
     )

@@ -1,4 +1,4 @@
-"""Distillation from scenes on disk to a trained encoder (SplatDistill, sec. 3.3): prepare, train, validate."""
+"""Training of an encoder from scenes on disk (SplatDistill sec. 3.3): preparation, distillation, validation."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -23,30 +23,30 @@ from gsencoder.train.adapter_heads import load_heads
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.crops import SamplingConfig
-from gsencoder.train.distributed import ProcessRank, joined
+from gsencoder.train.distributed import ProcessRank, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe
-from gsencoder.train.trainer import Trainer, TrainerConfig, Validated
+from gsencoder.train.trainer import Trainer, TrainerConfig, ValidationResult
 
-Validate = Callable[
-    [Sequence[PreparedScene], GaussianEncoder, OutputSpace, Float32[np.ndarray, "C channels"]], Validated
+SceneValidator = Callable[
+    [Sequence[PreparedScene], GaussianEncoder, OutputSpace, Float32[np.ndarray, "C channels"]], ValidationResult
 ]
-"""Scores an encoder on held-out scenes: scenes, encoder, output space, and the codebook of target kinds."""
-FREE_TO_CHANGE = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
-"""Settings of the loop that a continued run may change: none of them changes a step's result."""
+"""Scores an encoder on held-out scenes, given these, the encoder, its output space and the target classes' codebook."""
+CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
+"""Settings of the trainer that a resumed run may change, since they do not change the result of a step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainConfig(SourceConfig):
-    """All settings of a training."""
+    """Settings of a training run."""
 
-    tensorboard: bool = field(default=True, metadata={"help": "write TensorBoard events beside log.csv"})
+    tensorboard: bool = field(default=True, metadata={"help": "write TensorBoard events in addition to log.csv"})
     heads: str = field(
         default="",
-        metadata={"help": "file of the teacher's adapter heads, behind which cells are compared; empty = none"},
+        metadata={"help": "file of the teacher's adapter heads, on whose outputs L_render is computed; empty = none"},
     )
     model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -57,14 +57,14 @@ class TrainConfig(SourceConfig):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Training:
-    """A trained encoder.
+    """The result of a training run.
 
     Attributes:
-        encoder: the network.
-        outputs: what its output channels mean.
-        words: the teacher's text table; None where it has none.
+        encoder: the trained network.
+        outputs: its output space.
+        words: text table of the teacher; None if it has none.
         state: steps and seconds of the training.
-        scores: of the last validation; empty without held-out scenes.
+        scores: scores of the last validation; empty without held-out scenes.
     """
 
     encoder: GaussianEncoder
@@ -82,36 +82,37 @@ def train(
     held_out: Sequence[str | Path] = (),
     prepared: str | Path | None = None,
     device: Device = "auto",
-    validate: Validate | None = None,
+    validate: SceneValidator | None = None,
     track: Track = untracked,
 ) -> Training:
-    """Distils a teacher into an encoder. Under torchrun or SLURM every process calls this, and all return the result.
+    """Distills a teacher into an encoder. Under torchrun or SLURM every process calls this, and all return the result.
 
-    A call that was interrupted is continued by the next with the same `work`: from its checkpoint, and without
-    preparing scenes again.
+    An interrupted call is resumed by the next one with the same `work`, from its checkpoint and its prepared scenes.
 
     Args:
         scenes: folders or splat files to train on.
-        config: see there.
-        work: folder for the checkpoint and the log; made if it does not exist.
-        held_out: scenes that `validate` scores.
-        prepared: folder of prepared scenes, which trainings with the same sources may share; None = in `work`.
-        device: where the encoder computes.
-        validate: scores the encoder while it is trained, such as `gsencoder.evaluate.validation.validate_names`.
-        track: progress.
+        config: settings of the run.
+        work: folder for the checkpoint and the log; created if it does not exist.
+        held_out: scenes on which `validate` scores the encoder.
+        prepared: folder of prepared scenes, which runs with the same sources can share; None = a folder in `work`.
+        device: the device on which the encoder is trained.
+        validate: scores the encoder during training, for example `gsencoder.evaluate.validation.validate_names`.
+        track: wraps loops to show progress.
 
     Raises:
-        InputError: what is wrong with a scene, which is named; another run in `work` or `prepared`; a loss or gradient
-            that is not finite.
+        InputError: a scene cannot be used; `work` or `prepared` holds a run with other settings; or a loss or gradient
+            is not finite.
     """
     folder = Path(work)
     training, validation = [Path(path) for path in scenes], [Path(path) for path in held_out]
     words = text_table_of(config.teacher)
-    with joined(device) as (process, chosen):
+    with join_processes(device) as (process, chosen_device):
         folder.mkdir(parents=True, exist_ok=True)
-        place = Path(prepared) if prepared is not None else folder / "prepared"
+        prepared_folder = Path(prepared) if prepared is not None else folder / "prepared"
         voxel = config.model.voxel
-        dataset = prepare_scenes(training, validation, words, config, place, voxel=voxel, process=process, track=track)
+        dataset = prepare_scenes(
+            training, validation, words, config, prepared_folder, voxel=voxel, process=process, track=track
+        )
         return fit(
             dataset,
             [path.name for path in training],
@@ -120,7 +121,7 @@ def train(
             config,
             work=folder,
             process=process,
-            device=chosen,
+            device=chosen_device,
             validate=validate,
             track=track,
         )
@@ -136,28 +137,28 @@ def fit(
     work: Path,
     process: ProcessRank,
     device: torch.device,
-    validate: Validate | None = None,
+    validate: SceneValidator | None = None,
     track: Track = untracked,
 ) -> Training:
-    """Trains an encoder on prepared scenes, which are given by name; the other arguments are those of `train`.
+    """Trains an encoder on prepared scenes, given by name; the other arguments are those of `train`.
 
     Raises:
         InputError: see `train`.
     """
     outputs, _ = dataset.load_space()
-    rarity = dataset.load_rarity()
+    class_balance = dataset.load_class_balance()
     recipe = SampleRecipe(
         encoder=config.model,
         sampling=config.sampling,
         augmentation=config.augment,
         losses=config.loss,
-        rarity=rarity,
+        class_balance=class_balance,
         seed=config.train.seed,
         step_samples=config.train.samples_per_step(process.world_size),
     )
-    judge: Callable[[GaussianEncoder], Validated] = lambda encoder: Validated({})  # noqa: ARG005, E731
+    score_encoder: Callable[[GaussianEncoder], ValidationResult] = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
     if validate is not None and held_out:
-        judge = partial(_validate, validate, dataset.scenes(held_out), outputs, rarity.codebook)
+        score_encoder = partial(_validate, validate, dataset.scenes(held_out), outputs, class_balance.codebook)
     torch.manual_seed(config.train.seed)
     trainer = Trainer(
         GaussianEncoder(config.model, outputs.channels),
@@ -165,40 +166,43 @@ def fit(
         config.loss,
         config.train,
         folder=work,
-        settings=identity(config, process, dataset),
+        settings=resume_settings(config, process, dataset),
         heads=load_heads(find_file(config.heads, "heads"), outputs) if config.heads else (),
         process=process,
         device=device,
         tensorboard=config.tensorboard,
-        validate=judge,
+        validate=score_encoder,
     )
     state = trainer.run(track)
-    # A run that was interrupted between its last step and the validation of it has not been validated.
-    if trainer.validated is None and process.is_first:
-        trainer.validated = judge(trainer.encoder)
-    scores = dict(trainer.validated.scores) if trainer.validated is not None else {}
+    # A run that is resumed after its last step and validation has not validated in this process.
+    if trainer.last_validation is None and process.is_first:
+        trainer.last_validation = score_encoder(trainer.encoder)
+    scores = dict(trainer.last_validation.scores) if trainer.last_validation is not None else {}
     return Training(encoder=trainer.encoder, outputs=outputs, words=words, state=state, scores=scores)
 
 
-def identity(config: TrainConfig, process: ProcessRank, dataset: PreparedDataset) -> dict[str, Any]:
-    """What an interrupted run must share with the run that continues it, as JSON values. How the micro-batches of a
-    step are spread over processes may change."""
-    chosen = {name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
-    for name in FREE_TO_CHANGE:
-        del chosen["train"][name]
+def resume_settings(config: TrainConfig, process: ProcessRank, dataset: PreparedDataset) -> dict[str, Any]:
+    """The settings that a run must share with the one that it resumes, as JSON values.
+
+    The distribution of a step's micro-batches over processes may change.
+    """
+    shared = {name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
+    for name in CHANGEABLE_ON_RESUME:
+        del shared["train"][name]
     heads = hashlib.sha256(find_file(config.heads, "heads").read_bytes()).hexdigest()[:16] if config.heads else ""
     return {
-        **chosen,
+        **shared,
         **{"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": heads},
         "samples_per_step": config.train.samples_per_step(process.world_size),
     }
 
 
 def _validate(
-    validate: Validate,
+    validate: SceneValidator,
     scenes: Sequence[PreparedScene],
     outputs: OutputSpace,
     codebook: Float32[np.ndarray, "C channels"],
     encoder: GaussianEncoder,
-) -> Validated:
+) -> ValidationResult:
+    """`validate` with the encoder as the last argument, for `partial`."""
     return validate(scenes, encoder, outputs, codebook)

@@ -1,8 +1,8 @@
-"""Training samples: a part of a prepared scene, changed at random, with its plan, its targets and its rows of B.
+"""Training samples: augmented crops of prepared scenes with their plans, targets and rows of the render loss.
 
-Everything random about sample k of a run comes from (seed, k), and its size from the step that it belongs to. Nothing
-depends on which process makes it or on what was made before, so that a run may be cut off and resumed, or spread over
-more machines, and go through the same samples.
+All random numbers of sample k of a run come from (seed, k), and its size from (seed, step). Nothing depends on the
+process that makes a sample or on the samples before it, so that an interrupted run, or a run on more machines, goes
+through the same samples.
 """
 
 from collections import OrderedDict
@@ -20,18 +20,18 @@ from gsencoder.core.errors import InputError, about
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.grid.plan import CloudPlan, Plan, join_plans
 from gsencoder.train.augment import AugmentConfig, augment
-from gsencoder.train.class_balance import Rarity, nearest_codes
-from gsencoder.train.crops import SamplingConfig, choose_part, crop_size, thin_out
+from gsencoder.train.class_balance import ClassBalance, nearest_codes
+from gsencoder.train.crops import SamplingConfig, choose_crop, crop_size, drop_random
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.render_rows import Rows, join_rows, no_rows, restrict, rows_of
+from gsencoder.train.render_rows import RenderRows, empty_rows, join_rows, make_render_rows, restrict_rows
 
-OPEN_SCENES = 256
-"""Scenes that a process keeps open, the latest used."""
+MAX_OPEN_SCENES = 256
+"""Largest number of scenes that a process keeps open; the least recently used is closed first."""
 
 
 class Sample(NamedTuple):
-    """One part of one scene, as a worker hands it over; see `Batch`."""
+    """One sample, as a data worker returns it; attributes as in `Batch`."""
 
     name: str
     attributes: Float[Tensor, "N A"]
@@ -40,19 +40,19 @@ class Sample(NamedTuple):
     targets: Float[Tensor, "N C"]
     codes: Int64[Tensor, " N"]
     loss_weights: Float[Tensor, " N"]
-    rows: Rows
+    rows: RenderRows
 
 
 class Batch(NamedTuple):
-    """Samples side by side: Gaussians, tokens and rows follow one another, and plans and rows count on.
+    """A batch of samples, concatenated along Gaussians, tokens and rows.
 
     Attributes:
         names: scene and views of each sample, for messages.
-        attributes, opacities, plan: what the encoder takes.
-        targets: standard units.
-        codes: of each target the nearest row of the codebook; −1 where there is no target.
-        loss_weights: of each Gaussian; 0 where it has no target.
-        rows: of the render loss.
+        attributes, opacities, plan: inputs of the encoder.
+        targets: targets of the Gaussians, standard units.
+        codes: class of each Gaussian's target, a row of the codebook; −1 without a target.
+        loss_weights: weight of each Gaussian in the loss; 0 without a target.
+        rows: rows of the render loss.
     """
 
     names: tuple[str, ...]
@@ -62,10 +62,10 @@ class Batch(NamedTuple):
     targets: Float[Tensor, "N C"]
     codes: Int64[Tensor, " N"]
     loss_weights: Float[Tensor, " N"]
-    rows: Rows
+    rows: RenderRows
 
     def to(self, device: torch.device) -> "Batch":
-        """The same on a device."""
+        """The batch with all its tensors on a device."""
         if self.attributes.device == device:
             return self
 
@@ -80,22 +80,22 @@ class Batch(NamedTuple):
             targets=move(self.targets),
             codes=move(self.codes),
             loss_weights=move(self.loss_weights),
-            rows=Rows(*map(move, self.rows)),
+            rows=RenderRows(*map(move, self.rows)),
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleRecipe:
-    """All that turns a scene into samples.
+    """Settings of making samples from scenes.
 
     Attributes:
-        encoder: which attributes, which grid.
-        sampling: which part of the scene.
-        augmentation: what is changed; None leaves the scene as it is.
-        losses: which rows are compared.
-        rarity: how often targets of each kind occur.
-        seed: of everything random.
-        step_samples: samples of one step, over all processes; they are of one size, so that no process waits for
+        encoder: attributes and grid of the encoder.
+        sampling: selection of views and Gaussians.
+        augmentation: random changes; None = none.
+        losses: thresholds of the rows of the render loss, and the power of class weights.
+        class_balance: target classes of the dataset and their frequencies.
+        seed: seed of all random numbers.
+        step_samples: samples of one step over all processes; their crops have one size, so that no process waits for
             another.
     """
 
@@ -103,17 +103,21 @@ class SampleRecipe:
     sampling: SamplingConfig
     augmentation: AugmentConfig | None
     losses: LossConfig
-    rarity: Rarity
+    class_balance: ClassBalance
     seed: int
     step_samples: int = 1
 
 
 class SampleDataset(Dataset[Sample]):
-    """Sample k of a run, for any k: each pass over the scenes is in an order of its own."""
+    """The samples of a run by number; each epoch goes through the scenes in a new random order."""
 
     def __init__(self, scenes: Sequence[PreparedScene], recipe: SampleRecipe) -> None:
-        """Raises:
-        InputError: no scenes.
+        """Args:
+        scenes: the scenes to train on.
+        recipe: settings of the samples.
+
+        Raises:
+            InputError: there are no scenes.
         """
         if not scenes:
             raise InputError("training: no scenes to train on")
@@ -121,53 +125,56 @@ class SampleDataset(Dataset[Sample]):
         self._codes: OrderedDict[int, np.ndarray] = OrderedDict()
 
     def __getitem__(self, number: int) -> Sample | InputError:  # type: ignore[override]
-        """Sample `number`, or why there is none: from another process an error would come as a heap of text."""
+        """Sample `number`, or its error as a value: raised in a data worker it would arrive as a long traceback."""
         try:
             return self.make(number)
         except InputError as error:
             return error
 
     def make(self, number: int) -> Sample:
-        """Sample `number`.
+        """Makes sample `number`.
 
         Raises:
-            InputError: a scene that cannot be read, or whose views see nothing.
+            InputError: its scene cannot be read, or no view of the scene sees a Gaussian.
         """
-        epoch, place = divmod(number, len(self.scenes))
+        epoch, position = divmod(number, len(self.scenes))
         order = np.random.default_rng([self.recipe.seed, 0, epoch]).permutation(len(self.scenes))
         rng = np.random.default_rng([self.recipe.seed, 1, number])
-        step = np.random.default_rng([self.recipe.seed, 2, number // self.recipe.step_samples])
-        size = crop_size(self.recipe.sampling, step)
-        which = int(order[place])
-        scene = self.scenes[which]
+        step_rng = np.random.default_rng([self.recipe.seed, 2, number // self.recipe.step_samples])
+        size = crop_size(self.recipe.sampling, step_rng)
+        scene_index = int(order[position])
+        scene = self.scenes[scene_index]
         with about(f"scene {scene.name}"):
-            return make_sample(scene, self._codes_of(which), self.recipe, size, rng)
+            return make_sample(scene, self._target_codes(scene_index), self.recipe, size, rng)
 
-    def _codes_of(self, which: int) -> Int32[np.ndarray, " N"]:
-        """Kinds of a scene's targets. Only so many scenes are kept open: each holds a file descriptor."""
-        if which not in self._codes:
-            self._codes[which] = target_codes(self.scenes[which], self.recipe.rarity)
-        self._codes.move_to_end(which)
-        if len(self._codes) > OPEN_SCENES:
+    def _target_codes(self, scene_index: int) -> Int32[np.ndarray, " N"]:
+        """Target classes of a scene's Gaussians, cached together with the open scene.
+
+        The number of open scenes is limited, since each holds a file descriptor.
+        """
+        if scene_index not in self._codes:
+            self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe.class_balance)
+        self._codes.move_to_end(scene_index)
+        if len(self._codes) > MAX_OPEN_SCENES:
             oldest, _ = self._codes.popitem(last=False)
             self.scenes[oldest].close()
-        return self._codes[which]
+        return self._codes[scene_index]
 
 
 class StepSampler(Sampler[list[int]]):
-    """The numbers of the samples of each micro-batch of this process, step by step.
+    """The sample numbers of each micro-batch of this process, in order of steps.
 
-    Step s of a run takes samples s·n to (s + 1)·n − 1, n being batch · accumulate · processes; micro-batch m of process
-    r takes `batch` of them in a row.
+    Step s of a run takes samples s·n to (s + 1)·n − 1, where n = batch · accumulate · world. Each micro-batch of each
+    process takes `batch` consecutive ones of them.
     """
 
     def __init__(self, first: int, last: int, *, batch: int, accumulate: int, rank: int, world: int) -> None:
         """Args:
-        first: step to begin with.
-        last: step to end before.
-        batch: samples of a micro-batch.
-        accumulate: micro-batches of a process in a step.
-        rank: number of this process.
+        first: first step.
+        last: step after the last one.
+        batch: number of samples of a micro-batch.
+        accumulate: number of micro-batches of a process in a step.
+        rank: rank of this process.
         world: number of processes.
         """
         self.steps = range(first, last)
@@ -183,11 +190,11 @@ class StepSampler(Sampler[list[int]]):
                 yield list(range(start, start + self.batch))
 
 
-def target_codes(scene: PreparedScene, rarity: Rarity) -> Int32[np.ndarray, " N"]:
-    """For each Gaussian the row of the codebook that its target is nearest to; −1 where it has none."""
+def target_codes(scene: PreparedScene, class_balance: ClassBalance) -> Int32[np.ndarray, " N"]:
+    """The class of each Gaussian's target, a row of the codebook; −1 without a target."""
     codes = np.full(len(scene), -1, np.int32)
     seen = np.flatnonzero(scene.weights)
-    codes[seen] = nearest_codes(rarity.codebook, scene.targets(seen))
+    codes[seen] = nearest_codes(class_balance.codebook, scene.targets(seen))
     return codes
 
 
@@ -198,57 +205,59 @@ def make_sample(
     size: int,
     rng: np.random.Generator,
 ) -> Sample:
-    """Cuts a part out of a scene and makes it ready for the encoder.
+    """Makes a sample: selects views and Gaussians of a scene, augments them and computes the encoder's inputs.
 
     Args:
-        scene: to cut from.
-        codes: of its Gaussians (`target_codes`).
-        recipe: how.
-        size: most Gaussians; 0 = all that the views see.
-        rng: everything random comes from it.
+        scene: the scene.
+        codes: target classes of its Gaussians (`target_codes`).
+        recipe: settings of the sample.
+        size: largest number of Gaussians; 0 = all that the views see.
+        rng: source of all random numbers.
 
     Raises:
-        InputError: the chosen views see none of the scene's Gaussians.
+        InputError: no view sees any of the scene's Gaussians.
     """
-    # Code −1 is the last row of these tables, which gives the unseen 0. All kinds are equally often the center.
-    chances = np.append(recipe.rarity.each(1.0), np.float32(0))[codes]
-    weights = np.append(recipe.rarity.each(recipe.losses.rarity), np.float32(0))[codes]
-    views, selected = choose_part(scene.means, scene.cameras, chances, recipe.sampling, size, rng)
-    change = recipe.augmentation
-    kept = thin_out(selected, change.drop, rng) if change is not None else selected
+    # Code −1 indexes the last row of these tables: Gaussians without a target get weight 0. With the power 1 every
+    # class is equally often the center of a crop.
+    center_weights = np.append(recipe.class_balance.class_weights(1.0), np.float32(0))[codes]
+    loss_weights = np.append(recipe.class_balance.class_weights(recipe.losses.rarity), np.float32(0))[codes]
+    views, selected = choose_crop(scene.means, scene.cameras, center_weights, recipe.sampling, size, rng)
+    augmentation = recipe.augmentation
+    remaining = drop_random(selected, augmentation.drop, rng) if augmentation is not None else selected
     voxel = recipe.encoder.voxel / (scene.metres_per_unit or 1.0)
-    gaussians = scene.gaussians(kept)
-    if change is not None:
-        gaussians = augment(gaussians, rng, change, voxel=voxel, up=scene.up)
+    gaussians = scene.gaussians(remaining)
+    if augmentation is not None:
+        gaussians = augment(gaussians, rng, augmentation, voxel=voxel, up=scene.up)
     attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
-    shape = recipe.losses
-    rows = [no_rows(scene.channels)]
-    for view in views if shape.render_weight else ():
-        rows.append(rows_of(restrict(scene.view(view), len(scene), selected, kept, shape), recipe.rarity, shape.rarity))
+    losses = recipe.losses
+    rows = [empty_rows(scene.channels)]
+    for view in views if losses.render_weight else ():
+        view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
+        rows.append(make_render_rows(view_rows, recipe.class_balance, losses.rarity))
     return Sample(
         name=f"{scene.name} ({', '.join(scene.view_names[view] for view in views)})",
         attributes=attributes,
         opacities=opacities,
         plan=plan,
-        targets=torch.from_numpy(scene.targets(kept)),
-        codes=torch.from_numpy(codes[kept].astype(np.int64)),
-        loss_weights=torch.from_numpy(weights[kept]),
+        targets=torch.from_numpy(scene.targets(remaining)),
+        codes=torch.from_numpy(codes[remaining].astype(np.int64)),
+        loss_weights=torch.from_numpy(loss_weights[remaining]),
         rows=join_rows(rows, [0] * len(rows)),
     )
 
 
-def join_samples(parts: Sequence[Sample | InputError], patch: int) -> Batch | InputError:
-    """Puts samples side by side; if one could not be made, that is what comes back.
+def join_samples(results: Sequence[Sample | InputError], patch: int) -> Batch | InputError:
+    """Joins samples to a batch; if one of them is an error, returns the first error instead.
 
     Args:
-        parts: at least one.
-        patch: of the encoder's attention.
+        results: one or more samples or errors.
+        patch: largest number of tokens in a patch of the encoder.
     """
     samples = []
-    for part in parts:
-        if isinstance(part, InputError):
-            return part
-        samples.append(part)
+    for result in results:
+        if isinstance(result, InputError):
+            return result
+        samples.append(result)
     sizes = [len(sample.attributes) for sample in samples]
     starts = [sum(sizes[:i]) for i in range(len(sizes))]
     return Batch(

@@ -1,4 +1,4 @@
-"""The training loop: one step after another, the same on one process or many, and after a kill."""
+"""The training loop, resumable, with equal results on one process or several."""
 
 import math
 import signal
@@ -25,35 +25,39 @@ from gsencoder.core.runtime.device_names import Precision
 from gsencoder.core.runtime.signals import held_back, stop_of
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.train.checkpoint import CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
+from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.distill import Distillation
 from gsencoder.train.distributed import STOPPED_ELSEWHERE, ProcessRank, fail_together, sum_over_processes
-from gsencoder.train.losses import Head, LossConfig
+from gsencoder.train.losses import AdapterHead, LossConfig
 from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainerConfig:
-    """How long, how fast, how much at a time."""
+    """Settings of the training loop."""
 
     steps: int = field(default=2000, metadata={"help": "optimizer steps"})
-    batch: int = field(default=1, metadata={"help": "samples that one process takes at a time"})
-    accumulate: int = field(default=1, metadata={"help": "such micro-batches of a process in one step"})
+    batch: int = field(default=1, metadata={"help": "samples per micro-batch"})
+    accumulate: int = field(
+        default=1, metadata={"help": "micro-batches per process and step, whose gradients are accumulated"}
+    )
     learning_rate: float = field(default=2e-3, metadata={"help": "highest learning rate"})
-    final_rate: float = field(default=0.01, metadata={"help": "learning rate at the end, as a share of the highest"})
-    warmup: int = field(default=100, metadata={"help": "steps in which the learning rate rises"})
-    weight_decay: float = field(default=0.05, metadata={"help": "of matrices; never of norms and biases"})
-    clip: float = field(default=1.0, metadata={"help": "largest norm of the gradient; 0 = not clipped"})
+    final_rate: float = field(default=0.01, metadata={"help": "learning rate at the end, as a fraction of the highest"})
+    warmup: int = field(default=100, metadata={"help": "steps of linear warm-up of the learning rate"})
+    weight_decay: float = field(default=0.05, metadata={"help": "weight decay of matrices; norms and biases have none"})
+    clip: float = field(default=1.0, metadata={"help": "norm to which the gradient is clipped; 0 = no clipping"})
     precision: Precision = field(
         default="auto",
-        metadata={"help": "what the encoder computes in; auto = bfloat16 where the device multiplies it"},
+        metadata={"help": "floating-point type of the encoder; auto = bfloat16 on devices with hardware support"},
     )
-    workers: int = field(default=0, metadata={"help": "processes that make samples; 0 = the training process itself"})
-    seed: int = field(default=0, metadata={"help": "of everything random"})
-    log_every: int = field(default=10, metadata={"help": "steps that one line of the log stands for"})
-    validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = at the end alone"})
+    workers: int = field(
+        default=0, metadata={"help": "number of processes that make samples; 0 = make them in the training process"}
+    )
+    seed: int = field(default=0, metadata={"help": "seed of all random numbers"})
+    log_every: int = field(default=10, metadata={"help": "steps per row of the log, over which losses are averaged"})
+    validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = only at the end"})
     checkpoint_every: float = field(default=300.0, metadata={"help": "seconds between checkpoints"})
-    compile: bool = field(default=False, metadata={"help": "torch.compile the encoder"})
+    compile: bool = field(default=False, metadata={"help": "compile the encoder with torch.compile"})
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "accumulate", "log_every"):
@@ -67,30 +71,30 @@ class TrainerConfig:
         if not 0 < self.learning_rate < math.inf:
             raise InputError(f"learning_rate: expected a positive number, got {self.learning_rate}")
         if not 0 <= self.final_rate <= 1:
-            raise InputError(f"final_rate: expected a share in [0, 1], got {self.final_rate}")
+            raise InputError(f"final_rate: expected a number in [0, 1], got {self.final_rate}")
 
     def samples_per_step(self, processes: int) -> int:
-        """Samples of one optimizer step, over all processes."""
+        """The number of samples of one optimizer step over all processes."""
         return self.batch * self.accumulate * processes
 
 
-class Validated(NamedTuple):
-    """What a validation found.
+class ValidationResult(NamedTuple):
+    """The result of a validation.
 
     Attributes:
-        scores: by name.
-        pictures: uint8 [H, W, 3], by name.
+        scores: numbers by name.
+        pictures: images uint8 [H, W, 3] by name.
     """
 
     scores: Mapping[str, float]
     pictures: Mapping[str, np.ndarray] = {}
 
 
-Validation = Callable[[GaussianEncoder], Validated]
+EncoderValidator = Callable[[GaussianEncoder], ValidationResult]
 
 
 class Trainer:
-    """Trains an encoder on samples; everything that must survive a kill lies in one folder."""
+    """Trains an encoder on samples; its checkpoint and log, from which a killed run is resumed, are in one folder."""
 
     def __init__(
         self,
@@ -101,79 +105,84 @@ class Trainer:
         *,
         folder: Path,
         settings: Mapping[str, Any],
-        heads: Sequence[tuple[Head, nn.Module]] = (),
+        heads: Sequence[tuple[AdapterHead, nn.Module]] = (),
         process: ProcessRank = ProcessRank(),
         device: torch.device = torch.device("cpu"),
         tensorboard: bool = False,
-        validate: Validation = lambda encoder: Validated({}),  # noqa: ARG005
+        validate: EncoderValidator = lambda encoder: ValidationResult({}),  # noqa: ARG005
     ) -> None:
-        """Takes up what an earlier run with the same settings left in `folder`.
+        """Sets up training, and resumes from the checkpoint in `folder` if there is one.
 
         Args:
-            encoder: trained in place; moved to `device`.
-            dataset: what it is trained on.
-            losses: what is compared.
-            config: see there.
-            folder: for checkpoint and log; exists.
-            settings: what a run must have in common with one that it continues, as JSON values.
-            heads: a teacher's adapter heads, each with what decodes standard units for it.
-            process: this process among those that train together.
-            device: of this process.
-            tensorboard: whether to write events.
-            validate: judges the encoder; asked of the first process alone.
+            encoder: the encoder, trained in place and moved to `device`.
+            dataset: the training samples.
+            losses: weights and parameters of the loss terms.
+            config: settings of the loop.
+            folder: existing folder for checkpoint and log.
+            settings: the settings that a run must share with the one that it resumes, as JSON values.
+            heads: adapter heads of the teacher, each with a decoder from standard units to its input.
+            process: rank of this process.
+            device: device of this process.
+            tensorboard: whether to write TensorBoard events.
+            validate: validates the encoder; called on the first process only.
 
         Raises:
-            InputError: the folder holds another run.
+            InputError: the folder holds a run with other settings.
         """
         self.config, self.dataset, self.process, self.device = config, dataset, process, device
         self.folder, self.settings, self.validate = folder, dict(settings), validate
         self.encoder = encoder.to(device)
         self.optimizer = torch.optim.AdamW(
-            _groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
+            _parameter_groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
         )
         self.state = TrainingState()
-        self.validated: Validated | None = None
-        if (folder / CHECKPOINT_FILE).is_file():
-            self.state = load_checkpoint(folder / CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
+        self.last_validation: ValidationResult | None = None
+        if (folder / TRAINING_CHECKPOINT_FILE).is_file():
+            self.state = load_checkpoint(folder / TRAINING_CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
             if self.state.step > config.steps:
                 raise InputError(
-                    f"{folder / CHECKPOINT_FILE}: stands at step {self.state.step} of {config.steps}; give "
-                    "resume=false to begin anew"
+                    f"{folder / TRAINING_CHECKPOINT_FILE}: is at step {self.state.step}, beyond the last step "
+                    f"{config.steps}; give resume=false to begin anew"
                 )
-        # A line that was written for a step whose closing was cut off is written again.
-        done = self.state.step - (not self.state.closed)
-        begun = self.state.step > len(self.state.unlogged)
-        self._log = Log(folder, done=done, events=tensorboard, begun=begun) if process.is_first else None
+        # If the run was interrupted before the last step was closed, the step's row of the log is written again.
+        closed_steps = self.state.step - (not self.state.closed)
+        has_log = self.state.step > len(self.state.unlogged)
+        self._log = Log(folder, done=closed_steps, events=tensorboard, begun=has_log) if process.is_first else None
         network: nn.Module = torch.compile(encoder, dynamic=True) if config.compile else encoder  # type: ignore[assignment]
         self._parallel: nn.parallel.DistributedDataParallel | None = None
         if process.world_size > 1:
-            ids = [device.index] if device.type == "cuda" else None
-            network = self._parallel = nn.parallel.DistributedDataParallel(network, device_ids=ids)
-        codebook = torch.from_numpy(dataset.recipe.rarity.codebook).to(device)
+            device_ids = [device.index] if device.type == "cuda" else None
+            network = self._parallel = nn.parallel.DistributedDataParallel(network, device_ids=device_ids)
+        codebook = torch.from_numpy(dataset.recipe.class_balance.codebook).to(device)
         heads = [(head.to(device), decode.to(device)) for head, decode in heads]
         self.distillation = Distillation(network, losses, codebook, heads=heads)
         self._autocast = autocast_dtype(config.precision, device)
 
     def run(self, track: Track = untracked) -> TrainingState:
-        """All steps that are left. Whatever stops the run, an interrupt, a signal or an error of the input, leaves a
-        checkpoint of the last step that was done.
+        """Runs the remaining steps.
+
+        If the run is stopped by an interrupt, a signal or an InputError, it saves a checkpoint of the last completed
+        step first.
+
+        Returns:
+            Steps and seconds of the training.
 
         Raises:
-            InputError: a sample cannot be made, or a loss or gradient is not finite; the samples and the term are
-                named, and the step is not taken.
+            InputError: a sample cannot be made, or a loss or gradient is not finite; the error names the samples and
+                the loss term, and parameters are not changed.
         """
         try:
             self._run(track)
         except BaseException as stop:
-            foreseen = isinstance(stop, InputError) or not isinstance(stop, Exception) or stop_of(stop) is not None
-            if foreseen and self.state.step:
+            can_resume = isinstance(stop, InputError) or not isinstance(stop, Exception) or stop_of(stop) is not None
+            if can_resume and self.state.step:
                 with suppress(InputError):
                     self.save()
             raise
         finally:
             if self._log is not None:
                 self._log.close()
-        # DistributedDataParallel holds the process group, whose threads must end before the interpreter does.
+        # DistributedDataParallel holds the process group, whose threads must end before the interpreter exits.
         self.distillation.encoder, self._parallel = self.encoder, None
         return self.state
 
@@ -181,39 +190,41 @@ class Trainer:
         config, start = self.config, time.monotonic() - self.state.seconds
         first, saved = self.state.step, time.monotonic()
         if not self.state.closed:
-            self._close()
+            self._close_step()
         batches = iter(self._loader(first))
         for step in track(range(first, config.steps), "training"):
             losses = self._gradients(step, [next(batches) for _ in range(config.accumulate)])
             unlogged = (*self.state.unlogged, losses)
-            # A checkpoint of half a step would continue to other losses.
+            # A signal between these lines would save a checkpoint of parameters and state of different steps.
             with held_back():
                 self.optimizer.step()
                 seconds = time.monotonic() - start
                 self.state = TrainingState(step=step + 1, seconds=seconds, unlogged=unlogged, closed=False)
-            self._close()
+            self._close_step()
             if time.monotonic() - saved >= config.checkpoint_every or self.state.step == config.steps:
                 self.save()
                 saved = time.monotonic()
 
-    def _close(self) -> None:
-        """What is due after a step: validation, and a line of the log for the last steps."""
-        config, done, recent = self.config, self.state.step, self.state.unlogged
-        last = done == config.steps
+    def _close_step(self) -> None:
+        """Closes a step: validates if it is due, and writes a row of the log if it is due."""
+        config, step, recent = self.config, self.state.step, self.state.unlogged
+        is_last = step == config.steps
         row: dict[str, float] = {}
-        if logged := last or done % config.log_every == 0:
-            row = {name: float(np.mean([each[name] for each in recent])) for name in recent[-1]}
-        if last or (config.validate_every and done % config.validate_every == 0):
+        if log_due := is_last or step % config.log_every == 0:
+            row = {name: float(np.mean([losses[name] for losses in recent])) for name in recent[-1]}
+        if is_last or (config.validate_every and step % config.validate_every == 0):
             with fail_together():
-                row |= self._validated(done)
+                row |= self._run_validation(step)
         if row and self._log is not None:
-            self._log.add(done, row | {"seconds": self.state.seconds})
-        self.state = replace(self.state, unlogged=() if logged else recent, closed=True)
+            self._log.add(step, row | {"seconds": self.state.seconds})
+        self.state = replace(self.state, unlogged=() if log_due else recent, closed=True)
 
     def save(self) -> None:
-        """Writes the checkpoint; only the first process does."""
+        """Writes the checkpoint, on the first process only."""
         if self.process.is_first:
-            save_checkpoint(self.folder / CHECKPOINT_FILE, self.encoder, self.optimizer, self.state, self.settings)
+            save_checkpoint(
+                self.folder / TRAINING_CHECKPOINT_FILE, self.encoder, self.optimizer, self.state, self.settings
+            )
 
     def _loader(self, first: int) -> "DataLoader[Any]":
         config = self.config
@@ -225,27 +236,32 @@ class Trainer:
             rank=self.process.rank,
             world=self.process.world_size,
         )
-        # Workers are started anew and not forked: a forked child would inherit kernels' threads that no longer run.
+        # Workers are spawned: a forked child would inherit the state of threads that do not exist in it.
         return DataLoader(
             self.dataset,
             batch_sampler=sampler,
             collate_fn=partial(join_samples, patch=self.encoder.config.transformer.patch),
             num_workers=config.workers,
             multiprocessing_context="spawn" if config.workers else None,
-            worker_init_fn=_begin_worker if config.workers else None,
+            worker_init_fn=_init_worker if config.workers else None,
             prefetch_factor=4 if config.workers else None,
         )
 
-    def _gradients(self, step: int, made: list[Batch | InputError]) -> dict[str, float]:
-        """What one optimizer step goes by; returns the losses of all processes together."""
+    def _gradients(self, step: int, items: list[Batch | InputError]) -> dict[str, float]:
+        """Computes the gradients of one optimizer step; returns the losses over all processes.
+
+        Args:
+            step: number of the step.
+            items: micro-batches of this process, or the errors of their samples.
+        """
         self.optimizer.zero_grad(set_to_none=True)
         rate = self.rate_at(step)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.encoder.train()
-        batches, divisors = self._divisors(made)
+        batches, divisors = self._sum_divisors(items)
         lambdas = self.distillation.lambdas
-        parts = []
+        micro_losses = []
         for micro, batch in enumerate(batches):
             self._seed((step * len(batches) + micro) * self.process.world_size + self.process.rank)
             if self._parallel is not None:
@@ -254,113 +270,122 @@ class Trainer:
                 terms = self.distillation(batch.to(self.device))
             shares = torch.stack([terms[name] / divisors[name] for name in lambdas])
             loss = (shares * shares.new_tensor(list(lambdas.values()))).sum()
-            # Gradients of several processes are averaged; what is wanted is their sum.
+            # DistributedDataParallel averages gradients over processes; the step needs their sum.
             (loss * self.process.world_size).backward()
-            parts.append(shares.detach().double())
+            micro_losses.append(shares.detach().double())
         norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), self.config.clip or math.inf).item()
-        totals = self._finite_totals(step, batches, torch.stack(parts), norm)
+        totals = self._finite_totals(step, batches, torch.stack(micro_losses), norm)
         losses = dict(zip(lambdas, totals, strict=True))
         total = sum(lambdas[name] * loss for name, loss in losses.items())
         return {"loss": total, **losses, "gradient": norm, "learning_rate": rate}
 
-    def _divisors(self, made: list[Batch | InputError]) -> tuple[list[Batch], dict[str, float]]:
-        """The batches of a step, and what the totals of its terms are divided by, over all processes.
+    def _sum_divisors(self, items: list[Batch | InputError]) -> tuple[list[Batch], dict[str, float]]:
+        """Separates the batches of a step from errors, and sums the divisors of its loss terms over all processes.
 
         Raises:
-            InputError: a sample could not be made: its own error here, and at all other processes that there was one.
+            InputError: a sample could not be made, here or on another process, or no term has a weight.
         """
-        batches = [batch for batch in made if isinstance(batch, Batch)]
+        batches = [item for item in items if isinstance(item, Batch)]
         lambdas = self.distillation.lambdas
-        own = [self.distillation.divisors(batch) for batch in batches]
-        sums = [sum(each[name] for each in own) for name in lambdas]
-        failed = len(made) - len(batches)
-        found = sum_over_processes(torch.tensor([*sums, failed], dtype=torch.float64, device=self.device)).tolist()
-        for one in made:
-            if isinstance(one, InputError):
-                raise one
-        if found[-1]:
+        batch_divisors = [self.distillation.divisors(batch) for batch in batches]
+        sums = [sum(divisors[name] for divisors in batch_divisors) for name in lambdas]
+        failed = len(items) - len(batches)
+        totals = sum_over_processes(torch.tensor([*sums, failed], dtype=torch.float64, device=self.device)).tolist()
+        for item in items:
+            if isinstance(item, InputError):
+                raise item
+        if totals[-1]:
             raise InputError(STOPPED_ELSEWHERE)
-        if not any(found[:-1]):
+        if not any(totals[:-1]):
             names = "; ".join(name for batch in batches for name in batch.names)
             raise InputError(
-                f"training: nothing is compared in {names}: no Gaussian has a target that counts, and no cell of the "
-                "teacher's; look at loss.min_alpha, loss.min_kept and loss.rarity, or at these scenes"
+                f"training: there is nothing to compare in {names}: no Gaussian has a target with a weight, and no "
+                "cell of the teacher passes the thresholds; check loss.min_alpha, loss.min_kept and loss.rarity, and "
+                "these scenes"
             )
-        return batches, {name: max(count, 1e-12) for name, count in zip(lambdas, found, strict=False)}
+        return batches, {name: max(total, 1e-12) for name, total in zip(lambdas, totals, strict=False)}
 
     def _seed(self, number: int) -> None:
-        """What is random in the network follows the micro-batch's number in the run, not what was drawn before."""
+        """Seeds the network's random numbers by the number of the micro-batch in the run, so that a resumed run repeats
+        them."""
         state = np.random.SeedSequence([self.config.seed, number]).generate_state(1, np.uint64)
         torch.manual_seed(int(state[0] >> np.uint64(1)))
 
     def _finite_totals(
-        self, step: int, batches: list[Batch], parts: Float64[Tensor, "micro terms"], norm: float
+        self, step: int, batches: list[Batch], micro_losses: Float64[Tensor, "micro terms"], norm: float
     ) -> list[float]:
-        """The step's losses over all processes.
+        """The loss terms of the step over all processes.
 
         Raises:
             InputError: a loss of any process, or the gradient, is not finite.
         """
-        blame = gradient = ""
-        for batch, row in zip(batches, parts.tolist(), strict=True):
+        bad_loss = bad_gradient = ""
+        for batch, row in zip(batches, micro_losses.tolist(), strict=True):
             for name, value in zip(self.distillation.lambdas, row, strict=True):
                 if not math.isfinite(value):
-                    blame = blame or f"the {name} loss of {'; '.join(batch.names)}"
-        if not blame and not math.isfinite(norm):
-            # Gradients have been summed by now: with several processes any of their samples may be the cause.
+                    bad_loss = bad_loss or f"the {name} loss of {'; '.join(batch.names)}"
+        if not bad_loss and not math.isfinite(norm):
+            # Gradients are already summed over processes, so samples of any of them may be the cause.
             names = "; ".join(name for batch in batches for name in batch.names)
-            gradient = (
+            bad_gradient = (
                 f"the gradient of {names}{' or of samples of other processes' if self.process.world_size > 1 else ''}"
             )
-        flag = parts.new_tensor([float(bool(blame)), float(bool(gradient))])
-        *totals, blamed, unsure = sum_over_processes(torch.cat((parts.sum(dim=0), flag))).tolist()
-        if blamed or unsure:
-            # A loss says whose it is; a gradient only where no loss does.
-            where = blame or ("a loss of another process" if blamed else gradient)
+        flags = micro_losses.new_tensor([float(bool(bad_loss)), float(bool(bad_gradient))])
+        *totals, bad_losses, bad_gradients = sum_over_processes(torch.cat((micro_losses.sum(dim=0), flags))).tolist()
+        if bad_losses or bad_gradients:
+            # A loss identifies the samples that cause it; the gradient is named only if all losses are finite.
+            where = bad_loss or ("a loss of another process" if bad_losses else bad_gradient)
             raise InputError(
-                f"training: {where} is not finite at step {step}; nothing was changed by it. Lower learning_rate, or "
-                "look at these scenes (`gsencoder inspect`)"
+                f"training: {where} is not finite at step {step}; parameters were not changed. Use a lower "
+                "learning_rate, or check these scenes (`gsencoder inspect`)"
             )
         return totals
 
     def rate_at(self, step: int) -> float:
-        """The learning rate of a step: a linear rise, then half a cosine."""
+        """The learning rate of a step: linear warm-up, then a half cosine down to `final_rate`."""
         config = self.config
         if step < config.warmup:
             return config.learning_rate * (step + 1) / config.warmup
-        share = (step - config.warmup) / max(config.steps - config.warmup, 1)
-        low = config.final_rate
-        return config.learning_rate * (low + (1 - low) * 0.5 * (1 + math.cos(math.pi * share)))
+        progress = (step - config.warmup) / max(config.steps - config.warmup, 1)
+        final = config.final_rate
+        return config.learning_rate * (final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress)))
 
-    def _validated(self, done: int) -> dict[str, float]:
+    def _run_validation(self, step: int) -> dict[str, float]:
+        """Validates on the first process; returns the columns of the log, which are empty on the others."""
         scores: dict[str, float] = {}
         if self._log is not None:
             self.encoder.eval()
-            self.validated = found = self.validate(self.encoder)
-            scores = {f"validation/{name}": float(value) for name, value in found.scores.items()}
-            for name, pixels in found.pictures.items():
-                self._log.picture(done, f"validation/{name}", pixels)
+            self.last_validation = result = self.validate(self.encoder)
+            scores = {f"validation/{name}": float(value) for name, value in result.scores.items()}
+            for name, pixels in result.pictures.items():
+                self._log.picture(step, f"validation/{name}", pixels)
         return scores
 
 
-def _groups(encoder: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
+def _parameter_groups(encoder: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
+    """Parameters with weight decay (matrices) and without (norms and biases)."""
     matrices = [value for value in encoder.parameters() if value.ndim > 1]
-    rest = [value for value in encoder.parameters() if value.ndim <= 1]
-    return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+    vectors = [value for value in encoder.parameters() if value.ndim <= 1]
+    return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
 
 
-def _begin_worker(worker: int) -> None:  # noqa: ARG001
-    """One thread; and a signal to the whole group of processes is left to the training process, which ends its workers
-    once it has saved: a worker that dies first would be an error in the middle of that."""
+def _init_worker(worker: int) -> None:  # noqa: ARG001
+    """Sets a data worker to one thread, and makes it ignore signals that are sent to the process group: the training
+    process ends its workers after it has saved, and a worker that dies earlier would be an error while it saves."""
     torch.set_num_threads(1)
     for name in ("SIGTERM", "SIGHUP", "SIGINT"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    sys.excepthook = _quiet_of_ended_connections
+    sys.excepthook = _silence_connection_errors
 
 
-def _quiet_of_ended_connections(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """A training process that is stopped while it takes a sample from a worker says why itself; the thread that handed
-    the sample over would print that its connection was reset, or ended."""
-    if not issubclass(kind, ConnectionError | EOFError):
-        sys.__excepthook__(kind, error, trace)
+def _silence_connection_errors(
+    error_type: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """An excepthook of data workers that does not print errors of connections.
+
+    If the training process stops while it receives a sample, it reports the reason itself; the worker's thread that
+    sends the sample would print that its connection was reset or closed.
+    """
+    if not issubclass(error_type, ConnectionError | EOFError):
+        sys.__excepthook__(error_type, error, trace)

@@ -10,7 +10,7 @@ from torch import nn
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import write_archive
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.adapter_heads import Decode, Residual, load_heads, save_heads
+from gsencoder.train.adapter_heads import FeatureDecoder, Residual, load_heads, save_heads
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=6)
@@ -30,7 +30,7 @@ def test_decoding_undoes_standard_units(rank: int) -> None:
     standard = np.random.default_rng(1).normal(size=(5, space.channels)).astype(np.float32)
     restored = space.restore(standard)
     expected = restored if space.basis is None else restored @ space.basis.components + space.mean
-    found = Decode(space)(torch.from_numpy(standard)).numpy()
+    found = FeatureDecoder(space)(torch.from_numpy(standard)).numpy()
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 

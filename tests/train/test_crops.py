@@ -10,7 +10,7 @@ from splats import front_camera
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import blend
-from gsencoder.train.crops import SamplingConfig, choose_part, crop_size, in_frusta, nearest, seen_by, thin_out
+from gsencoder.train.crops import SamplingConfig, choose_crop, crop_size, drop_random, in_frusta, nearest_rows, seen_by
 from gsencoder.types import Cameras, Gaussians
 
 RNG = np.random.default_rng
@@ -64,7 +64,7 @@ def test_almost_nothing_that_a_view_shows_lies_outside_its_frustum() -> None:
 @given(st.integers(1, 50), st.integers(1, 60))
 def test_a_crop_holds_the_nearest(count: int, wanted: int) -> None:
     means = RNG(count).normal(size=(count, 3)).astype(np.float32)
-    rows = nearest(means, means[0], wanted)
+    rows = nearest_rows(means, means[0], wanted)
     assert len(rows) == min(count, wanted)
     assert (np.diff(rows) > 0).all()
     distances = np.linalg.norm(means - means[0], axis=1)
@@ -96,7 +96,7 @@ def cloud(count: int = 1000, places: int = 1) -> np.ndarray:
 def test_without_a_limit_a_sample_is_all_that_its_views_see() -> None:
     points, row = cloud(1000, 4), cameras(4)
     config = SamplingConfig(views=2, gaussians=0)
-    views, rows = choose_part(points, row, np.ones(1000, np.float32), config, 0, RNG(0))
+    views, rows = choose_crop(points, row, np.ones(1000, np.float32), config, 0, RNG(0))
     assert len(set(views)) == 2
     assert np.array_equal(rows, np.flatnonzero(in_frusta(points, row.select(views))))
 
@@ -105,7 +105,7 @@ def test_the_views_of_a_crop_look_at_its_center() -> None:
     points, row = cloud(1000, 4), cameras(4)
     for seed in range(8):
         config = SamplingConfig(views=2)
-        views, rows = choose_part(points, row, np.ones(1000, np.float32), config, 50, RNG(seed))
+        views, rows = choose_crop(points, row, np.ones(1000, np.float32), config, 50, RNG(seed))
         assert len(views) == 1  # No other camera of the row sees the same place.
         assert len(rows) == 50
         assert in_frusta(points[rows], row.select(views)).all()
@@ -118,7 +118,7 @@ def test_a_crop_holds_the_gaussians_nearest_to_its_center_that_the_views_see() -
     visible = np.flatnonzero(in_frusta(points, camera))
     chances[visible[7]] = 1
     config = SamplingConfig(views=1, rare_centers=1.0)
-    _, rows = choose_part(points, camera, chances, config, 20, RNG(0))
+    _, rows = choose_crop(points, camera, chances, config, 20, RNG(0))
     distances = np.linalg.norm(points[visible] - points[visible[7]], axis=1)
     assert set(rows) == set(visible[np.argsort(distances)[:20]])
 
@@ -130,25 +130,25 @@ def test_a_rare_target_is_often_the_center_of_a_crop() -> None:
     chances[visible[0]] = 1e3
     config = SamplingConfig(views=1, rare_centers=1.0)
     for seed in range(5):
-        assert visible[0] in choose_part(points, camera, chances, config, 5, RNG(seed))[1]
+        assert visible[0] in choose_crop(points, camera, chances, config, 5, RNG(seed))[1]
 
 
 def test_where_no_gaussian_has_a_target_any_may_be_the_center() -> None:
     config = SamplingConfig(views=1)
-    assert len(choose_part(cloud(), cameras(1), np.zeros(1000, np.float32), config, 5, RNG(0))[1])
+    assert len(choose_crop(cloud(), cameras(1), np.zeros(1000, np.float32), config, 5, RNG(0))[1])
 
 
 def test_the_whole_scene_may_be_taken() -> None:
     config = SamplingConfig(scope="scene")
     for size, expected in ((0, 100), (30, 30), (500, 100)):
-        assert len(choose_part(cloud(100), cameras(2), np.ones(100, np.float32), config, size, RNG(0))[1]) == expected
+        assert len(choose_crop(cloud(100), cameras(2), np.ones(100, np.float32), config, size, RNG(0))[1]) == expected
 
 
 def test_a_camera_that_looks_into_the_void_gives_way_to_one_that_sees_something() -> None:
     points, row = cloud(50), cameras(3)  # All before the first camera.
     for size in (0, 5):
         for seed in range(6):
-            views, rows = choose_part(points, row, np.ones(50, np.float32), SamplingConfig(views=1), size, RNG(seed))
+            views, rows = choose_crop(points, row, np.ones(50, np.float32), SamplingConfig(views=1), size, RNG(seed))
             assert len(rows)
             assert 0 in views
 
@@ -164,13 +164,13 @@ def test_a_scene_behind_its_cameras_is_an_error() -> None:
     behind = cloud(10) - np.array([0, 0, 9], np.float32)
     for size in (0, 5):
         with pytest.raises(InputError, match="no Gaussian lies in the frustum of any view"):
-            choose_part(behind, cameras(2), np.ones(10, np.float32), SamplingConfig(), size, RNG(0))
+            choose_crop(behind, cameras(2), np.ones(10, np.float32), SamplingConfig(), size, RNG(0))
 
 
 @given(st.integers(1, 40), st.floats(0, 0.9), st.integers(0, 50))
 def test_thinning_out_leaves_something(count: int, most: float, seed: int) -> None:
     rows = np.arange(count) * 2
-    kept = thin_out(rows, most, RNG(seed))
+    kept = drop_random(rows, most, RNG(seed))
     assert len(kept) >= 1
     assert np.isin(kept, rows).all()
 

@@ -9,7 +9,14 @@ import pytest
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.train.distributed import ProcessRank, fail_together, first_host, gpu_of, joined, rank_from_environment
+from gsencoder.train.distributed import (
+    ProcessRank,
+    fail_together,
+    first_host,
+    gpu_index,
+    join_processes,
+    rank_from_environment,
+)
 
 SLURM = {
     "SLURM_STEP_ID": "0",
@@ -23,7 +30,7 @@ SLURM = {
 
 def test_without_a_launcher_there_is_one_process() -> None:
     assert rank_from_environment({}) == (ProcessRank(), "")
-    with joined("cpu") as (process, device):
+    with join_processes("cpu") as (process, device):
         assert process.is_first
         assert device.type == "cpu"
 
@@ -48,7 +55,7 @@ def test_a_task_of_slurm_that_sees_one_gpu_takes_it(
     environment: dict[str, str], visible: int, gpu: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: visible)
-    assert gpu_of(*rank_from_environment(environment)) == gpu
+    assert gpu_index(*rank_from_environment(environment)) == gpu
 
 
 def test_an_address_that_is_given_is_taken() -> None:
@@ -73,7 +80,7 @@ def test_the_first_machine_of_a_list(nodes: str, host: str) -> None:
     [
         ({"RANK": "4", "WORLD_SIZE": "4"}, "RANK=4 is not below WORLD_SIZE=4"),
         ({"RANK": "x", "WORLD_SIZE": "4"}, "RANK: expected a whole number"),
-        ({**SLURM, "SLURM_STEP_NODELIST": ""}, "list of machines"),
+        ({**SLURM, "SLURM_STEP_NODELIST": ""}, "node list"),
     ],
 )
 def test_an_environment_that_contradicts_itself_is_refused(environment: dict[str, str], message: str) -> None:
@@ -82,12 +89,12 @@ def test_an_environment_that_contradicts_itself_is_refused(environment: dict[str
 
 
 def test_a_device_that_is_not_there_is_refused(no_gpu: None) -> None:
-    with pytest.raises(InputError, match="no GPU"), joined("cuda"):
+    with pytest.raises(InputError, match="no GPU"), join_processes("cuda"):
         pass
 
 
 def test_an_unknown_device_is_refused(no_jaxtyping: None) -> None:
-    with pytest.raises(InputError, match="expected auto, cpu or cuda"), joined("tpu"):  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="expected auto, cpu or cuda"), join_processes("tpu"):  # type: ignore[arg-type]
         pass
 
 
@@ -95,10 +102,10 @@ TOGETHER = """
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.train.distributed import joined, fail_together
+from gsencoder.train.distributed import fail_together, join_processes
 
 if __name__ == "__main__":
-    with joined("cpu") as (process, device):
+    with join_processes("cpu") as (process, device):
         try:
             with fail_together():
                 if not process.is_first:

@@ -9,7 +9,7 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import blend
-from gsencoder.train.losses import Head, LossConfig, contrast_loss, field_loss, match_loss, render_loss
+from gsencoder.train.losses import AdapterHead, LossConfig, contrast_loss, field_loss, match_loss, render_loss
 
 CONFIG = LossConfig()
 
@@ -100,7 +100,7 @@ def test_heads_are_compared_in_their_own_spaces_and_do_not_learn() -> None:
     b = blend(random_gaussians(60), front_camera(), patch=8)
     body = torch.nn.Linear(12, 5)
     decode = torch.nn.Linear(8, 12)
-    head = Head(body, torch.zeros(5), 1.0)
+    head = AdapterHead(body, torch.zeros(5), 1.0)
     predicted = torch.randn(60, 8, requires_grad=True)
     weights = (b.alpha > 0.3).float()
     found = render_loss(predicted, b, typical(b.rows), weights, CONFIG, [(head, decode), (head, decode)])
@@ -117,7 +117,7 @@ def test_weights_out_of_range_are_refused(change: dict) -> None:
 
 
 def test_no_loss_at_all_is_refused() -> None:
-    with pytest.raises(InputError, match="no loss left"):
+    with pytest.raises(InputError, match="there would be no loss"):
         LossConfig(field_weight=0.0, render_weight=0.0)
 
 
@@ -210,7 +210,7 @@ def test_a_head_gives_standard_units_of_its_own_space() -> None:
     vectors = torch.randn(500, 6, generator=torch.Generator().manual_seed(0)).double() * 3 + 7
     mean = vectors.mean(dim=0)
     scale = float((vectors - mean).square().sum(dim=1).mean().sqrt())
-    found = Head(torch.nn.Identity(), mean.float(), scale)(vectors.float())
+    found = AdapterHead(torch.nn.Identity(), mean.float(), scale)(vectors.float())
     torch.testing.assert_close(found.double(), (vectors - mean) / scale * 6**0.5, rtol=1e-4, atol=1e-5)
     assert abs(found.square().mean() - 1) < 1e-4
 
@@ -218,7 +218,7 @@ def test_a_head_gives_standard_units_of_its_own_space() -> None:
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
 def test_a_head_without_a_scale_is_refused(scale: float) -> None:
     with pytest.raises(InputError, match="positive scale"):
-        Head(torch.nn.Identity(), torch.zeros(3), scale)
+        AdapterHead(torch.nn.Identity(), torch.zeros(3), scale)
 
 
 @pytest.mark.parametrize("name", ["cosine", "smooth_l1", "field_weight", "render_weight", "contrast_weight", "rarity"])

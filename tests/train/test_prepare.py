@@ -15,9 +15,9 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import write_archive
 from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.train.class_balance import Rarity, cluster_targets, count_targets, nearest_codes
+from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets, nearest_codes
 from gsencoder.train.dataset_space import dataset_space
-from gsencoder.train.prepare import RARITY_FILE, SETTINGS_FILE, SPACE_FILE, PreparedDataset
+from gsencoder.train.prepare import CLASS_BALANCE_FILE, DATASET_SETTINGS_FILE, SPACE_FILE, PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -63,26 +63,26 @@ def test_cells_of_the_render_loss_hold_the_mean_of_their_pixels(tmp_path: Path) 
 
 def test_what_is_prepared_is_not_prepared_again(tmp_path: Path) -> None:
     _, names = prepared(tmp_path, count=2)
-    files = (tmp_path / SPACE_FILE, tmp_path / RARITY_FILE)
+    files = (tmp_path / SPACE_FILE, tmp_path / CLASS_BALANCE_FILE)
     before = [path.read_bytes() for path in files]
     again = PreparedDataset(tmp_path, {"made": "for a test"})
-    again.find_space([], lambda path: (scene(0), SideTeacher()), PREPARE)
-    again.find_rarity([], untracked)
+    again.fit_space([], lambda path: (scene(0), SideTeacher()), PREPARE)
+    again.count_classes([], untracked)
     assert [path.read_bytes() for path in files] == before
-    assert again.holds(Path(names[0]))
-    assert not again.holds(Path("wall_7"))
+    assert again.has_scene(Path(names[0]))
+    assert not again.has_scene(Path("wall_7"))
 
 
 def test_another_scene_of_a_prepared_name_is_refused(tmp_path: Path) -> None:
     dataset, names = prepared(tmp_path / "prepared", count=1)
-    with pytest.raises(InputError, match=f"was prepared from .*{names[0]}, and this run means .*elsewhere.*{names[0]}"):
-        dataset.holds(tmp_path / "elsewhere" / names[0])
+    with pytest.raises(InputError, match=f"was prepared from .*{names[0]}, but this run uses .*elsewhere.*{names[0]}"):
+        dataset.has_scene(tmp_path / "elsewhere" / names[0])
 
 
 def test_what_is_there_is_opened_without_settings_and_nothing_is_made(tmp_path: Path) -> None:
     dataset, _ = prepared(tmp_path / "prepared", count=1)
     assert PreparedDataset(tmp_path / "prepared").settings == dataset.settings
-    with pytest.raises(InputError, match=f"expected prepared scenes, found no {SETTINGS_FILE}"):
+    with pytest.raises(InputError, match=f"expected prepared scenes, found no {DATASET_SETTINGS_FILE}"):
         PreparedDataset(tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
 
@@ -94,14 +94,14 @@ def test_a_folder_of_another_dataset_is_refused_and_the_setting_named(tmp_path: 
 
 
 def test_settings_that_cannot_be_read_are_an_error_with_the_folder(tmp_path: Path) -> None:
-    (tmp_path / SETTINGS_FILE).write_text("{")
+    (tmp_path / DATASET_SETTINGS_FILE).write_text("{")
     with pytest.raises(InputError, match=str(tmp_path)):
         PreparedDataset(tmp_path, {})
 
 
 def test_a_damaged_scene_is_told_with_its_file(tmp_path: Path) -> None:
     dataset, names = prepared(tmp_path, count=1)
-    path = dataset.path_of(names[0])
+    path = dataset.scene_path(names[0])
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(InputError, match=str(path)):
         len(dataset.scenes(names)[0])
@@ -153,18 +153,18 @@ def test_values_that_no_preparation_writes_are_told_with_the_file_and_what_to_do
     tmp_path: Path, name: str, change: Callable[[np.ndarray], None]
 ) -> None:
     dataset, names = prepared(tmp_path, count=1)
-    path = dataset.path_of(names[0])
+    path = dataset.scene_path(names[0])
     arrays = load_file(path)
     change(arrays[name])
     rewrite(path, arrays)
-    with pytest.raises(InputError, match=rf"{path}: .*; remove the file, and it is prepared again$"):
+    with pytest.raises(InputError, match=rf"{path}: .*; remove the file to prepare the scene again$"):
         look_at_all(dataset.scenes(names)[0])
 
 
 @pytest.mark.parametrize("name", ["quats", "targets", "weights", "crow", "col", "row_valid", "means"])
 def test_arrays_that_do_not_fit_together_are_told_with_the_file(tmp_path: Path, name: str) -> None:
     dataset, names = prepared(tmp_path, count=1)
-    path = dataset.path_of(names[0])
+    path = dataset.scene_path(names[0])
     arrays = load_file(path)
     rewrite(path, {**arrays, name: arrays[name][:-1].copy()})
     with pytest.raises(InputError, match=rf"{path}: its arrays do not fit together; remove the file"):
@@ -174,8 +174,8 @@ def test_arrays_that_do_not_fit_together_are_told_with_the_file(tmp_path: Path, 
 @pytest.mark.parametrize("text", ["null", "[]", "3", '"x"', "[" * 100_000])
 def test_settings_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
     prepared(tmp_path, count=1)
-    (tmp_path / SETTINGS_FILE).write_text(text)
-    with pytest.raises(InputError, match=rf"{SETTINGS_FILE}: .*give another folder as prepared="):
+    (tmp_path / DATASET_SETTINGS_FILE).write_text(text)
+    with pytest.raises(InputError, match=rf"{DATASET_SETTINGS_FILE}: .*give another folder as prepared="):
         PreparedDataset(tmp_path, {"made": "for a test"})
 
 
@@ -183,9 +183,9 @@ def test_scenes_whose_settings_or_space_are_gone_are_not_taken_for_new_ones(tmp_
     dataset, _ = prepared(tmp_path, count=1)
     (tmp_path / SPACE_FILE).unlink()
     with pytest.raises(InputError, match="not the space that they were prepared for"):
-        dataset.find_space([Path("wall_0")], lambda path: (scene(0), SideTeacher()), PREPARE)
-    (tmp_path / SETTINGS_FILE).unlink()
-    with pytest.raises(InputError, match=rf"something else than prepared scenes \(no {SETTINGS_FILE}\)"):
+        dataset.fit_space([Path("wall_0")], lambda path: (scene(0), SideTeacher()), PREPARE)
+    (tmp_path / DATASET_SETTINGS_FILE).unlink()
+    with pytest.raises(InputError, match=rf"something else than prepared scenes \(no {DATASET_SETTINGS_FILE}\)"):
         PreparedDataset(tmp_path, {"made": "for a test"})
 
 
@@ -193,9 +193,9 @@ def test_scenes_whose_settings_or_space_are_gone_are_not_taken_for_new_ones(tmp_
 def test_kinds_of_another_width_are_refused(tmp_path: Path, columns: int) -> None:
     dataset, _ = prepared(tmp_path, count=1)
     arrays = {"codebook": np.zeros((2, columns), np.float32), "counts": np.ones(2)}
-    write_archive(tmp_path / RARITY_FILE, arrays, {})
-    with pytest.raises(InputError, match="remove the file, and it is counted again"):
-        dataset.load_rarity()
+    write_archive(tmp_path / CLASS_BALANCE_FILE, arrays, {})
+    with pytest.raises(InputError, match="remove the file to count targets again"):
+        dataset.load_class_balance()
 
 
 def test_scenes_of_two_spaces_are_refused() -> None:
@@ -233,12 +233,12 @@ def test_a_teacher_that_says_the_same_everywhere_is_refused() -> None:
 
 
 def test_rarity_gives_each_kind_its_power_of_the_count_and_a_mean_of_one() -> None:
-    rarity = Rarity(codebook=np.eye(3, dtype=np.float32), counts=np.array([100.0, 25.0, 0.0]))
-    each = rarity.each(0.5)
-    assert each[1] / each[0] == pytest.approx(2.0, rel=1e-5)
-    assert (each * rarity.counts).sum() / 125 == pytest.approx(1.0, rel=1e-5)
-    assert each[2] == each[0]  # A cell between kinds may be nearest to one that no Gaussian has.
-    assert (rarity.each(0.0) == 1).all()
+    balance = ClassBalance(codebook=np.eye(3, dtype=np.float32), counts=np.array([100.0, 25.0, 0.0]))
+    weights = balance.class_weights(0.5)
+    assert weights[1] / weights[0] == pytest.approx(2.0, rel=1e-5)
+    assert (weights * balance.counts).sum() / 125 == pytest.approx(1.0, rel=1e-5)
+    assert weights[2] == weights[0]  # A cell between kinds may be nearest to one that no Gaussian has.
+    assert (balance.class_weights(0.0) == 1).all()
 
 
 def test_targets_are_counted_by_the_nearest_vector() -> None:
@@ -258,5 +258,5 @@ def test_clusters_stand_for_names_where_there_are_none() -> None:
 
 def test_settings_are_kept_as_json(tmp_path: Path) -> None:
     PreparedDataset(tmp_path / "new", {"a": (1, 2)})
-    assert json.loads((tmp_path / "new" / SETTINGS_FILE).read_text()) == {"a": [1, 2]}
+    assert json.loads((tmp_path / "new" / DATASET_SETTINGS_FILE).read_text()) == {"a": [1, 2]}
     PreparedDataset(tmp_path / "new", {"a": (1, 2)})

@@ -17,11 +17,11 @@ from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_en
 from gsencoder.core.errors import InputError
 from gsencoder.render import BlendConfig, blend
 from gsencoder.train.augment import AugmentConfig
-from gsencoder.train.crops import SamplingConfig, choose_part
+from gsencoder.train.crops import SamplingConfig, choose_crop
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene, ViewRows
-from gsencoder.train.render_rows import restrict
+from gsencoder.train.render_rows import restrict_rows
 from gsencoder.train.samples import SampleDataset, StepSampler, join_samples, make_sample, target_codes
 from gsencoder.types import Cameras
 
@@ -114,7 +114,7 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
 def test_of_many_scenes_the_latest_used_are_kept_open(
     dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    monkeypatch.setattr("gsencoder.train.samples.OPEN_SCENES", most)
+    monkeypatch.setattr("gsencoder.train.samples.MAX_OPEN_SCENES", most)
     data, used = samples(*dataset), list[str]()
     for number in range(9):
         used.append(data.make(number).name.split(" ")[0])
@@ -159,13 +159,15 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
     rewrite(path, {**arrays, "weights": np.where(np.arange(len(arrays["means"])) % 5 == 0, 0, arrays["weights"])})
     scene = PreparedScene(path)
     recipe = samples(*dataset, augmentation=None, sampling=SamplingConfig(scope="scene", gaussians=0)).recipe
-    rarity, power = recipe.rarity, recipe.losses.rarity
-    squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - rarity.codebook).sum(axis=2)
+    balance, power = recipe.class_balance, recipe.losses.rarity
+    squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - balance.codebook).sum(axis=2)
     expected = np.where(scene.weights > 0, squares.argmin(axis=1), -1)
-    np.testing.assert_array_equal(target_codes(scene, rarity), expected)
+    np.testing.assert_array_equal(target_codes(scene, balance), expected)
     found = SampleDataset([scene], recipe)[0]
     np.testing.assert_array_equal(found.codes.numpy(), expected)
-    np.testing.assert_array_equal(found.loss_weights.numpy(), np.where(expected < 0, 0, rarity.each(power)[expected]))
+    np.testing.assert_array_equal(
+        found.loss_weights.numpy(), np.where(expected < 0, 0, balance.class_weights(power)[expected])
+    )
 
 
 def test_all_kinds_are_equally_often_the_center_of_a_sample(
@@ -173,15 +175,15 @@ def test_all_kinds_are_equally_often_the_center_of_a_sample(
 ) -> None:
     recipe, drawn = samples(*dataset).recipe, list[np.ndarray]()
 
-    def record(means: np.ndarray, cameras: Cameras, chances: np.ndarray, *rest: Any) -> Any:
-        drawn.append(chances)
-        return choose_part(means, cameras, chances, *rest)
+    def record(means: np.ndarray, cameras: Cameras, center_weights: np.ndarray, *rest: Any) -> Any:
+        drawn.append(center_weights)
+        return choose_crop(means, cameras, center_weights, *rest)
 
-    monkeypatch.setattr("gsencoder.train.samples.choose_part", record)
-    counts = recipe.rarity.counts
+    monkeypatch.setattr("gsencoder.train.samples.choose_crop", record)
+    counts = recipe.class_balance.counts
     sums = np.zeros(len(counts))
     for scene in dataset[0].scenes(dataset[1]):
-        codes = target_codes(scene, recipe.rarity)
+        codes = target_codes(scene, recipe.class_balance)
         make_sample(scene, codes, recipe, 200, np.random.default_rng(0))
         assert (drawn[-1][codes < 0] == 0).all()
         np.add.at(sums, codes[codes >= 0], drawn[-1][codes >= 0])
@@ -221,13 +223,13 @@ ALL = np.arange(4)
 def test_rows_stay_where_they_mean_something(
     row: list[float], selected: np.ndarray, kept: np.ndarray, stays: bool
 ) -> None:
-    found = restrict(rows_of([row, [1.0, 0, 0, 0]]), 4, selected, kept, LossConfig())
+    found = restrict_rows(rows_of([row, [1.0, 0, 0, 0]]), 4, selected, kept, LossConfig())
     assert found.targets.ravel().tolist() == ([0.0, 1.0] if stays else [1.0])
     assert found.col.max() < len(kept)
 
 
 def test_cells_without_a_teachers_vector_are_left_out() -> None:
-    found = restrict(rows_of([[1.0, 0], [0, 1.0]], [False, True]), 2, np.arange(2), np.arange(2), LossConfig())
+    found = restrict_rows(rows_of([[1.0, 0], [0, 1.0]], [False, True]), 2, np.arange(2), np.arange(2), LossConfig())
     assert found.targets.ravel().tolist() == [1.0]
     assert found.col.tolist() == [1]
 
@@ -254,9 +256,9 @@ def test_samples_side_by_side_are_the_samples_alone(dataset: tuple[PreparedDatas
 
 def test_a_dense_teacher_has_clusters_in_the_place_of_names(tmp_path: Path) -> None:
     dataset, names = prepared(tmp_path, teacher=DenseSideTeacher())
-    rarity = dataset.load_rarity()
+    balance = dataset.load_class_balance()
     assert dataset.load_space()[1] is None
-    assert rarity.counts.sum() == sum(int((scene.weights > 0).sum()) for scene in dataset.scenes(names))
+    assert balance.counts.sum() == sum(int((scene.weights > 0).sum()) for scene in dataset.scenes(names))
     assert np.isfinite(samples(dataset, names)[0].targets.numpy()).all()
 
 

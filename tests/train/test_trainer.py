@@ -20,11 +20,11 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.step_log import LOG_FILE, read_log
 from gsencoder.core.runtime.signals import Stopped
-from gsencoder.train.checkpoint import CHECKPOINT_FILE
+from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.trainer import Trainer, TrainerConfig, Validated, _quiet_of_ended_connections
+from gsencoder.train.trainer import Trainer, TrainerConfig, ValidationResult, _silence_connection_errors
 
 pytestmark = pytest.mark.slow
 
@@ -52,12 +52,12 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 def weights_in(folder: Path) -> dict[str, np.ndarray]:
     """Parameters of the checkpoint."""
-    found = load_file(folder / CHECKPOINT_FILE)
+    found = load_file(folder / TRAINING_CHECKPOINT_FILE)
     return {name: value for name, value in found.items() if name.startswith("model.")}
 
 
 def steps_in(folder: Path) -> int:
-    with open_archive(folder / CHECKPOINT_FILE) as file:
+    with open_archive(folder / TRAINING_CHECKPOINT_FILE) as file:
         return file.value("step", int)
 
 
@@ -134,14 +134,14 @@ def test_a_stop_that_compiled_code_wraps_is_a_stop(
 
     with pytest.raises(SystemError):
         trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9)).run(stop_at_three)
-    assert (tmp_path / CHECKPOINT_FILE).is_file() == saved
+    assert (tmp_path / TRAINING_CHECKPOINT_FILE).is_file() == saved
 
 
 def test_a_worker_whose_training_process_is_gone_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     for error in (ConnectionResetError(), BrokenPipeError(), EOFError()):
-        _quiet_of_ended_connections(type(error), error, None)
+        _silence_connection_errors(type(error), error, None)
     assert capsys.readouterr().err == ""
-    _quiet_of_ended_connections(ValueError, ValueError("wrong"), None)
+    _silence_connection_errors(ValueError, ValueError("wrong"), None)
     assert "ValueError: wrong" in capsys.readouterr().err
 
 
@@ -150,11 +150,11 @@ def test_an_interrupted_validation_is_done_again(dataset: Prepared, tmp_path: Pa
     config = replace(SHORT, validate_every=4, log_every=4, checkpoint_every=1e9)
     asked: list[float] = []
 
-    def validate(encoder: torch.nn.Module) -> Validated:
+    def validate(encoder: torch.nn.Module) -> ValidationResult:
         asked.append(float(sum(value.double().sum() for value in encoder.state_dict().values())))
         if len(asked) == at // 4:
             raise KeyboardInterrupt
-        return Validated({"score": asked[-1]})
+        return ValidationResult({"score": asked[-1]})
 
     with pytest.raises(KeyboardInterrupt):
         trainer(dataset, tmp_path / "cut", config, validate=validate).run()
@@ -213,7 +213,7 @@ def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, 
 )
 def test_a_state_that_no_run_was_in_is_refused(dataset: Prepared, tmp_path: Path, key: str, value: object) -> None:
     trainer(dataset, tmp_path).run()
-    path = tmp_path / CHECKPOINT_FILE
+    path = tmp_path / TRAINING_CHECKPOINT_FILE
     header = header_of(path)
     assert header["unlogged"] == []
     write_archive(path, load_file(path), {**header, key: value})
@@ -223,7 +223,7 @@ def test_a_state_that_no_run_was_in_is_refused(dataset: Prepared, tmp_path: Path
 
 def test_a_checkpoint_without_moments_is_refused(dataset: Prepared, tmp_path: Path) -> None:
     trainer(dataset, tmp_path).run()
-    path = tmp_path / CHECKPOINT_FILE
+    path = tmp_path / TRAINING_CHECKPOINT_FILE
     arrays = {name: array for name, array in load_file(path).items() if not name.startswith("optimizer.step")}
     write_archive(path, arrays, header_of(path))
     with pytest.raises(InputError, match=r"'optimizer\.step\..*' is missing"):
@@ -240,7 +240,7 @@ def test_a_log_that_is_gone_is_told(dataset: Prepared, tmp_path: Path) -> None:
 def test_a_training_that_compares_nothing_is_refused(dataset: Prepared, tmp_path: Path) -> None:
     strict = LossConfig(field_weight=0.0, render_weight=1.0, min_alpha=1.0, min_kept=1.0)
     nothing = samples(*dataset, losses=strict)
-    with pytest.raises(InputError, match=r"nothing is compared in wall_\d"):
+    with pytest.raises(InputError, match=r"there is nothing to compare in wall_\d"):
         Trainer(small_encoder(), nothing, strict, SHORT, folder=tmp_path, settings={}).run()
 
 
@@ -295,7 +295,7 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
     ):
         one.run()
     assert all(torch.equal(value, before[name]) for name, value in one.encoder.state_dict().items())
-    assert not (tmp_path / CHECKPOINT_FILE).exists()
+    assert not (tmp_path / TRAINING_CHECKPOINT_FILE).exists()
 
 
 def test_a_gradient_that_is_not_finite_stops_the_run_too(dataset: Prepared, tmp_path: Path) -> None:
@@ -314,7 +314,7 @@ def test_what_was_done_before_a_step_that_is_not_finite_is_kept(dataset: Prepare
         return gradient * (float("nan") if len(calls) == 4 else 1.0)
 
     one.encoder.head.weight.register_hook(spoil)
-    with pytest.raises(InputError, match="not finite at step 3; nothing was changed"):
+    with pytest.raises(InputError, match="not finite at step 3; parameters were not changed"):
         one.run()
     assert steps_in(tmp_path) == 3
     trainer(dataset, tmp_path).run()
@@ -346,7 +346,7 @@ def test_the_learning_rate_rises_and_falls(dataset: Prepared, tmp_path: Path) ->
 def test_validation_is_asked_for_and_logged(dataset: Prepared, tmp_path: Path) -> None:
     config, grey = replace(SHORT, validate_every=4), np.full((4, 6, 3), 128, np.uint8)
     scores = iter((0.5, 1.0))
-    validate = lambda encoder: Validated({"score": next(scores)}, {"sheet": grey})  # noqa: E731
+    validate = lambda encoder: ValidationResult({"score": next(scores)}, {"sheet": grey})  # noqa: E731
     trainer(dataset, tmp_path, config, validate=validate).run()
     assert sorted(path.name for path in (tmp_path / "validation").iterdir()) == ["sheet_000004.png", "sheet_000008.png"]
     rows = read_log(tmp_path / LOG_FILE)
@@ -366,7 +366,7 @@ from dataclasses import replace
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from training_scenes import LOSSES, SHORT, samples, small_encoder
-from gsencoder.train.distributed import joined
+from gsencoder.train.distributed import join_processes
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.trainer import Trainer
@@ -374,7 +374,7 @@ from gsencoder.train.trainer import Trainer
 if __name__ == "__main__":
     dataset = PreparedDataset(Path({prepared!r}), {{"made": "for a test"}})
     names = {names!r}
-    with joined("cpu") as (process, device):
+    with join_processes("cpu") as (process, device):
         config = replace(SHORT, steps={steps}, accumulate={accumulate})
         trainer = Trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
                           settings={{}}, process=process, device=device)

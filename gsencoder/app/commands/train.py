@@ -25,7 +25,7 @@ from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.text.table import save_text_table
-from gsencoder.train.distributed import fail_together, joined
+from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
 from gsencoder.train.run import TrainConfig, Training, fit
 
@@ -65,7 +65,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
             raise InputError(f"prepared={prepared}: lies in the folder of {name}, {taken}; give another folder")
     training, held_out = split_scenes(find_scenes(config.paths), config.holdout)
     words = text_table_of(config.teacher)
-    with WorkFolder(work) as state, joined(config.device) as (process, device), ExitStack() as results:
+    with WorkFolder(work) as state, join_processes(config.device) as (process, device), ExitStack() as results:
         track = Progress(quiet=config.quiet or not process.is_first)
         folder = None
         with fail_together():

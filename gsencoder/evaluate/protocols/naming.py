@@ -23,7 +23,7 @@ from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
 CHUNK_ROWS = 16_384
-"""Rows whose cosines with all words are computed at once."""
+"""Rows of features that are compared with all words in one matrix product."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -46,7 +46,7 @@ def cut_scene_curves(
     """
     scaled = np.floor(means.astype(np.float64) / voxel)
     low, high = scaled.min(axis=0), scaled.max(axis=0)
-    # Two cells fewer than would fit: the coordinates of a part may be counted from a cell beside the lowest.
+    # Two cells fewer than would fit, since the origin of a part may be rounded to a cell next to the lowest one.
     if not (high - low).max() < MAX_EXTENT - 2:
         return None
     cells = (scaled - np.floor(low / ALIGN) * ALIGN).astype(np.int64)
