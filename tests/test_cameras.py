@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from splats import random_cameras
@@ -19,6 +19,7 @@ from gsencoder.types.poses import (
     look_at,
     look_rotation,
     move_origin,
+    perpendicular,
     transform,
 )
 
@@ -279,6 +280,20 @@ def test_cameras_look_at_what_is_before_them_and_stand_upright() -> None:
     assert (rotations[:, 1] @ up < 0).all()
     ahead = transform(poses[3], (centers + 2 * forward)[3:4])
     np.testing.assert_allclose(ahead, [[0, 0, 2]], atol=1e-12)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3), st.sampled_from((1e-150, 1.0, 1e150)))
+def test_a_perpendicular_vector_is_perpendicular_and_of_unit_length(direction: list[float], length: float) -> None:
+    norm = float(np.linalg.norm(direction))
+    assume(norm > 1e-6)
+    unit = np.array(direction) / norm
+    normal = perpendicular(unit * length)
+    assert abs(normal @ unit) < 1e-15
+    assert abs(np.linalg.norm(normal) - 1) < 1e-15
+
+
+def test_the_perpendicular_vector_of_z_is_y() -> None:
+    assert perpendicular(np.array([0.0, 0.0, 1.0])).tolist() == [0, 1, 0]
 
 
 def test_opengl_axes_are_a_half_turn_about_x() -> None:

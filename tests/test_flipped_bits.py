@@ -19,8 +19,9 @@ from splats import front_camera, random_gaussians
 from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import open_archive
 from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint
-from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, load_settings, save_features
+from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_package
 from gsencoder.fusion.teacher_maps import read_map, write_map
 from gsencoder.models.output_space import OutputSpace
@@ -46,7 +47,12 @@ def a_scene(n: int = 60) -> Scene:
 
 def features(folder: Path, name: str) -> Made:
     save_features(folder, a_scene(), make_features(n=60), {"teacher": "test", "energy": 0.999})
-    return folder / name, lambda: (load_features(folder), load_settings(folder))
+
+    def read() -> Any:
+        with open_archive(folder / FEATURES_FILE) as file:
+            return load_features(folder), file.value("settings", dict)
+
+    return folder / name, read
 
 
 def package(folder: Path, name: str) -> Made:

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from gsencoder.core.errors import InputError
 from gsencoder.types import Cameras, Gaussians
 from gsencoder.types.cameras import intrinsic_matrix
-from gsencoder.types.poses import look_at
+from gsencoder.types.poses import look_at, perpendicular
 
 COVERED = 0.95
 """The opacity-weighted share of the Gaussians that must fit into the picture, …"""
@@ -88,8 +88,7 @@ def spiral_directions(
     low, high = (-0.9, 0.9) if up is None else (math.sin(math.radians(-15)), math.sin(math.radians(60)))
     steps = (np.arange(count) + 0.5) / count
     sines, turns = low + (high - low) * steps, GOLDEN_ANGLE * np.arange(count)
-    east = np.cross(vertical, np.eye(3)[np.abs(vertical).argmin()])
-    east /= np.linalg.norm(east)
+    east = perpendicular(vertical)
     north = np.cross(vertical, east)
     level = np.sqrt(1 - sines**2)[:, None] * (np.cos(turns)[:, None] * east + np.sin(turns)[:, None] * north)
     return level + sines[:, None] * vertical, vertical

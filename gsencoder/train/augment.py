@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import sh_basis
 from gsencoder.types import SH_C0, Gaussians
+from gsencoder.types.poses import perpendicular
 
 _DIRECTIONS = 64
 """Directions over which harmonics are turned: more than enough for the 16 coefficients of degree 3."""
@@ -68,12 +69,11 @@ def augment(
     """
     axis = np.array([0.0, 0.0, 1.0]) if up is None else up / np.linalg.norm(up)
     rotation = Rotation.from_rotvec(axis * math.radians(rng.uniform(-config.turn, config.turn)))
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across = Rotation.from_rotvec(axis * rng.uniform(0, 2 * math.pi)).apply(across / np.linalg.norm(across))
-    rotation = Rotation.from_rotvec(across * math.radians(rng.normal(0, config.tilt))) * rotation
+    horizontal = Rotation.from_rotvec(axis * rng.uniform(0, 2 * math.pi)).apply(perpendicular(axis))
+    rotation = Rotation.from_rotvec(horizontal * math.radians(rng.normal(0, config.tilt))) * rotation
     to_from = rotation.as_matrix()
     if rng.random() < config.mirror:
-        to_from = to_from @ (np.eye(3) - 2 * np.outer(across, across))
+        to_from = to_from @ (np.eye(3) - 2 * np.outer(horizontal, horizontal))
     turned = turn(gaussians, to_from, float(rng.uniform(1 - config.scale, 1 + config.scale)))
     shift = rng.uniform(0, voxel, 3) + rng.normal(0, config.jitter * voxel, turned.means.shape)
     return replace(

@@ -45,6 +45,15 @@ def move_origin(
     return moved
 
 
+def perpendicular(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+    """A unit vector perpendicular to `direction`, which is of any length but zero.
+
+    It is the cross product with the coordinate axis that is farthest from parallel: the result of the z axis is y.
+    """
+    normal = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    return normal / np.linalg.norm(normal)
+
+
 def look_rotation(forward: Float64[np.ndarray, "V 3"], up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "V 3 3"]:
     """Rotations cam_from_world of cameras that look along `forward`, level with `up`; rows are right, down, forward.
 

@@ -10,7 +10,8 @@ from safetensors.numpy import load_file
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, load_settings, save_features
+from gsencoder.core.files.archive import open_archive
+from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=8, teacher="test", text_encoder="words")
@@ -62,7 +63,8 @@ def test_scene_and_features_come_back_within_half_precision(tmp_path: Path, magn
     assert (loaded.gaussians.means == scene.gaussians.means).all()
     assert loaded.views is not None
     assert loaded.views.names == ("a",)
-    assert load_settings(tmp_path) == {"lift": "blend"}
+    with open_archive(tmp_path / FEATURES_FILE) as file:
+        assert file.value("settings", dict) == {"lift": "blend"}
 
 
 def test_only_seen_rows_are_stored(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Curves against their definitions: every cell once, neighbors in the order are neighbors in space, levels nest."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ from gsencoder.models.grid.serialize import (
     ALIGN,
     INVALID_CODE,
     MAX_EXTENT,
+    Order,
     check_extent,
     coordinate_bits,
-    encode_cells,
+    curve_from_morton,
     hilbert_from_morton,
     morton_codes,
 )
@@ -29,6 +31,10 @@ def cube(bits: int) -> torch.Tensor:
     return torch.tensor(list(itertools.product(range(2**bits), repeat=3)))
 
 
+def curve_codes(cells: Any, order: Order, bits: int) -> Any:
+    return curve_from_morton(morton_codes(cells), order, bits)
+
+
 def interleaved(x: int, y: int, z: int) -> int:
     """A Morton code, bit by bit."""
     return sum(((x >> i & 1) << 3 * i + 2) | ((y >> i & 1) << 3 * i + 1) | ((z >> i & 1) << 3 * i) for i in range(21))
@@ -37,7 +43,7 @@ def interleaved(x: int, y: int, z: int) -> int:
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("bits", [1, 2, 3, 4])
 def test_a_curve_visits_every_cell_of_a_cube_once(order: str, bits: int) -> None:
-    codes = encode_cells(cube(bits), order, bits)
+    codes = curve_codes(cube(bits), order, bits)
     assert sorted(codes.tolist()) == list(range(8**bits))
 
 
@@ -45,14 +51,14 @@ def test_a_curve_visits_every_cell_of_a_cube_once(order: str, bits: int) -> None
 @pytest.mark.parametrize("bits", [1, 2, 3, 4, 5])
 def test_hilbert_steps_to_a_face_neighbor_always(order: str, bits: int) -> None:
     cells = cube(bits)
-    path = cells[torch.argsort(encode_cells(cells, order, bits))]
+    path = cells[torch.argsort(curve_codes(cells, order, bits))]
     assert (path.diff(dim=0).abs().sum(dim=1) == 1).all()
 
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("bits", [2, 3, 4])
 def test_cutting_three_bits_off_a_code_gives_the_code_of_the_larger_cell_up_to_the_curve(order: str, bits: int) -> None:
-    codes = encode_cells(cube(bits), order, bits) >> 3
+    codes = curve_codes(cube(bits), order, bits) >> 3
     parents = morton_codes(cube(bits) >> 1)
     # One code for all eight children, and different codes for different parents.
     pairs = set(zip(codes.tolist(), parents.tolist(), strict=True))
@@ -62,15 +68,15 @@ def test_cutting_three_bits_off_a_code_gives_the_code_of_the_larger_cell_up_to_t
 def test_transposed_orders_are_the_orders_of_swapped_cells() -> None:
     cells = torch.randint(0, 2**20, (500, 3))
     swapped = cells[:, [1, 0, 2]]
-    assert torch.equal(encode_cells(cells, "z-trans", 20), encode_cells(swapped, "z", 20))
-    assert torch.equal(encode_cells(cells, "hilbert-trans", 20), encode_cells(swapped, "hilbert", 20))
+    assert torch.equal(curve_codes(cells, "z-trans", 20), curve_codes(swapped, "z", 20))
+    assert torch.equal(curve_codes(cells, "hilbert-trans", 20), curve_codes(swapped, "hilbert", 20))
 
 
 def test_orders_that_are_not_transposed_take_x_first() -> None:
     cells = torch.randint(0, 2**20, (500, 3))
     morton = morton_codes(cells)
-    assert torch.equal(encode_cells(cells, "z", 20), morton)
-    assert torch.equal(encode_cells(cells, "hilbert", 20), hilbert_from_morton(morton, 20))
+    assert torch.equal(curve_codes(cells, "z", 20), morton)
+    assert torch.equal(curve_codes(cells, "hilbert", 20), hilbert_from_morton(morton, 20))
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 2**21 - 1)] * 3), min_size=1, max_size=20))
@@ -82,7 +88,7 @@ def test_codes_are_distinct_at_the_far_end_of_twenty_bits() -> None:
     far = 2**20 + ALIGN - 1
     cells = torch.tensor(list(itertools.product((0, 1, far - 1, far), repeat=3)))
     for order in ORDERS:
-        codes = encode_cells(cells, order, coordinate_bits(cells))
+        codes = curve_codes(cells, order, coordinate_bits(cells))
         assert len(codes.unique()) == 64
         assert (codes >= 0).all()
 
@@ -90,7 +96,7 @@ def test_codes_are_distinct_at_the_far_end_of_twenty_bits() -> None:
 @pytest.mark.parametrize("bits", range(2, 22))
 def test_hilbert_codes_do_not_depend_on_how_many_bits_are_looked_at(bits: int) -> None:
     """The corner of a large scene is ordered as a small scene of its own."""
-    assert torch.equal(encode_cells(cube(2), "hilbert", bits), encode_cells(cube(2), "hilbert", 2))
+    assert torch.equal(curve_codes(cube(2), "hilbert", bits), curve_codes(cube(2), "hilbert", 2))
 
 
 def test_a_part_counted_from_the_corner_of_the_whole_has_the_codes_of_the_whole() -> None:
@@ -133,9 +139,9 @@ def test_no_points_have_no_cells() -> None:
 @pytest.mark.parametrize("order", ORDERS)
 def test_arrays_and_tensors_have_the_same_codes(order: str) -> None:
     cells = np.random.default_rng(0).integers(0, MAX_EXTENT, (500, 3))
-    codes = encode_cells(cells, order, 20)
+    codes = curve_codes(cells, order, 20)
     assert isinstance(codes, np.ndarray)
-    np.testing.assert_array_equal(encode_cells(torch.from_numpy(cells), order, 20).numpy(), codes)
+    np.testing.assert_array_equal(curve_codes(torch.from_numpy(cells), order, 20).numpy(), codes)
 
 
 def test_bits_are_those_of_the_largest_coordinate() -> None:
@@ -155,7 +161,7 @@ def test_no_cell_has_the_code_that_none_has(order: str) -> None:
     """Coordinates have 21 bits with the room for alignment, and three of them fill an int64 to its last bit."""
     far = MAX_EXTENT + ALIGN - 1
     cells = torch.tensor(list(itertools.product((0, far), repeat=3)))
-    codes = encode_cells(cells, order, coordinate_bits(cells))
+    codes = curve_codes(cells, order, coordinate_bits(cells))
     assert (codes >= 0).all()
     assert (codes < INVALID_CODE).all()
     assert np.iinfo(np.int64).max == INVALID_CODE

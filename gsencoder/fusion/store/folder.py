@@ -104,17 +104,6 @@ def load_features(folder: str | Path) -> Scene:
     return replace(scene, features={features.space.name: features})
 
 
-def load_settings(folder: Path) -> dict[str, Any]:
-    """The settings that made the features of a folder.
-
-    Raises:
-        InputError: not such a folder, or damaged.
-    """
-    with _open(folder, FEATURES_FILE) as file:
-        settings: dict[str, Any] = file.value("settings", dict)
-        return settings
-
-
 def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
     if not (folder / name).is_file():
         raise InputError(f"{folder}: {name} is missing; expected a folder of gsencoder features")

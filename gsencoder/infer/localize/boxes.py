@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, Integer
 
 from gsencoder.types import Gaussians
+from gsencoder.types.poses import perpendicular
 
 Extent = Literal["means", "sigma"]
 MAX_EXACT_POINTS = 50_000
@@ -226,11 +227,9 @@ def _smallest_rectangle(plane_points: Float64[np.ndarray, "n 2"]) -> float:
 
 
 def _plane_axes(normal: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 2"]:
-    """Two axes beside a unit vector, so that (first, second, normal) is right-handed; x and y for normal = z."""
-    helper = np.eye(3)[0 if abs(normal[0]) < 0.9 else 1]
-    first = helper - normal * normal[int(helper.argmax())]
-    first /= math.sqrt(float(first @ first))
-    return np.stack([first, np.cross(normal, first)], axis=1)
+    """Two axes across a unit vector, so that (first, second, normal) is right-handed; x and y for normal = z."""
+    second = perpendicular(normal)
+    return np.stack([np.cross(second, normal), second], axis=1)
 
 
 def _axes_about(normal: Float64[np.ndarray, "3"], angle: float) -> Float64[np.ndarray, "3 3"]:

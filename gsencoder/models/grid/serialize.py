@@ -56,13 +56,14 @@ def coordinate_bits(cells: Int64[Any, "N 3"]) -> int:
     return max(1, int(cells.max()).bit_length()) if len(cells) else 1
 
 
-def encode_cells(cells: Int64[Any, "N 3"], order: Order, bits: int) -> Int64[Any, " N"]:
-    """Codes of cells (coordinates from 0 to 2^bits − 1) along a curve; the "-trans" orders swap x and y first."""
-    return curve_from_morton(morton_codes(cells), order, bits)
-
-
 def curve_from_morton(morton: Int64[Any, " N"], order: Order, bits: int) -> Int64[Any, " N"]:
-    """Codes along a curve, as `encode_cells` gives them, of cells given by their Morton codes."""
+    """Codes along a curve of cells that are given by their Morton codes; the "-trans" orders swap x and y first.
+
+    Args:
+        morton: codes of coordinates from 0 to 2^bits − 1.
+        order: the curve.
+        bits: levels of the curve.
+    """
     morton = swap_xy(morton, order)
     return hilbert_from_morton(morton, bits) if order.startswith("hilbert") else morton
 
