@@ -10,6 +10,7 @@ import torch
 
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.removed_options import without_removed_options
 from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.parameters import shapes_of
 from gsencoder.reconstruct.row_adam import RowAdam
@@ -81,7 +82,7 @@ def load_state(
         InputError: damaged, or of a run with other settings; the first that differs is named.
     """
     with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
-        earlier = file.value("settings", dict)
+        earlier = without_removed_options(file.value("settings", dict))
         if earlier != settings:
             raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
         step, adam_steps = file.value("step", int), file.value("adam_steps", int)

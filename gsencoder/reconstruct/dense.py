@@ -38,6 +38,12 @@ FILLED_SPACING = 2.0
 MAX_SEE_THROUGH = 1
 """A point that no view confirms may be seen through by this many views."""
 MIN_SPACING = 0.1
+MIN_CORRELATION = 0.6
+"""Normalized cross-correlation of two windows, −1 to 1, from which they are taken to show the same surface."""
+DEPTH_TOLERANCE = 0.02
+"""Largest relative difference of two depths of one surface."""
+COLOR_TOLERANCE = 0.06
+"""Largest mean difference of the colors (0 to 1) of one surface in two photographs."""
 CELL = 1 / 40
 """Side of the cells in which coverage is counted, as a share of the picture's longer side."""
 
@@ -54,11 +60,6 @@ class DenseConfig:
     samples: int = field(default=3, metadata={"help": "pixels that must agree on a seed, from all photographs"})
     size: int = field(default=200, metadata={"help": "longer side in pixels of the pictures that are compared"})
     sources: int = field(default=4, metadata={"help": "other photographs that each is compared with"})
-    alike: float = field(default=0.6, metadata={"help": "correlation from which windows count as the same, −1 to 1"})
-    agree: float = field(default=0.02, metadata={"help": "relative difference of depths that agree"})
-    color: float = field(
-        default=0.06, metadata={"help": "difference of colors (of 1) up to which interpolated points are kept"}
-    )
 
     def __post_init__(self) -> None:
         if not 0 <= self.enough <= 1:
@@ -67,12 +68,6 @@ class DenseConfig:
             raise InputError(f"spacing: expected {MIN_SPACING} pixels or more, got {self.spacing}")
         if self.samples < 1:
             raise InputError(f"samples: expected at least 1 pixel, got {self.samples}")
-        if not -1 <= self.alike < 1:
-            raise InputError(f"alike: expected a correlation from −1 to below 1, got {self.alike}")
-        if not 0 < self.agree < 0.5:
-            raise InputError(f"agree: expected a share between 0 and 0.5, got {self.agree}")
-        if not 0 <= self.color <= 1:
-            raise InputError(f"color: expected a number from 0 to 1, got {self.color}")
         if self.size < 32:
             raise InputError(f"size: expected at least 32 pixels, got {self.size}")
         if self.sources < 2:
@@ -147,15 +142,15 @@ def densify(
             swept_map = sweep(
                 photos[view], poses[view], [photos[o] for o in others], [poses[o] for o in others], *limits
             )
-            maps[view] = swept_map._replace(depth=torch.where(swept_map.score >= config.alike, swept_map.depth, 0))
-    consistent = _consistent_depths(maps, photos, poses, neighbors, config)
+            maps[view] = swept_map._replace(depth=torch.where(swept_map.score >= MIN_CORRELATION, swept_map.depth, 0))
+    consistent = _consistent_depths(maps, photos, poses, neighbors)
     swept = _back_project(consistent, photos, poses)
     seen = _fill_depths(consistent, photos, poses, points)
-    filled = _back_project(_supported_depths(seen, consistent, photos, poses, neighbors, config), photos, poses)
+    filled = _back_project(_supported_depths(seen, consistent, photos, poses, neighbors), photos, poses)
     voxel = config.spacing * _pixel_size(cameras, consistent)
-    swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses, config.agree)
+    swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses, DEPTH_TOLERANCE)
     filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
-    filled = carve(*filled, consistent, photos, poses, config.agree)
+    filled = carve(*filled, consistent, photos, poses, DEPTH_TOLERANCE)
     positions, tints = (np.concatenate(arrays) for arrays in zip((points, colors), swept, filled, strict=True))
     after = coverage(cameras, training, positions)
     return DenseSeeds(
@@ -225,13 +220,12 @@ def _consistent_depths(
     photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
     neighbors: Mapping[int, Sequence[int]],
-    config: DenseConfig,
 ) -> dict[int, Float[Tensor, "h w"]]:
     """Depths that two other views confirm; 0 elsewhere."""
     consistent = {}
     for view, depth_map in maps.items():
         others = [(maps[other], photos[other], poses[other]) for other in neighbors[view] if other in maps]
-        votes = count_agreeing(depth_map.depth, photos[view], poses[view], others, config.agree)
+        votes = count_agreeing(depth_map.depth, photos[view], poses[view], others, DEPTH_TOLERANCE)
         consistent[view] = torch.where(votes >= 2, depth_map.depth, 0)
     return consistent
 
@@ -300,7 +294,6 @@ def _supported_depths(
     photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
     neighbors: Mapping[int, Sequence[int]],
-    config: DenseConfig,
 ) -> dict[int, Float[Tensor, "h w"]]:
     """Interpolated depths whose colors two other photographs confirm, and that none sees through; 0 elsewhere."""
     smooth = {view: window_mean(photos[view].image.permute(2, 0, 1)[None])[0] for view in seen}
@@ -321,9 +314,9 @@ def _supported_depths(
             other_tints = torch.nn.functional.grid_sample(smooth[other][None], grid[None, None], align_corners=False)[
                 0, :, 0
             ].T
-            votes += inside & ((other_tints - tints).abs().mean(dim=-1) <= config.color)
+            votes += inside & ((other_tints - tints).abs().mean(dim=-1) <= COLOR_TOLERANCE)
             z, measured = sample_depth(points_seen, consistent[other], photos[other], poses[other])
-            against |= sees_through(z, measured, config.agree)
+            against |= sees_through(z, measured, DEPTH_TOLERANCE)
         chosen = torch.zeros_like(candidates)
         chosen[candidates] = (votes >= 2) & ~against
         supported[view] = torch.where(chosen, depth, 0)

@@ -11,6 +11,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from gsencoder.app import cli
+from gsencoder.app.commands.localize import LocalizeCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.app.settings.config import HIDDEN, CommonConfig, check_required, settings, typed
 from gsencoder.app.settings.options import describe, join_list, split_list
@@ -244,6 +245,20 @@ def test_a_wrong_setting_is_told_in_one_line_with_its_full_key(conf: Path, word:
         toy(conf, word)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_removed_option_is_accepted_with_its_former_default_alone() -> None:
+    words = ["features", "query=mug"]
+    same = compose("localize", LocalizeCommandConfig, words)
+    assert compose("localize", LocalizeCommandConfig, [*words, "localize.margin=0"]) == same
+    assert compose("localize", LocalizeCommandConfig, [*words, "margin=0.0"]) == same
+    assert typed(LocalizeCommandConfig, {"paths": ["features"], "query": "mug", "localize": {"margin": 0}}) == same
+    for refused in (
+        lambda: compose("localize", LocalizeCommandConfig, [*words, "margin=0.1"]),
+        lambda: typed(LocalizeCommandConfig, {"paths": ["features"], "query": "mug", "localize": {"margin": 0.1}}),
+    ):
+        with pytest.raises(InputError, match=r"localize\.margin: this option was removed"):
+            refused()
 
 
 def test_a_setting_given_twice_is_an_error_also_under_its_short_name(conf: Path) -> None:

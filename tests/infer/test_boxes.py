@@ -200,14 +200,6 @@ def test_one_two_and_three_points_have_boxes() -> None:
     assert area[1] * area[2] <= 2 + 1e-6
 
 
-def test_the_margin_grows_both_boxes_on_every_side(rng: np.random.Generator) -> None:
-    points = rng.random((50, 3)).astype(np.float32)
-    plain, grown = bounds(points), bounds(points, margin=0.25)
-    np.testing.assert_allclose(grown.size, plain.size + 0.5)
-    np.testing.assert_allclose(grown.aabb_min, plain.aabb_min - 0.25)
-    np.testing.assert_allclose(grown.aabb_max, plain.aabb_max + 0.25)
-
-
 def test_sigma_boxes_bound_the_ellipsoids(rng: np.random.Generator) -> None:
     quats = Rotation.random(20, rng=1).as_quat()[:, [3, 0, 1, 2]]
     gaussians = splat(rng.random((20, 3)), 0.05, quats)

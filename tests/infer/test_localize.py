@@ -76,7 +76,7 @@ def first(found: Localization, word: str) -> Box:
 
 @pytest.mark.parametrize("basis", [False, True])
 def test_words_are_found_where_they_are(basis: bool) -> None:
-    found = localize(make_room_scene(basis=basis), ["mug", "lamp"], TABLE, LocalizeConfig(margin=0.0))
+    found = localize(make_room_scene(basis=basis), ["mug", "lamp"], TABLE)
     for word in ("mug", "lamp"):
         box, place, size = first(found, word), np.array(PLACES[word][0]), np.array(SIZES[word])
         assert np.abs(box.aabb_min - (place - size / 2)).max() <= STEP + 1e-6
@@ -181,7 +181,7 @@ def test_objects_of_one_to_three_gaussians_are_found_when_asked_for(count: int) 
     features = fused.features.copy()
     features[60 : 60 + count] = TABLE.embeddings[WORDS.index("spoon")]
     scene = replace(SCENE, features={"toy": replace(fused, features=features)})
-    box = localize(scene, ["spoon"], TABLE, LocalizeConfig(min_samples=1, margin=0.0)).boxes[0]
+    box = localize(scene, ["spoon"], TABLE, LocalizeConfig(min_samples=1)).boxes[0]
     assert box.rows.tolist() == list(range(60, 60 + count))
     np.testing.assert_allclose(np.sort(box.obb_size), [0, 0, (count - 1) * STEP], atol=1e-6)
 
@@ -229,7 +229,6 @@ def test_of_several_feature_sets_one_must_be_named() -> None:
         {"eps_spacings": -1.0},
         {"min_samples": 0},
         {"min_share": 2.0},
-        {"margin": -0.1},
         {"temperature": 0.0},
     ],
 )

@@ -134,10 +134,6 @@ def test_points_that_cover_the_pictures_are_left_alone() -> None:
         ("samples", 0),
         ("size", 8),
         ("sources", 1),
-        ("alike", 2.0),
-        ("agree", -1.0),
-        ("agree", 1e9),
-        ("color", -1.0),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(name: str, value: float) -> None:

@@ -36,7 +36,7 @@ class ExportConfig(CommonConfig):
     paths: tuple[str, ...] = field(
         default=(),
         metadata={
-            "help": "splats or scenes to compare on, beside random clouds, and to calibrate int8_static on",
+            "help": "splats or scenes to compare on, in addition to random clouds",
             "metavar": "SPLAT",
         },
     )
@@ -55,8 +55,8 @@ class ExportConfig(CommonConfig):
     precision: Stored = field(
         default="float32",
         metadata={
-            "help": "what the graph computes in; int8_weights = stored in 8 bits, computed in float32; int8_dynamic, "
-            "int8_static = products of 8-bit integers, their ranges found for each cloud, or once from SPLATs"
+            "help": "what the graph computes in; int8_weights = stored in 8 bits, computed in float32; int8_dynamic = "
+            "products of 8-bit integers, whose ranges are computed for each splat"
         },
     )
     sizes: tuple[int, ...] = field(
@@ -84,8 +84,6 @@ class ExportConfig(CommonConfig):
             raise InputError(f"tolerance: expected a share between 0 and 1, got {self.tolerance}")
         if not -1 <= self.cosine <= 1:
             raise InputError(f"cosine: expected -1 to 1, got {self.cosine}")
-        if self.precision == "int8_static" and not self.paths:
-            raise InputError("precision=int8_static: give splats or scenes to calibrate on, of the kind that it is for")
 
 
 def run(config: ExportConfig, summary: Summary) -> None:
@@ -112,7 +110,7 @@ def run(config: ExportConfig, summary: Summary) -> None:
         with summary.step("convert"):
             if config.precision == "float16":
                 lowered = lower(encoder, half=True)
-            model = export_onnx(encoder, lowered, config.precision, scenes=scenes, track=track)
+            model = export_onnx(encoder, lowered, config.precision)
         with summary.step("judge"):
             cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=track)
         told = (

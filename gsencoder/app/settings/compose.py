@@ -31,6 +31,7 @@ from gsencoder.app.settings.options import (
     wrong_value,
 )
 from gsencoder.core.errors import InputError
+from gsencoder.core.removed_options import check_removed_option, removed_option
 
 Config = TypeVar("Config", bound=CommonConfig)
 
@@ -141,6 +142,8 @@ def read_words(
         full = key if sweep and re.match(r"hydra[./]", key) else _full_key(key, choices)
         if full is None and os.path.lexists(word):
             paths.append(word)
+        elif full is None and (removed := removed_option(key, choices.options)) is not None:
+            check_removed_option(removed, value)
         elif full is None:
             raise InputError(_unknown(word, key, choices))
         elif full in given:

@@ -28,6 +28,7 @@ from gsencoder.app.settings.options import (
     wrong_value,
 )
 from gsencoder.core.errors import InputError
+from gsencoder.core.removed_options import REMOVED_OPTIONS, check_removed_option
 
 T = TypeVar("T")
 
@@ -100,6 +101,9 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
     types = field_types(cls)
     values: dict[str, Any] = {}
     for name, value in data.items():
+        if name not in types and f"{prefix}{name}" in REMOVED_OPTIONS:
+            check_removed_option(f"{prefix}{name}", value)
+            continue
         if name not in types:
             known = [prefix + known for known in types]
             raise InputError(f"{prefix}{name}: no such option{near(f'{prefix}{name}', known)}")

@@ -8,6 +8,8 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
+from gsencoder.core.removed_options import REMOVED_VALUES
+
 Kind = Literal["text", "list", "value"]
 
 
@@ -216,7 +218,8 @@ def wrong_value(option: Option, value: Any) -> str:
     if isinstance(value, (list, tuple)) and option.kind == "list":
         value = join_list(map(str, value))
     allowed = [str(word) for word in _words(option.annotation)]
-    hint = near(str(value), allowed) if allowed else ""
+    removed = REMOVED_VALUES.get(f"{option.key}={value}")
+    hint = f", which was removed: {removed}" if removed else near(str(value), allowed) if allowed else ""
     meaning = f" ({option.help})" if option.help and not hint else ""
     return f"{option.key}: expected {describe(option.annotation)}, got {value!r}{hint}{meaning}"
 

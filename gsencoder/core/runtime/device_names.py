@@ -4,5 +4,5 @@ from typing import Literal
 
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["auto", "float32", "bfloat16"]
-Stored = Literal["float32", "float16", "int8_weights", "int8_dynamic", "int8_static"]
+Stored = Literal["float32", "float16", "int8_weights", "int8_dynamic"]
 """What an exported graph computes in."""

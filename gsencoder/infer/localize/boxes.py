@@ -120,7 +120,6 @@ def box_around(
     *,
     extent: Extent = "means",
     sigmas: float = 1.0,
-    margin: float = 0.0,
     up: Float64[np.ndarray, "3"] | None = None,
 ) -> Extents:
     """The axis-aligned and the oriented box of some Gaussians.
@@ -131,7 +130,6 @@ def box_around(
         extent: "means" bounds the centers; "sigma" bounds the ellipsoids of `sigmas` standard deviations, whose
             half-width along a unit vector a is sigmas·√(aᵀΣa).
         sigmas: see there.
-        margin: length added on every side.
         up: direction of the last axis of the oriented box; None = the smallest box of any orientation.
     """
     from scipy.spatial.transform import Rotation
@@ -148,13 +146,10 @@ def box_around(
     # Coordinates about the middle: rotating those of a far-away scene would round.
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     rotated = (points - middle) @ rotation
-    low, high = (
-        (rotated - half_widths_rotated).min(axis=0) - margin,
-        (rotated + half_widths_rotated).max(axis=0) + margin,
-    )
+    low, high = (rotated - half_widths_rotated).min(axis=0), (rotated + half_widths_rotated).max(axis=0)
     return Extents(
-        aabb_min=(points - half_widths).min(axis=0) - margin,
-        aabb_max=(points + half_widths).max(axis=0) + margin,
+        aabb_min=(points - half_widths).min(axis=0),
+        aabb_max=(points + half_widths).max(axis=0),
         center=middle + rotation @ ((low + high) / 2),
         rotation=rotation,
         size=high - low,

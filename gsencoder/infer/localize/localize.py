@@ -57,7 +57,6 @@ class LocalizeConfig:
         default="means", metadata={"help": "boxes around Gaussian means, or around their ellipsoids"}
     )
     sigmas: float = field(default=1.0, metadata={"help": "size of the ellipsoids for extent=sigma"})
-    margin: float = field(default=0.0, metadata={"help": "added on every side of a box, in spacings"})
     upright: bool = field(
         default=True,
         metadata={"help": "one axis of oriented boxes follows the scene's up direction, where it is known"},
@@ -72,7 +71,7 @@ class LocalizeConfig:
         for name in ("temperature", "eps_spacings", *(("eps",) if self.eps is not None else ())):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("min_weight", "sigmas", "margin"):
+        for name in ("min_weight", "sigmas"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected zero or a positive number, got {getattr(self, name)}")
         for name in ("min_samples", "max_boxes"):
@@ -221,7 +220,6 @@ def _boxes_for_word(
             candidate.rows,
             extent=config.extent,
             sigmas=config.sigmas,
-            margin=config.margin * spacing,
             up=scene.up if config.upright else None,
         )
         boxes.append(

@@ -92,9 +92,6 @@ def export_onnx(
     encoder: TorchEncoder,
     lowered: Any,
     precision: Stored = "float32",
-    *,
-    scenes: Sequence[Cloud] = (),
-    track: Track = untracked,
 ) -> bytes:
     """What the file is to hold: the graph, and what a runtime must know of it.
 
@@ -102,24 +99,17 @@ def export_onnx(
         encoder: to be exported.
         lowered: what `lower` made of it, in half precision for float16.
         precision: what the graph is to compute in.
-        scenes: for int8_static: what its ranges are taken from.
-        track: wraps the loop over them to show progress.
-
-    Raises:
-        InputError: int8_static without scenes.
     """
     import onnx
 
     from gsencoder.infer.onnx.operators import in_standard_operators
-    from gsencoder.infer.onnx.precision import calibrate, products_in_int8, weights_in_int8
+    from gsencoder.infer.onnx.precision import products_in_int8, weights_in_int8
 
     header = header_of(encoder, precision)
     if precision == "int8_weights":
         lowered = weights_in_int8(lowered)
     elif precision == "int8_dynamic":
         lowered = products_in_int8(lowered)
-    elif precision == "int8_static":
-        lowered = products_in_int8(lowered, calibrate(lowered, _settings(header), scenes, track=track))
     model = in_standard_operators(lowered)
     for name, value in _settings(header).items():
         model.graph.initializer.append(onnx.numpy_helper.from_array(value, name))

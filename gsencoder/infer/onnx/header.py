@@ -13,7 +13,7 @@ import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class OnnxHeader:
         patch: most tokens in a patch.
         outputs: what the features mean; the graph has restored them already.
         words: what turns words into their space, where there is such a table.
-        precision: what the graph computes in.
+        precision: what the graph computes in; files of earlier versions may say "int8_static".
         made_by: settings and results of training and export, as JSON values.
     """
 
@@ -61,7 +61,7 @@ class OnnxHeader:
     patch: int
     outputs: OutputSpace
     words: TextTable | None = None
-    precision: Stored = "float32"
+    precision: Stored | Literal["int8_static"] = "float32"
     made_by: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -72,10 +72,9 @@ class OnnxHeader:
                 f"expected a positive voxel, 1 to {ALIGN.bit_length()} levels and patches of 1 or more, got "
                 f"{self.voxel}, {self.levels}, {self.patch}"
             )
-        if self.precision not in get_args(Stored):
-            raise InputError(
-                f"expected a precision among {', '.join(get_args(Stored))}, got {str(self.precision)[:40]}"
-            )
+        readable = (*get_args(Stored), "int8_static")
+        if self.precision not in readable:
+            raise InputError(f"expected a precision among {', '.join(readable)}, got {str(self.precision)[:40]}")
         if not self.orders or not set(self.orders) <= known:
             raise InputError(f"expected orders among {', '.join(sorted(known))}, got {str(self.orders)[:80]}")
 
