@@ -14,7 +14,7 @@ import numpy as np
 from per_scene import labeled, quality
 
 from gsencoder.core.files.model_files import find_file
-from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.evaluate.boxes import accuracy
 from gsencoder.evaluate.protocols.naming import naming_scores
 from gsencoder.fusion.feature_error import field_error
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--chunks", default="125000,80000,40000")
     parser.add_argument("--halos", default="0,0.64,1.28")
     chosen = parser.parse_args()
-    keep_heap()
+    retain_freed_memory()
     words = load_text_table(find_file(chosen.words, "words"))
     encoder, outputs, _ = load_weights(chosen.weights)
     halos = [float(halo) for halo in chosen.halos.split(",")]

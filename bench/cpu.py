@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.grid.cells import grid_coords
 from gsencoder.models.grid.neighbors import NeighborConv, neighbor_table
@@ -103,7 +103,7 @@ def main() -> None:
     chosen = parser.parse_args()
     if chosen.only:
         if chosen.only not in ("heap-off", "forward-off"):
-            keep_heap()
+            retain_freed_memory()
         if chosen.only.startswith("forward"):
             print(forward(200_000, 5))
             return
@@ -120,7 +120,7 @@ def main() -> None:
             )
             ratios.append(off / on)
         print(f"{choice}: {text} takes {np.median(ratios):.2f} times as long", flush=True)
-    keep_heap()
+    retain_freed_memory()
     ratio = in_turn(attention(torch.bfloat16), attention(torch.float32), chosen.rounds)
     print(f"attention: forward and backward in bfloat16 take {ratio:.2f} times as long as in float32")
     for size in (chosen.gaussians, 20 * chosen.gaussians):

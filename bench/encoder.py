@@ -27,7 +27,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.runtime.device import autocast_dtype
-from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
@@ -232,7 +232,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--chunk", type=int, default=250_000)
     chosen = parser.parse_args()
-    keep_heap()
+    retain_freed_memory()
     config = compose("train", TrainCommandConfig, ["scene", f"model={chosen.model}"])
     if chosen.patch:
         shape = replace(config.model.transformer, patch=chosen.patch)

@@ -23,13 +23,13 @@ ROUNDS, PASSES = 3, 5
 def measure(model: str, splat: str) -> dict[str, float]:
     """One process's figures; runs in the child."""
     from gsencoder.app.runs.summary import peak_memory_mb
-    from gsencoder.core.runtime.heap import keep_heap
+    from gsencoder.core.runtime.heap import retain_freed_memory
     from gsencoder.data.splats import load_splat
     from gsencoder.infer.encode.chunks import EncodeConfig
     from gsencoder.infer.load_encoder import load_encoder
 
     gaussians = load_splat(splat)
-    keep_heap()
+    retain_freed_memory()
     encoder = load_encoder(model, "cpu")
     # A file computes in what it was exported in.
     config = EncodeConfig(chunk=0, precision="auto" if model.endswith(".onnx") else "float32", device="cpu")

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from gsencoder.core.files.model_files import find_file
-from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import seed
 from gsencoder.evaluate.boxes import Hit, accuracy
@@ -116,7 +116,7 @@ def main() -> None:
     parser.add_argument("--rounds", default="5,20,50")
     parser.add_argument("--stride", type=int, default=2)
     chosen = parser.parse_args()
-    keep_heap()
+    retain_freed_memory()
     words = load_text_table(find_file(chosen.words, "words"))
     encoder = TorchEncoder(chosen.weights)
     table: dict[str, list[tuple[NamingCounts, list[Hit], float]]] = {}

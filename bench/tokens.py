@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.infer.views.tokens import feature_tokens, token_blends
@@ -31,7 +31,7 @@ def main() -> None:
     scene = with_gaussians(load_scene(chosen.scene))
     assert scene.gaussians is not None
     assert scene.views is not None
-    cameras = scene.views.cameras.select(evenly(len(scene.views), chosen.views))
+    cameras = scene.views.cameras.select(even_indices(len(scene.views), chosen.views))
     lines, columns = map(int, chosen.grid.split(","))
     n, d, rng = len(scene.gaussians), chosen.channels, np.random.default_rng(0)
     space = FeatureSpace(name="random", channels=d)

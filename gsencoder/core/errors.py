@@ -1,7 +1,7 @@
-"""The one exception that means "the input is wrong", as opposed to "the program is wrong".
+"""The exception for wrong input, as opposed to a bug.
 
-Every message is one line that says what was wrong, where, what was expected, and what to do. The command line
-prints it and leaves with exit code 2; anything else that escapes is a defect of ours and keeps its traceback.
+Every message is one line that says what was wrong, where, what was expected, and what to do. The command line prints it
+and exits with code 2; any other exception is a bug and is shown with its traceback.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,14 +16,14 @@ class SceneWarning(UserWarning):
     """Something in the input was left out or estimated; the message counts it and says how."""
 
 
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """The first of many names, for a message."""
-    return ", ".join(names[:most]) + (", …" if len(names) > most else "")
+def listed(names: Sequence[str], limit: int = 8) -> str:
+    """The first names of a list, for a message."""
+    return ", ".join(names[:limit]) + (", …" if len(names) > limit else "")
 
 
 @contextmanager
 def about(what: object) -> Iterator[None]:
-    """An `InputError` in the block says which of many things it is about, unless it does so already."""
+    """Prefixes the message of an `InputError` that leaves the block with `what`, unless it contains it already."""
     try:
         yield
     except InputError as error:
@@ -32,7 +32,7 @@ def about(what: object) -> Iterator[None]:
 
 @contextmanager
 def advised(advice: str) -> Iterator[None]:
-    """An `InputError` in the block also says what to do about it."""
+    """Appends advice to the message of an `InputError` that leaves the block."""
     try:
         yield
     except InputError as error:

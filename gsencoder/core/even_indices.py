@@ -1,9 +1,9 @@
-"""Some of many, evenly spread."""
+"""Evenly spaced indices."""
 
 import numpy as np
 from jaxtyping import Int64
 
 
-def evenly(available: int, wanted: int) -> Int64[np.ndarray, " n"]:
-    """Places from the first to the last of `available`, ascending and distinct: `wanted` of them, or all there are."""
-    return np.linspace(0, available - 1, min(wanted, available)).round().astype(np.int64)
+def even_indices(length: int, count: int) -> Int64[np.ndarray, " n"]:
+    """`count` evenly spaced indices into a sequence, its first and last included; all indices if it is shorter."""
+    return np.linspace(0, length - 1, min(count, length)).round().astype(np.int64)

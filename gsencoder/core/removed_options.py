@@ -7,7 +7,7 @@ from gsencoder.core.errors import InputError
 
 
 class Removed(NamedTuple):
-    """An option that is gone.
+    """A removed option.
 
     Attributes:
         default: its former default, which still describes what the code does.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
 from gsencoder.data.readers.images import (
     DepthFiles,
@@ -271,7 +271,7 @@ def make_views(
     if not chosen:
         raise InputError(f"{posed.source}: no view")
     if max_views:
-        chosen = tuple(chosen[row] for row in evenly(len(chosen), max_views))
+        chosen = tuple(chosen[row] for row in even_indices(len(chosen), max_views))
     cam_from_world = np.stack([image.cam_from_world for image in chosen])
     origin = choose_origin(invert_rigid(cam_from_world)[:, :3, 3])
     pinholes: dict[CameraModel, Pinhole] = {}

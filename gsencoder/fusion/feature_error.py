@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.types import GaussianFeatures
 
 SAMPLE = 20_000
@@ -53,7 +53,7 @@ def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, samp
     if not len(rows):
         raise InputError("field_error: the reference saw no Gaussian")
     if sample:
-        rows = rows[evenly(len(rows), sample)]
+        rows = rows[even_indices(len(rows), sample)]
     both = rows[features.seen[rows]]
     centered = raw = 0.0
     for start in range(0, len(both), CHUNK):

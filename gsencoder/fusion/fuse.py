@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.clock import Clock, timed
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
@@ -104,7 +104,7 @@ def fuse(
     """
     gaussians, views = _checked(scene, teacher, basis)
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))
-    rows = tuple(int(view) for view in evenly(len(views), config.views or len(views)))
+    rows = tuple(int(view) for view in even_indices(len(views), config.views or len(views)))
     checkpoint = None
     if work is not None:
         checkpoint = open_checkpoint(work, asdict(config), teacher, gaussians, views, rows, basis)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.signals import held_back
+from gsencoder.core.runtime.signals import defer_signals
 from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.parameters import (
     Parameters,
@@ -187,7 +187,7 @@ class Optimizer:
             self._check(view, losses, grads)
             terms = {name: float(value.detach()) for name, value in losses.items()}
         # A step that is cut in two could not be gone on with.
-        with held_back():
+        with defer_signals():
             self.is_consistent = False
             if len(rows):
                 rates = self.config.rates_at(self.step, self.extent)

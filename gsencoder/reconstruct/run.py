@@ -15,7 +15,7 @@ import torch
 from jaxtyping import UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning, advised
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.files.step_log import LOG_FILE, Log, read_log
 from gsencoder.core.runtime.clock import Clock
@@ -297,7 +297,7 @@ def compare(optimizer: Optimizer, held_out: Sequence[int]) -> tuple[Comparison, 
         return (image * 255 + 0.5).to(torch.uint8).numpy()
 
     comparisons = []
-    for view in (held_out[index] for index in evenly(len(held_out), MAX_COMPARISONS)):
+    for view in (held_out[index] for index in even_indices(len(held_out), MAX_COMPARISONS)):
         photo = optimizer.photographs.at_scale(view)
         comparisons.append(
             Comparison(

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.basis import Moments, encode, fit_basis, table_basis
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import map_rows
@@ -75,7 +75,7 @@ def dataset_space(
 
 def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:
     """Adds cells of the maps of `count` evenly spaced views to the moments."""
-    for view in evenly(len(views), count):
+    for view in even_indices(len(views), count):
         rows = map_rows(teacher.feature_map(views, int(view)))
         rows = rows[np.isfinite(rows[:, 0])]
         moments.add(rows[:: max(1, len(rows) // MAX_CELLS_PER_MAP)])

@@ -22,7 +22,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import Log
 from gsencoder.core.runtime.device import autocast_dtype
 from gsencoder.core.runtime.device_names import Precision
-from gsencoder.core.runtime.signals import held_back, stop_of
+from gsencoder.core.runtime.signals import defer_signals, stop_of
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
@@ -196,7 +196,7 @@ class Trainer:
             losses = self._gradients(step, [next(batches) for _ in range(config.accumulate)])
             unlogged = (*self.state.unlogged, losses)
             # A signal between these lines would save a checkpoint of parameters and state of different steps.
-            with held_back():
+            with defer_signals():
                 self.optimizer.step()
                 seconds = time.monotonic() - start
                 self.state = TrainingState(step=step + 1, seconds=seconds, unlogged=unlogged, closed=False)

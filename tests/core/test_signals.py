@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from gsencoder.core.runtime.signals import SIGNALS, Stopped, held_back, stop_of
+from gsencoder.core.runtime.signals import SIGNALS, Stopped, defer_signals, stop_of
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 
@@ -28,7 +28,7 @@ def test_what_is_held_back_happens_as_a_whole_and_is_stopped_then(number: int) -
     handler, done = signal.getsignal(number), []
 
     def work() -> None:
-        with held_back():
+        with defer_signals():
             os.kill(os.getpid(), number)
             done.append("all of it")
 
@@ -45,8 +45,8 @@ def test_blocks_within_blocks_end_with_the_outer_one(number: int) -> None:
     done = []
 
     def work() -> None:
-        with held_back():
-            with held_back():
+        with defer_signals():
+            with defer_signals():
                 os.kill(os.getpid(), number)
             done.append("outer")
 
@@ -57,7 +57,7 @@ def test_blocks_within_blocks_end_with_the_outer_one(number: int) -> None:
 
 def test_a_signal_is_heard_beside_an_error_too(number: int) -> None:
     def work() -> None:
-        with held_back():
+        with defer_signals():
             os.kill(os.getpid(), number)
             raise ValueError("wrong")
 
@@ -69,7 +69,7 @@ def test_a_signal_is_heard_beside_an_error_too(number: int) -> None:
 def test_signals_that_python_does_not_handle_are_left_alone() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with held_back():
+        with defer_signals():
             assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
             os.kill(os.getpid(), signal.SIGHUP)
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
@@ -81,7 +81,7 @@ def test_other_threads_need_nothing() -> None:
     done = []
 
     def work() -> None:
-        with held_back():
+        with defer_signals():
             done.append(1)
 
     thread = threading.Thread(target=work)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsencoder.app.runs.summary import Summary, peak_memory_mb
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.fuse import Fusion
 from gsencoder.infer.draw.pictures import PcaColors, color_bar, depth_picture, fit_pca_colors, pca_picture
 from gsencoder.infer.draw.relevancy_views import relevancy_pictures
@@ -95,7 +95,7 @@ def write_report(path: Path, scene: Scene, asked: Sequence[Asked], summary: Summ
             **{f"{one.title} found": f"{one.found_count} of {len(one.words)}" for one in asked},
         }
     )
-    shown = evenly(len(views), SHOWN_VIEWS).tolist()
+    shown = even_indices(len(views), SHOWN_VIEWS).tolist()
     _views(report, gaussians, views, asked, shown)
     for one in asked:
         _answers(report, scene, one)

@@ -8,7 +8,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import about
-from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
@@ -40,7 +40,7 @@ class EncodeCommandConfig(CommonConfig):
 
 def run(config: EncodeCommandConfig, summary: Summary) -> None:
     """Encodes one scene into out=, or each of several into a folder of its name below out=."""
-    keep_heap()
+    retain_freed_memory()
     paths = find_scenes(config.paths)
     check_names(paths)
     with summary.step("weights"):

@@ -13,7 +13,7 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import write_bytes
-from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
@@ -67,7 +67,7 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
             f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words="
         )
     if config.weights:
-        keep_heap()
+        retain_freed_memory()
         source = encoder_source(load_encoder(config.weights, config.encode.device), config.encode)
     else:
         source = fusion_source(config.teacher, words, config.fusion)

@@ -14,7 +14,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats import READABLE, save_splat
 from gsencoder.infer.draw.pictures import contact_sheet
@@ -52,7 +52,7 @@ class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
 
 def run(config: ReconstructCommandConfig, summary: Summary) -> None:
     """Reads or places photographs, reconstructs, and writes splat, log and pictures into out=."""
-    keep_heap()
+    retain_freed_memory()
     choose_device(config.device)  # A device that is not there is refused before anything is read.
     path, screen = Path(config.paths[0]), console(config.quiet)
     out = config.out or Path("outputs") / (path.resolve().name or "scene") / "reconstruction"

@@ -17,7 +17,7 @@ from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.heap import keep_heap
+from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.store.folder import WORDS_FILE
@@ -56,7 +56,7 @@ class TrainCommandConfig(TrainConfig, CommonConfig):
 
 def run(config: TrainCommandConfig, summary: Summary) -> None:
     """Prepares scenes, trains, and writes weights, log and scores into out=."""
-    keep_heap()
+    retain_freed_memory()
     out = config.out or Path("outputs") / "train"
     real = Path(os.path.realpath(out))
     work, prepared = real.with_name(f"{real.name}.training"), config.prepared or real.with_name(f"{real.name}.prepared")

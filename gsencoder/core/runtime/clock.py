@@ -17,7 +17,7 @@ class Clock:
     """Adds up the seconds that each step of a stage takes.
 
     A step is a block, `with clock("lift"): …`, or, between `with clock.running():`, a call of a function that is
-    marked with `@timed("lift")`.
+    decorated with `@timed("lift")`.
 
     Attributes:
         seconds: by step, in order of first start.
@@ -34,7 +34,7 @@ class Clock:
 
     @contextmanager
     def running(self) -> Iterator["Clock"]:
-        """Functions marked with `timed` that this thread calls inside the block count here."""
+        """Lets functions decorated with `timed` that this thread calls inside the block count towards this clock."""
         token = _running.set(self)
         try:
             yield self
@@ -43,7 +43,7 @@ class Clock:
 
 
 def timed(step: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Marks a function as one step of a stage; it counts where a clock is running and costs nothing elsewhere."""
+    """Decorates a function as one step of a stage: its calls are timed while a clock is running."""
 
     def mark(function: Callable[P, R]) -> Callable[P, R]:
         @wraps(function)

@@ -1,4 +1,4 @@
-"""Where an encoder computes, and in what: float32, or bfloat16 where that is multiplied in hardware."""
+"""The device and the floating-point type that an encoder computes in."""
 
 import torch
 
@@ -7,11 +7,11 @@ from gsencoder.core.runtime.device_names import Device, Precision
 
 
 def choose_device(name: Device, local_rank: int = 0) -> torch.device:
-    """The device that a process is to use: with "auto" a GPU where torch sees one, else the CPU.
+    """The device of a process: with "auto" a GPU if torch sees one, else the CPU.
 
     Args:
-        name: what was asked for.
-        local_rank: the process's number on its machine; each takes a GPU of its own.
+        name: the option.
+        local_rank: number of the process on its machine; each process takes another GPU.
 
     Raises:
         InputError: another name, or no GPU for this process.
@@ -28,9 +28,10 @@ def choose_device(name: Device, local_rank: int = 0) -> torch.device:
 
 
 def autocast_dtype(precision: Precision, device: torch.device) -> torch.dtype | None:
-    """The type that torch.autocast is to use on a device, or None for float32 throughout.
+    """The type for torch.autocast on a device; None for float32 throughout.
 
-    "auto" takes bfloat16 on GPUs from NVIDIA's Ampere on, and on CPUs with AMX tiles; elsewhere it would be slower.
+    "auto" is bfloat16 on NVIDIA GPUs since Ampere and on CPUs with AMX tiles, and float32 elsewhere, where bfloat16 is
+    slower.
     """
     if precision == "float32":
         return None

@@ -1,4 +1,4 @@
-"""The most memory that a piece of work held beyond what was there before it."""
+"""Growth of peak memory in a block of code."""
 
 import ctypes
 import gc
@@ -11,10 +11,10 @@ STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Growth:
-    """Filled when the block of `memory_growth` ends.
+    """The result of `memory_growth`, set when its block ends.
 
     Attributes:
-        mib: peak resident memory less that at the start, MiB; NaN where the system does not tell.
+        mib: peak resident memory minus that at the start, MiB; NaN where the system does not report it.
     """
 
     def __init__(self) -> None:
@@ -23,10 +23,11 @@ class Growth:
 
 @contextmanager
 def memory_growth() -> Iterator[Growth]:
-    """Measures a block, which may run many times in one process.
+    """Measures the memory of a block, which may run many times in one process.
 
-    Linux keeps each process's peak of resident memory (VmHWM) and lets it be set back to the present value. Freed heap
-    memory is given back first, so that the block cannot live on what an earlier one left. Elsewhere the result is NaN.
+    Linux records the peak of resident memory of each process (VmHWM) and can reset it to the present value. Freed heap
+    memory is returned to the system first, so that the block cannot reuse what an earlier one freed. On other systems
+    the result is NaN.
     """
     growth = Growth()
     gc.collect()

@@ -1,4 +1,4 @@
-"""How a process is asked to end: signals are raised as exceptions where it is, or after what must not be cut in two."""
+"""Signals that end a process: raised as exceptions, and deferred over blocks that must not be interrupted."""
 
 import signal
 import threading
@@ -8,11 +8,11 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name))
-"""All by which a user, a shell or a cluster asks."""
+"""Signals with which a user, a shell or a cluster ends a process."""
 
 
 class Stopped(BaseException):
-    """The process was asked to end; raised where it was, so that half-written output is removed."""
+    """The process received a signal to end; raised where it was running, so that half-written output is removed."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -20,41 +20,41 @@ class Stopped(BaseException):
 
 
 def stop_of(error: BaseException) -> Stopped | KeyboardInterrupt | None:
-    """What asked the process to end, if that is what an exception is about. A signal that arrives within a compiled
-    function comes out of it wrapped in a `SystemError`."""
+    """The signal or interrupt behind an exception, or None. A signal that arrives within a compiled function leaves it
+    wrapped in a `SystemError`."""
     inner = error.__cause__ or error.__context__ if isinstance(error, SystemError) else error
     return inner if isinstance(inner, Stopped | KeyboardInterrupt) else None
 
 
 @contextmanager
-def held_back() -> Iterator[None]:
-    """Signals that ask the process to end are handled after the block, so that what is in it happens as a whole.
+def defer_signals() -> Iterator[None]:
+    """Signals that end the process are handled after the block, so that they do not interrupt it.
 
-    Handlers run in the main thread alone: in another one nothing needs to be held back.
+    Handlers run in the main thread alone; in other threads nothing is deferred.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before: dict[int, Callable[[int, FrameType | None], Any]] = {}
-    heard: list[tuple[int, FrameType | None]] = []
-    over = False
+    deferred: list[tuple[int, FrameType | None]] = []
+    block_ended = False
 
-    def hear(number: int, frame: FrameType | None) -> None:
-        if over:
+    def defer(number: int, frame: FrameType | None) -> None:
+        if block_ended:
             before[number](number, frame)
         else:
-            heard.append((number, frame))
+            deferred.append((number, frame))
 
     try:
         for number in SIGNALS:
             handler = signal.getsignal(number)
             if callable(handler):
                 before[number] = handler
-                signal.signal(number, hear)
+                signal.signal(number, defer)
         yield
     finally:
-        over = True
+        block_ended = True
         for number, handler in before.items():
             signal.signal(number, handler)
-        for number, frame in heard:
+        for number, frame in deferred:
             before[number](number, frame)

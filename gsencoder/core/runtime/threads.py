@@ -1,8 +1,7 @@
-"""How CPU kernels are compiled and run: numba functions without the GIL, called from a pool of Python threads.
+"""CPU kernels: numba functions without the GIL, called from a pool of Python threads.
 
-Threads rather than numba's parallel loops: an OpenMP pool aborts a process that was forked after its first use, which
-data loaders do. Work is cut into pieces whose results do not depend on how many threads there are, so neither do the
-bits.
+numba's parallel loops are not used, since an OpenMP pool aborts a process that was forked after its first use, as data
+loaders do. Work is cut into a fixed number of pieces, so that results do not depend on the number of threads.
 """
 
 import os
@@ -17,30 +16,30 @@ from jaxtyping import Int64
 from numba import njit
 
 PIECES = 32
-"""Work is cut into so many pieces: enough to balance a dozen cores, few enough to cost nothing on two."""
+"""Number of pieces that work is cut into: enough to balance a dozen cores, few enough to cost nothing on two."""
 
 kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
-"""Compiles a function that parallel() may run; reassociation stays off, so sums have one order."""
+"""Compiles a function for `parallel`; reassociation is off, so that sums have one order."""
 
 
 _here = threading.local()
 
 
-def _enter() -> None:
+def _mark_worker() -> None:
     _here.inside = True
 
 
 def parallel(work: Callable[[int], Any], pieces: Iterable[int]) -> list[Any]:
-    """Runs `work` for each piece on as many threads as torch uses; results in order. Work that calls this again does
-    its own pieces one after the other: the threads are taken."""
+    """Runs `work` for each piece on as many threads as torch uses, and returns the results in order. A nested call runs
+    its pieces one after the other, since all threads are busy."""
     threads = min(torch.get_num_threads(), os.cpu_count() or 1)
     if threads == 1 or getattr(_here, "inside", False):
         return [work(piece) for piece in pieces]
-    with ThreadPoolExecutor(threads, initializer=_enter) as pool:
+    with ThreadPoolExecutor(threads, initializer=_mark_worker) as pool:
         return list(pool.map(work, pieces))
 
 
 def even_cuts(starts: Int64[np.ndarray, " n_plus_1"]) -> Int64[np.ndarray, " pieces_plus_1"]:
-    """Cuts a compressed array into pieces of about as many entries each."""
+    """Cuts the rows of a compressed array into pieces with about equally many entries."""
     inner = np.searchsorted(starts, np.linspace(0, starts[-1], PIECES + 1)[1:-1])
     return np.concatenate(([0], inner, [len(starts) - 1]))

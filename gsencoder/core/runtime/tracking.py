@@ -1,12 +1,12 @@
-"""What long loops show their progress through, and what stands in its place where nobody watches."""
+"""The type of functions that show the progress of a loop, and one that shows nothing."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
 
 Track = Callable[[Iterable[Any], str], Iterable[Any]]
-"""Gives the items of a loop one by one; the text says what the loop does."""
+"""Yields the items of a loop and shows its progress; the text says what the loop does."""
 
 
 def untracked(items: Iterable[Any], label: str) -> Iterable[Any]:  # noqa: ARG001
-    """The items, silently."""
+    """Yields the items and shows nothing."""
     return items

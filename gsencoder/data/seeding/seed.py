@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.data.readers.scene_splat import file_of_scene
 from gsencoder.data.seeding.depth import depth_samples, read_rgbd
 from gsencoder.data.seeding.flat import flat_gaussians
@@ -184,7 +184,7 @@ def _voxel_in_units(scene: Scene, config: SeedConfig, estimate: Callable[[], flo
 def _depth_voxel(views: Views) -> float:
     if not len(views) or views.depths is None or views.images is None:
         raise InputError("seeds: the scene has no posed views with depth and images; use source=points or source=mesh")
-    some = evenly(len(views), SAMPLED_VIEWS)
+    some = even_indices(len(views), SAMPLED_VIEWS)
     depths = [depth[depth > 0] for depth in (read_rgbd(views, int(view))[0] for view in some)]
     values = np.concatenate(depths)
     if not values.size:

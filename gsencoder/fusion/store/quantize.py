@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 MAX_BITS = 8
@@ -143,14 +143,14 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
     rows = np.flatnonzero(features.seen)
     if not len(rows):
         raise InputError("compact: no Gaussian has features")
-    sample = rows[evenly(len(rows), SAMPLE)]
+    sample = rows[even_indices(len(rows), SAMPLE)]
     bound = min(MIN_COSINE, 1 - 10 * error)
     for _ in range(RETRIES):
         compacted, cosines = _within(features, rows, sample, error)
         missed = np.setdiff1d(rows[cosines < bound], sample)
         if not len(missed):
             break
-        sample = np.union1d(sample, missed[evenly(len(missed), SAMPLE // 4)])
+        sample = np.union1d(sample, missed[even_indices(len(missed), SAMPLE // 4)])
     return compacted
 
 

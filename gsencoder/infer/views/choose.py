@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.data.orbits import orbit_cameras
 from gsencoder.infer.views.closeups import closeups
 from gsencoder.infer.views.constants import CONSTANTS
@@ -135,7 +135,7 @@ def _uniform(scene: Scene, gaussians: Gaussians, config: ViewsConfig) -> _Candid
             up=scene.up,
         )
         return _Candidates(around, [f"orbit {number:02d}" for number in range(len(around))], [None] * len(around))
-    chosen = evenly(len(scene.views), config.count)
+    chosen = even_indices(len(scene.views), config.count)
     names = [scene.views.names[view] for view in chosen]
     return _Candidates(_downscaled(scene.views.cameras.select(chosen), config), names, [int(view) for view in chosen])
 

@@ -7,7 +7,7 @@ near it would, and sharper than any render.
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians
@@ -28,7 +28,7 @@ def closeups(
     Returns:
         n cameras at places of frames, and which frames these are, ascending.
     """
-    points = gaussians.means[target.rows[evenly(len(target.rows), CONSTANTS.closeup_sample)]].astype(np.float64)
+    points = gaussians.means[target.rows[even_indices(len(target.rows), CONSTANTS.closeup_sample)]].astype(np.float64)
     rows: list[int] = []
     Ks: list[Float64[np.ndarray, "3 3"]] = []
     for view in range(len(frames)):

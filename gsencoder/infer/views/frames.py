@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.targets import Target
@@ -42,7 +42,7 @@ def _rank_frames(
     count = min(count, len(cameras))
     half = (count + 1) // 2
     filled = _fill_shares(cameras, target)
-    rows = target.rows[evenly(len(target.rows), CONSTANTS.frame_rays)]
+    rows = target.rows[even_indices(len(target.rows), CONSTANTS.frame_rays)]
     points = gaussians.means[rows].astype(np.float64)
     shown = np.full(len(cameras), -1.0)
 
@@ -63,10 +63,10 @@ def _rank_frames(
     best = np.argsort(-shown, kind="stable")
     enough = CONSTANTS.min_spread_share * shown[best[0]]
     others = np.setdiff1d(np.flatnonzero(filled >= enough), best[:half])
-    others = others[evenly(len(others), CONSTANTS.spread_frames * count)]
+    others = others[even_indices(len(others), CONSTANTS.spread_frames * count)]
     judge(others[shown[others] < 0])
     others = others[shown[others] >= enough]
-    photograph_at = np.concatenate([best[:half], others[evenly(len(others), count - half)]])
+    photograph_at = np.concatenate([best[:half], others[even_indices(len(others), count - half)]])
     # Whatever is missing comes from those that show less, and at last from those that no ray was sent to.
     rest = np.lexsort((-filled, -shown))
     return np.concatenate([photograph_at, rest[~np.isin(rest, photograph_at)]])[:count]

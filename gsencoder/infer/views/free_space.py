@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Integer
 
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.threads import parallel
 from gsencoder.data.seeding.spacing import NEIGHBOR
 from gsencoder.geometry import covariances
@@ -35,7 +35,7 @@ class FreeSpace:
             solid = np.arange(len(gaussians))
         self._gaussians, self._quats = gaussians, gaussians.quats[solid]
         means = gaussians.means[solid].astype(np.float64)
-        asked = means[evenly(len(means), CONSTANTS.spacing_sample)]
+        asked = means[even_indices(len(means), CONSTANTS.spacing_sample)]
         distances = cKDTree(means).query(asked, k=[min(NEIGHBOR + 1, len(means))])[0]
         # Of a single Gaussian, and of many in one place, the size is known.
         self.cell = CONSTANTS.cell_spacings * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
 
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.threads import parallel
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.targets import Target
@@ -111,7 +111,9 @@ class _TargetProbe:
         self._member = torch.from_numpy(member)
         near = np.linalg.norm(gaussians.means - target.center, axis=1) <= CONSTANTS.context_radii * target.radius
         around = np.flatnonzero(near & (member == 0))
-        self._samples = tuple(rows[evenly(len(rows), CONSTANTS.coverage_sample)] for rows in (target.rows, around))
+        self._samples = tuple(
+            rows[even_indices(len(rows), CONSTANTS.coverage_sample)] for rows in (target.rows, around)
+        )
         # The size of a flat Gaussian is that of its disc.
         self._sizes = np.sqrt(np.sort(self._alone.scales, axis=1)[:, 1:].prod(axis=1, dtype=np.float64))
 

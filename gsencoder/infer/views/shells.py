@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.even_indices import evenly
+from gsencoder.core.even_indices import even_indices
 from gsencoder.data.orbits import looking_cameras, spiral_directions
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.free_space import FreeSpace
@@ -66,7 +66,7 @@ def shell_cameras(
     backed = _background_fraction(target, centers[tried], vertical, free)
     enough = np.sort(backed)[::-1][min(count, len(backed)) - 1]
     kept = tried[backed >= enough]
-    kept = kept[evenly(len(kept), count)]
+    kept = kept[even_indices(len(kept), count)]
     return looking_cameras(centers[kept], -outward[kept], vertical, focal, width, height)
 
 
@@ -101,7 +101,7 @@ def _distances(
     between: tuple[float, float],
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Along each direction how far a camera should be, how far at least, and how far the target itself reaches."""
-    rows = target.rows[evenly(len(target.rows), CONSTANTS.outline_sample)]
+    rows = target.rows[even_indices(len(target.rows), CONSTANTS.outline_sample)]
     offsets = gaussians.means[rows].astype(np.float64) - target.center
     # A Gaussian fills a cell of its own size.
     margin = CONSTANTS.fill_margin
