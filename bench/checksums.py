@@ -28,7 +28,7 @@ def timed(data: Any, checksums: str, blocks: Any = None) -> list[int]:
     return wrong
 
 
-plain = mapped_arrays.wrong_blocks
+plain = mapped_arrays.damaged_blocks
 
 
 def main() -> None:
@@ -40,7 +40,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = ["train", *given.scenes, *given.options, f"prepared={folder}/prepared", "quiet=true", "holdout="]
         assert cli.main([*run, "prepare_only=true"]) == 0
-        mapped_arrays.wrong_blocks = timed
+        mapped_arrays.damaged_blocks = timed
         steps = [f"train.steps={given.steps}", "train.warmup=1", "train.workers=0", "train.validate_every=0"]
         assert cli.main([*run, f"out={folder}/out", *steps, "tensorboard=false"]) == 0
         seconds = json.loads((Path(folder) / "out" / "summary.json").read_text())["results"]["seconds"]

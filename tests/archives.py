@@ -10,14 +10,14 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from gsencoder.core.files.archive import OWN_KEYS, write_archive
+from gsencoder.core.files.archive import RESERVED_KEYS, write_archive
 
 
 def header_of(path: Path) -> dict[str, Any]:
     """What the writer of an archive put into its header."""
     with safe_open(path, framework="numpy") as file:
         header = json.loads(file.metadata()["gsencoder"])
-    return {key: value for key, value in header.items() if key not in OWN_KEYS}
+    return {key: value for key, value in header.items() if key not in RESERVED_KEYS}
 
 
 def rewrite(

@@ -255,7 +255,7 @@ def _table(file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray]) ->
 
 def _read_npz(file: Path, encoder: str) -> TextTable:
     wanted = {"names": ("U", 1), "embeddings": ("f", 2)}
-    arrays = read_npz(file, wanted, {"encoder": ("U", 0)}, longest_text=LONGEST_NAME)
+    arrays = read_npz(file, wanted, {"encoder": ("U", 0)}, max_text=LONGEST_NAME)
     made_by = encoder or str(arrays.get("encoder", "")) or file.stem.removesuffix("_names")
     try:
         return make_text_table([str(name) for name in arrays["names"]], arrays["embeddings"], made_by)

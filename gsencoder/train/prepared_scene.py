@@ -128,12 +128,12 @@ class PreparedScene:
 
     @property
     def means(self) -> Float32[np.ndarray, "N 3"]:
-        return self._arrays.whole("means")
+        return self._arrays.array("means")
 
     @property
     def weights(self) -> Float32[np.ndarray, " N"]:
         """The fusion weight of each Gaussian; 0 = not seen in any view, and without a target."""
-        return self._arrays.whole("weights")
+        return self._arrays.array("weights")
 
     def gaussians(self, rows: np.ndarray) -> Gaussians:
         """Reads Gaussians by row, with degree-0 colors."""
@@ -151,16 +151,16 @@ class PreparedScene:
 
     def view(self, view: int) -> ViewRows:
         """Reads the blending matrix and the teacher's vectors of one view."""
-        first, last = (int(row) for row in self._arrays.whole("rows")[view : view + 2])
-        crow = np.array(self._arrays.whole("crow")[first : last + 1])
+        first, last = (int(row) for row in self._arrays.array("rows")[view : view + 2])
+        crow = np.array(self._arrays.array("crow")[first : last + 1])
         start, end = int(crow[0]), int(crow[-1])
         with self._error_context():
             view_rows = ViewRows(
                 crow=crow - start,
-                col=np.array(self._arrays.part("col", start, end)),
-                weight=self._arrays.part("weight", start, end).astype(np.float32),
-                targets=self._arrays.part("row_targets", first, last).astype(np.float32),
-                valid=self._arrays.part("row_valid", first, last).astype(bool),
+                col=np.array(self._arrays.row_range("col", start, end)),
+                weight=self._arrays.row_range("weight", start, end).astype(np.float32),
+                targets=self._arrays.row_range("row_targets", first, last).astype(np.float32),
+                valid=self._arrays.row_range("row_valid", first, last).astype(bool),
             )
             in_range = (view_rows.col >= 0) & (view_rows.col < len(self))
             if not in_range.all() or not (view_rows.weight >= 0).all() or not np.isfinite(view_rows.targets).all():
@@ -179,7 +179,7 @@ def _check_arrays(arrays: MappedArrays, views: int) -> None:
     shapes = {name: arrays.shape(name) for name in _ARRAYS}
     sizes = {name: shape[0] for name, shape in shapes.items()}
     columns = {name: shape[1:] for name, shape in shapes.items()}
-    n, rows, crow = sizes["means"], arrays.whole("rows"), arrays.whole("crow")
+    n, rows, crow = sizes["means"], arrays.array("rows"), arrays.array("crow")
     width = columns["targets"]
     expected = [("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ()), ("sh_dc", (3,)), ("weights", ())]
     consistent = all(
@@ -192,7 +192,7 @@ def _check_arrays(arrays: MappedArrays, views: int) -> None:
     consistent = bool(consistent) and crow[0] == 0 and bool((np.diff(crow) >= 0).all())
     if not consistent or not crow[-1] == sizes["col"] == sizes["weight"]:
         raise InputError("its arrays do not fit together")
-    if not np.isfinite(arrays.whole("means")).all() or not (arrays.whole("weights") >= 0).all():
+    if not np.isfinite(arrays.array("means")).all() or not (arrays.array("weights") >= 0).all():
         raise InputError("it has positions that are not finite, or weights that are negative or NaN")
 
 

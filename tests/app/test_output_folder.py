@@ -370,7 +370,7 @@ def test_numbers_that_are_not_finite_become_null_and_are_named(tmp_path: Path) -
 
 
 def test_what_json_has_nothing_for_is_named(tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match=r"a\.0: set has no place in JSON"):
+    with pytest.raises(TypeError, match=r"a\.0: set cannot be written as JSON"):
         write_json(tmp_path / "a.json", {"a": [{1}]})
     assert names(tmp_path) == []
 

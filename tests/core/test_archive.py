@@ -2,6 +2,7 @@
 
 import json
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -157,8 +158,8 @@ def test_mapped_arrays_are_what_was_written(mapped: Path, rng: np.random.Generat
         if array.ndim:
             rows = rng.integers(0, max(len(array), 1), 50 if len(array) else 0)
             np.testing.assert_array_equal(arrays.rows(name, rows), array[rows])
-            np.testing.assert_array_equal(arrays.part(name, 1, len(array) // 2), array[1 : len(array) // 2])
-        np.testing.assert_array_equal(arrays.whole(name), array)
+            np.testing.assert_array_equal(arrays.row_range(name, 1, len(array) // 2), array[1 : len(array) // 2])
+        np.testing.assert_array_equal(arrays.array(name), array)
 
 
 def offset_of(path: Path, name: str) -> int:
@@ -180,18 +181,19 @@ def test_a_flip_is_seen_by_whoever_reads_its_block_and_by_nobody_else(mapped: Pa
     }
     touching = [row for row, touched in blocks.items() if byte // BLOCK_BYTES in touched]
     for row in {0, len(array) - 1, touching[0], touching[-1], max(touching[0] - 1, 0), touching[len(touching) // 2]}:
-        for read in (lambda arrays: arrays.rows(name, np.array([row])), lambda arrays: arrays.part(name, row, row + 1)):  # noqa: B023
+        for method, arguments in (("rows", (np.array([row]),)), ("row_range", (row, row + 1))):
             arrays = open_mapped(mapped)
+            read = partial(getattr(arrays, method), name, *arguments)
             if row in touching:
                 with pytest.raises(InputError, match=f"m: the file is damaged: {name} does not have the checksum"):
-                    read(arrays)
+                    read()
                 # It is refused again, and not only the first time.
                 with pytest.raises(InputError):
-                    read(arrays)
+                    read()
             else:
-                np.testing.assert_array_equal(read(arrays)[0], array[row])
+                np.testing.assert_array_equal(read()[0], array[row])
     with pytest.raises(InputError):
-        open_mapped(mapped).whole(name)
+        open_mapped(mapped).array(name)
 
 
 def test_a_block_is_checked_once(mapped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,8 +207,8 @@ def test_a_block_is_checked_once(mapped: Path, monkeypatch: pytest.MonkeyPatch) 
     assert looked_at == [0, 3]
     arrays.rows("wide", np.array([3, 3, 2]))
     assert looked_at == [0, 3, 2]
-    arrays.whole("wide")
-    arrays.part("wide", 0, 4)
+    arrays.array("wide")
+    arrays.row_range("wide", 0, 4)
     assert looked_at == [0, 3, 2, 1]
 
 
@@ -230,10 +232,10 @@ def test_what_was_checked_is_remembered_until_the_file_is_written_again(
     arrays.close()
     monkeypatch.setattr(checksums, "_checksum", lambda data, block: looked_at.append(block) or plain(data, block))
     again = MappedArrays(mapped, wanted, arrays)
-    np.testing.assert_array_equal(again.whole("wide"), SIZES["wide"])
+    np.testing.assert_array_equal(again.array("wide"), SIZES["wide"])
     assert looked_at == [1, 2]
     again.close()
     looked_at.clear()
     os.utime(mapped, ns=(1, 1))
-    MappedArrays(mapped, wanted, again).whole("wide")
+    MappedArrays(mapped, wanted, again).array("wide")
     assert looked_at == [0, 1, 2, 3]

@@ -233,7 +233,7 @@ def test_a_checkpoint_without_moments_is_refused(dataset: Prepared, tmp_path: Pa
 def test_a_log_that_is_gone_is_told(dataset: Prepared, tmp_path: Path) -> None:
     trainer(dataset, tmp_path).run()
     (tmp_path / LOG_FILE).unlink()
-    with pytest.warns(SceneWarning, match=r"log\.csv: is gone; the log begins again at step 8"):
+    with pytest.warns(SceneWarning, match=r"log\.csv: is missing; the log starts at step 8"):
         trainer(dataset, tmp_path)
 
 

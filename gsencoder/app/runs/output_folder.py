@@ -14,7 +14,7 @@ from typing import Any
 
 from gsencoder.app.runs.summary import SUMMARY_NAME, Summary
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import is_full_disk, locked
+from gsencoder.core.files.atomic import is_full_disk, lock_folder
 from gsencoder.core.files.json_values import json_bytes, write_bytes
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
@@ -77,13 +77,13 @@ def _begin(target: Path) -> tuple[Path, int | None]:
     Raises:
         BlockingIOError: a living run is writing `target`.
     """
-    turn = locked(target.parent, wait=True)
+    turn = lock_folder(target.parent, wait=True)
     try:
         if _remove_stale(target):
             raise BlockingIOError
         partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
         partial.mkdir()
-        return partial, locked(partial)
+        return partial, lock_folder(partial)
     finally:
         if turn is not None:
             os.close(turn)
@@ -174,7 +174,7 @@ def _remove_stale(target: Path) -> bool:
         if not pattern.fullmatch(entry.name) or not entry.is_dir(follow_symlinks=False):
             continue
         try:
-            descriptor = locked(entry.path)
+            descriptor = lock_folder(entry.path)
         except BlockingIOError:
             return True
         except OSError:

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import atomic_file, locked
+from gsencoder.core.files.atomic import atomic_file, lock_folder
 
 WORK_MARK = "unfinished.txt"
 _HALF_A_MARK = re.compile(re.escape(f".{WORK_MARK}.") + "[0-9a-f]+[.]tmp")
@@ -50,7 +50,7 @@ class WorkFolder:
                     f"(no {WORK_MARK}); give another out="
                 )
             try:
-                self._descriptor = locked(self.path)
+                self._descriptor = lock_folder(self.path)
             except BlockingIOError:
                 raise InputError(
                     f"{self.path}: another run keeps its state here now; wait for it or give another out="

@@ -1,8 +1,8 @@
-"""One safetensors file with a JSON header: written whole or not at all, and on load checked against what it must hold.
+"""Archives: safetensors files with a JSON header and checksums, written atomically and validated when they are read.
 
-A file comes from anywhere: an array of another size would otherwise be broadcast, or end the run far from its cause.
-A disk or a transfer may change it: files of version 2 carry checksums (`checksums.py`) of header and arrays, and each
-array is held against its own when it is read. Version 1 had none, and is read with a warning.
+Files are not trusted: an array of another size would otherwise be broadcast, or fail far from the cause. Against
+damage, files of version 2 carry checksums (`checksums.py`) of the header and the arrays, and each array is verified
+when it is read. Files of version 1 have none, and are read with a warning.
 """
 
 import hashlib
@@ -18,23 +18,24 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files.atomic import is_full_disk
-from gsencoder.core.files.checksums import block_checksums, bytes_of, file_digest, wrong_blocks
+from gsencoder.core.files.checksums import block_checksums, bytes_of, damaged_blocks, file_digest
 
 VERSION = 2
 WITHOUT_CHECKSUMS = 1
-"""The version whose files have none, but for packages, which had one over the whole file."""
-OWN_KEYS = ("version", "checksums", "digest")
-"""Keys of the header that are not the caller's: the blocks' checksums by array, and the digest over everything else."""
+"""The version without checksums, except for packages, which had one over the file."""
+RESERVED_KEYS = ("version", "checksums", "digest")
+"""Keys of the header that callers may not use: version, checksums of the blocks by array, and the digest of the rest.
+"""
 LARGEST_NUMBER = 2.0**63
 DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", "I64": "int64", "U8": "uint8"}
-"""safetensors' names of the number types that are written here."""
+"""The types of arrays that archives may hold, by their names in safetensors."""
 DAMAGED = "the file is damaged"
 
 
-def first_difference(found: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = "") -> str:
-    """The first setting in which two runs differ, in words."""
-    for key in sorted({*found, *wanted}):
-        old, new = found.get(key), wanted.get(key)
+def first_difference(saved: Mapping[str, Any], current: Mapping[str, Any], prefix: str = "") -> str:
+    """Describes the first setting in which a saved run and the current one differ."""
+    for key in sorted({*saved, *current}):
+        old, new = saved.get(key), current.get(key)
         if isinstance(old, dict) and isinstance(new, dict) and old != new:
             return first_difference(old, new, f"{prefix}{key}.")
         if old != new:
@@ -43,21 +44,21 @@ def first_difference(found: Mapping[str, Any], wanted: Mapping[str, Any], prefix
 
 
 class Archive:
-    """An open file; arrays and header values are checked as they are taken out.
+    """An open archive; arrays and header values are validated as they are read.
 
     Attributes:
         path: of the file, for messages.
-        sizes: what the letters of shapes stand for, as the arrays taken so far have fixed it.
+        sizes: values of the letters in shapes, as set by the arrays that were read so far.
     """
 
     def __init__(self, path: Path, file: Any, header: dict[str, Any]) -> None:
         """Args:
         path: of the file.
-        file: it, opened by safetensors.
-        header: what it says of itself.
+        file: the file, opened by safetensors.
+        header: its JSON header.
 
         Raises:
-            InputError: another version, or a header that has been changed since it was written.
+            InputError: another version, or a header that does not match its digest.
         """
         self.path, self.sizes = path, dict[str, int]()
         self._file, self._header, self._names = file, header, frozenset(file.keys())
@@ -77,20 +78,22 @@ class Archive:
         self.checksums = checksums
 
     def array(self, name: str, dtype: str, shape: tuple[int | str, ...]) -> np.ndarray:
-        """An array; a letter in its shape means the same size in all arrays of the file.
+        """Reads an array; a letter in its shape stands for the same size in all arrays of the file.
 
         Raises:
             InputError: missing, of another type or size, or not finite.
         """
         got_dtype, got = self._stored(name)
-        wanted = tuple(self.sizes.get(side, side) if isinstance(side, str) else side for side in shape)
-        same = len(got) == len(wanted) and all(isinstance(w, str) or w == g for w, g in zip(wanted, got, strict=True))
+        expected = tuple(self.sizes.get(side, side) if isinstance(side, str) else side for side in shape)
+        same = len(got) == len(expected) and all(
+            isinstance(e, str) or e == g for e, g in zip(expected, got, strict=True)
+        )
         if got_dtype != dtype or not same:
             raise InputError(
-                f"{self.path}: expected {name} {dtype}[{_listed(wanted)}], got {got_dtype}[{_listed(got)}]; "
+                f"{self.path}: expected {name} {dtype}[{_listed(expected)}], got {got_dtype}[{_listed(got)}]; "
                 "the file is damaged or from another program"
             )
-        self.sizes |= {side: size for side, size in zip(wanted, got, strict=True) if isinstance(side, str)}
+        self.sizes |= {side: size for side, size in zip(expected, got, strict=True) if isinstance(side, str)}
         values = self._read(name)
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             bad = values.size - int(np.count_nonzero(np.isfinite(values)))
@@ -98,7 +101,7 @@ class Archive:
         return values
 
     def shape(self, name: str, dtype: str, axes: int) -> tuple[int, ...]:
-        """The size of an array, without reading it.
+        """The shape of an array, without reading it.
 
         Raises:
             InputError: missing, of another type, or with another number of axes.
@@ -113,19 +116,19 @@ class Archive:
 
     def _read(self, name: str) -> np.ndarray:
         values: np.ndarray = self._file.get_tensor(name)
-        if self.checksums is not None and wrong_blocks(bytes_of(values), self.checksums[name]):
+        if self.checksums is not None and damaged_blocks(bytes_of(values), self.checksums[name]):
             raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
         return values
 
     def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
-        """Type and size of an array as the file states them."""
+        """Type and shape of an array according to the file."""
         if name not in self._names:
             raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
         stored = self._file.get_slice(name)
         return DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
 
     def value(self, key: str, *kinds: type | None) -> Any:
-        """A value of the header, of one of these types.
+        """Reads a value of the header, which must be of one of these types.
 
         Raises:
             InputError: missing or of another type.
@@ -142,7 +145,7 @@ class Archive:
         return value
 
     def verify(self) -> None:
-        """Reads all arrays and holds them against their checksums; those of version 1 against the sum of the file.
+        """Verifies the checksums of all arrays, or of the file where its version is 1.
 
         Raises:
             InputError: the file is damaged, or has no checksums.
@@ -165,12 +168,12 @@ def _listed(shape: tuple[int | str, ...]) -> str:
 
 
 def warn_without_checksums(path: Path) -> None:
-    """One warning a folder: a run may read hundreds of files of one kind from it."""
+    """Warns once for each folder, since a run may read hundreds of such files from it."""
     if path.parent not in _WARNED:
         _WARNED.add(path.parent)
         warnings.warn(
             f"{path}: was written by an earlier version, without checksums, so damage to it or to files beside it "
-            "would not be noticed; make it anew to have them",
+            "would not be noticed; write it again to add them",
             SceneWarning,
             stacklevel=5,
         )
@@ -190,12 +193,12 @@ def _sum_of_version_1(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any
 
 
 def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
-    """Writes arrays and header with their checksums; what had the name stays until the new file is whole.
+    """Writes arrays and header with their checksums; an existing file is replaced once the new one is complete.
 
     Args:
         path: the file.
         arrays: by name, of the types in `DTYPES`.
-        header: values that JSON has, under other keys than `OWN_KEYS`.
+        header: JSON values, under other keys than `RESERVED_KEYS`.
 
     Raises:
         InputError: the disk is full, or the system refuses.
@@ -205,10 +208,10 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
 
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     pieces = {name: _contiguous(array) for name, array in arrays.items()}
-    assert not set(OWN_KEYS) & set(header)
-    assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that readers do not know"
+    assert not set(RESERVED_KEYS) & set(header)
+    assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that cannot be read back"
     checksums = {name: block_checksums(array) for name, array in pieces.items()}
-    # As it will be read: JSON makes lists of tuples and text of keys.
+    # The digest is of what a reader will see: JSON turns tuples into lists and keys into text.
     covered = json.loads(json.dumps({**header, "version": VERSION, "checksums": checksums}))
     digest = file_digest(covered, {name: (array.dtype.name, array.shape) for name, array in pieces.items()})
     metadata = {"gsencoder": json.dumps({**covered, "digest": digest})}
@@ -216,7 +219,7 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
         save_file(pieces, temporary, metadata)
         with temporary.open("rb") as stream:
             os.fsync(stream.fileno())
-        # safetensors writes files that nobody else may read.
+        # safetensors writes files that no other user may read.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
@@ -230,14 +233,14 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
 
 
 def _contiguous(array: np.ndarray) -> np.ndarray:
-    """The array in one piece, of the same shape; numpy's own function makes a number a list of one."""
+    """A contiguous copy of the same shape; np.ascontiguousarray alone gives a scalar an axis."""
     return np.ascontiguousarray(array).reshape(array.shape)
 
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[Archive]:
-    """The file at `path`, open for the block. An `InputError` in the block that does not name the file is given its
-    name, so that what the types refuse is told with its place.
+    """Opens the file at `path` for the block. An `InputError` in the block that does not name the file is prefixed with
+    its path, so that errors of validation say which file they are about.
 
     Raises:
         InputError: missing, damaged, or of another version.

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and what else it takes to share a disk with other runs."""
+"""Atomic files, folder locks and the detection of full disks."""
 
 import errno
 import os
@@ -13,20 +13,20 @@ from gsencoder.core.errors import InputError
 
 try:
     import fcntl
-except ImportError:  # A system without it never sees that another run is at work.
+except ImportError:  # Without it, runs do not see each other's locks.
     fcntl = None  # type: ignore[assignment]
 
 
-def locked(folder: str | Path, *, wait: bool = False) -> int | None:
-    """An open descriptor with a lock on a folder, which the system gives back when it closes, and for a killed run too;
-    None where folders cannot be locked (some network file systems).
+def lock_folder(folder: str | Path, *, wait: bool = False) -> int | None:
+    """Locks a folder and returns the open descriptor; the system releases the lock when it is closed or the process
+    ends. None where folders cannot be locked (some network file systems).
 
     Args:
         folder: an existing one.
-        wait: until another run gives its lock back.
+        wait: whether to wait until another run releases its lock.
 
     Raises:
-        BlockingIOError: another run has it.
+        BlockingIOError: another run holds the lock.
         OSError: there is no such folder, or it may not be opened.
     """
     if fcntl is None:
@@ -47,10 +47,10 @@ def locked(folder: str | Path, *, wait: bool = False) -> int | None:
 
 
 def is_full_disk(error: BaseException) -> bool:
-    """Whether an error, of the system or of a library that wrote, means that the disk or the quota is full."""
+    """Whether an error of the system or of a library means that the disk or the quota is full."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return True
-    # numpy says "4096 requested and 100 written", and safetensors puts the system's words in its own error.
+    # numpy reports "4096 requested and 100 written"; safetensors quotes the system's message in its error.
     short = (
         isinstance(error, OSError) and error.errno is None and re.search(r"\d+ requested and \d+ written", str(error))
     )
@@ -59,10 +59,10 @@ def is_full_disk(error: BaseException) -> bool:
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
-    """A binary file that takes the name `path` only when the block ends without an error.
+    """Opens a binary file that appears at `path` only if the block ends without an error.
 
-    It is written under a temporary name in the same folder, synced to disk and renamed, so a kill or a full disk
-    leaves what was there before.
+    It is written under a temporary name in the same folder, synced to disk and renamed, so that a kill or a full disk
+    leaves an earlier file as it was.
 
     Raises:
         InputError: the folder is missing, or the system refuses the write.

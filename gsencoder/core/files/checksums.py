@@ -1,8 +1,8 @@
 """Checksums of array files: a CRC-32 for each block of each array, and one SHA-256 over the header and all of these.
 
 Blocks let a reader that maps a file check only what it reads: a training step touches a small part of a scene. A CRC-32
-finds every error of up to 32 neighboring bits in a block, and misses one in 2³² of all others; it is not meant to stop
-anybody who changes a file on purpose.
+detects every error of up to 32 neighboring bits in a block, and misses one in 2³² of all others; it is no protection
+against deliberate changes.
 """
 
 import hashlib
@@ -15,18 +15,18 @@ import numpy as np
 from jaxtyping import Int64, UInt8
 
 BLOCK_BYTES = 1 << 18
-"""Bytes that share a checksum; the last block of an array may be shorter."""
+"""Bytes of a block, which has one checksum; the last block of an array may be shorter."""
 DIGITS = 8
 """Hexadecimal digits of one checksum."""
 
 
 def bytes_of(array: np.ndarray) -> UInt8[np.ndarray, " bytes"]:
-    """The bytes of an array in C order, without a copy where it lies in one piece."""
+    """The bytes of an array in C order, without a copy if it is contiguous."""
     return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
 
 
 def block_checksums(array: np.ndarray) -> str:
-    """The CRC-32 of each block of an array, as hexadecimal digits in one text."""
+    """The CRC-32 of each block of an array, as one string of hexadecimal digits."""
     data = bytes_of(array)
     return "".join(_checksum(data, block) for block in range(-(-len(data) // BLOCK_BYTES)))
 
@@ -35,25 +35,25 @@ def _checksum(data: UInt8[np.ndarray, " bytes"], block: int) -> str:
     return f"{zlib.crc32(data[block * BLOCK_BYTES : (block + 1) * BLOCK_BYTES].data):0{DIGITS}x}"
 
 
-def wrong_blocks(
+def damaged_blocks(
     data: UInt8[np.ndarray, " bytes"], checksums: str, blocks: Int64[np.ndarray, " n"] | None = None
 ) -> list[int]:
-    """The blocks of an array's bytes that do not have their checksums.
+    """Numbers of the blocks of an array that do not match their checksums.
 
     Args:
         data: the bytes of the array.
         checksums: of `block_checksums`.
-        blocks: which to look at; all unless given.
+        blocks: numbers of the blocks to verify; None = all.
     """
     count = -(-len(data) // BLOCK_BYTES)
     if len(checksums) != count * DIGITS:
         return list(range(max(count, 1)))
-    looked_at = range(count) if blocks is None else blocks.tolist()
-    return [n for n in looked_at if _checksum(data, n) != checksums[n * DIGITS : (n + 1) * DIGITS]]
+    numbers = range(count) if blocks is None else blocks.tolist()
+    return [n for n in numbers if _checksum(data, n) != checksums[n * DIGITS : (n + 1) * DIGITS]]
 
 
 def file_digest(header: Mapping[str, Any], entries: Mapping[str, tuple[str, tuple[int, ...]]]) -> str:
-    """The SHA-256 over a header (the checksums of all blocks included) and over what the file says of its arrays.
+    """The SHA-256 over a header (the checksums of all blocks included) and over the types and shapes of the arrays.
 
     Args:
         header: JSON values.

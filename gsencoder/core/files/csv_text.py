@@ -1,4 +1,4 @@
-"""Tables as CSV text."""
+"""CSV text of tables."""
 
 import csv
 import io
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows with the same keys, under a line that names them. Floats keep six digits; None and NaN are left empty."""
+    """CSV of rows with the same keys, after a header line. Floats have six digits; None and NaN are empty cells."""
     if not rows:
         return ""
     stream = io.StringIO()

@@ -1,4 +1,4 @@
-"""Values as JSON, and files of it that appear whole or not at all."""
+"""JSON of values that contain numpy arrays, paths and dataclasses, and atomic JSON files."""
 
 import json
 import math
@@ -15,15 +15,16 @@ from gsencoder.core.files.atomic import atomic_file
 
 
 def plain(value: Any, where: str = "", lost: list[str] | None = None) -> Any:
-    """`value` in what JSON has: numpy values, paths, tuples and dataclasses are turned, non-finite numbers are null.
+    """Converts `value` to JSON types: numpy values, paths, tuples and dataclasses are converted, non-finite numbers
+    null.
 
     Args:
-        value: anything made of those.
+        value: nested lists, tuples, mappings and dataclasses of such values.
         where: the dotted name of `value`, for `lost`.
         lost: collects the dotted names of the numbers that were not finite.
 
     Raises:
-        TypeError: something that JSON has nothing for; it is named.
+        TypeError: a value of another type; it is named.
     """
 
     def inside(name: object, item: Any) -> Any:
@@ -51,19 +52,19 @@ def plain(value: Any, where: str = "", lost: list[str] | None = None) -> Any:
         return [inside(index, item) for index, item in enumerate(value)]
     if is_dataclass(value) and not isinstance(value, type):
         return {item.name: inside(item.name, getattr(value, item.name)) for item in fields(value)}
-    raise TypeError(f"{where or 'value'}: {type(value).__name__} has no place in JSON")
+    raise TypeError(f"{where or 'value'}: {type(value).__name__} cannot be written as JSON")
 
 
 def json_bytes(value: Any) -> tuple[bytes, list[str]]:
     """`value` as JSON, and the dotted names of the numbers that were not finite."""
     lost: list[str] = []
     text = json.dumps(plain(value, "", lost), indent=2, ensure_ascii=False, allow_nan=False)
-    # A lone surrogate stands for a byte of a file name that is not UTF-8; it is escaped, as JSON can.
+    # A lone surrogate stands for a byte of a file name that is not UTF-8; it is escaped.
     return text.encode("utf-8", "backslashreplace") + b"\n", lost
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Writes a file that appears whole or not at all, in place of what had its name.
+    """Writes a file atomically; an existing one is replaced.
 
     Raises:
         InputError: the folder is missing, the disk is full, or the system refuses.
@@ -73,7 +74,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Writes JSON, atomically. numpy values, paths and dataclasses become what JSON has for them.
+    """Writes a JSON file atomically; values are converted as by `plain`.
 
     Numbers that are not finite become null, with one counted `SceneWarning` that names them.
 

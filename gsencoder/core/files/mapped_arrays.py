@@ -1,4 +1,4 @@
-"""Arrays of an archive as read-only memory maps: only what is looked at is read, and processes share it."""
+"""Memory-mapped arrays of an archive: only the blocks that are used are read, and processes share them."""
 
 import json
 from collections.abc import Mapping
@@ -9,29 +9,29 @@ from jaxtyping import Int, Int64, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import DAMAGED, open_archive
-from gsencoder.core.files.checksums import BLOCK_BYTES, wrong_blocks
+from gsencoder.core.files.checksums import BLOCK_BYTES, damaged_blocks
 
 
 class MappedArrays:
-    """Some arrays of a file. A block is held against its checksum when something in it is first asked for, and not
-    again; values are not looked at otherwise. Files of version 1 have no checksums, and are believed.
+    """Read-only arrays of a file. A block is verified against its checksum when it is first used, and not again; values
+    are not validated otherwise. Files of version 1 have no checksums, and are read as they are.
     """
 
-    def __init__(self, path: Path, wanted: Mapping[str, tuple[str, int]], before: "MappedArrays | None" = None) -> None:
+    def __init__(self, path: Path, types: Mapping[str, tuple[str, int]], earlier: "MappedArrays | None" = None) -> None:
         """Maps the file.
 
         Args:
             path: of the file.
-            wanted: dtype and number of axes of each array.
-            before: an earlier map of these arrays, now closed; blocks that it checked are not checked again if the
-                file has not been written since.
+            types: dtype and number of axes of each array.
+            earlier: a closed map of these arrays; blocks that it verified are not verified again if the file has not
+                been written since.
 
         Raises:
             InputError: missing, damaged, or without these arrays.
         """
         self.path = path
         with open_archive(path) as file:
-            shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in wanted.items()}
+            shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in types.items()}
             self._checksums = file.checksums
         state = path.stat()
         self._stamp = (state.st_ino, state.st_size, state.st_mtime_ns)
@@ -40,7 +40,7 @@ class MappedArrays:
         entries = json.loads(raw[8:begin].tobytes())
         self._bytes: dict[str, UInt8[np.ndarray, " bytes"]] = {}
         self._arrays: dict[str, np.ndarray] = {}
-        for name, (dtype, _) in wanted.items():
+        for name, (dtype, _) in types.items():
             first, last = entries[name]["data_offsets"]
             self._bytes[name] = raw[begin + first : begin + last]
             self._arrays[name] = self._bytes[name].view(dtype).reshape(shapes[name])
@@ -48,11 +48,11 @@ class MappedArrays:
         if self._checksums is not None:
             blocks = {name: -(-len(data) // BLOCK_BYTES) for name, data in self._bytes.items()}
             self._unchecked = {name: np.ones(count, bool) for name, count in blocks.items() if count}
-            if before is not None and before._stamp == self._stamp:
-                self._unchecked = before._unchecked
+            if earlier is not None and earlier._stamp == self._stamp:
+                self._unchecked = earlier._unchecked
 
     def close(self) -> None:
-        """Lets go of the file, and remembers which blocks have been checked; nothing can be read any more."""
+        """Closes the file; only the record of verified blocks remains."""
         self._bytes.clear()
         self._arrays.clear()
 
@@ -60,8 +60,8 @@ class MappedArrays:
         """The shape of an array."""
         return self._arrays[name].shape
 
-    def whole(self, name: str) -> np.ndarray:
-        """An array, all of it checked; a view of the map.
+    def array(self, name: str) -> np.ndarray:
+        """A complete array, verified; a view of the map.
 
         Raises:
             InputError: the file is damaged.
@@ -71,32 +71,32 @@ class MappedArrays:
         return self._arrays[name]
 
     def rows(self, name: str, rows: Int[np.ndarray, " n"]) -> np.ndarray:
-        """Some rows of an array, copied.
+        """Copies rows of an array.
 
         Args:
             name: of the array.
-            rows: numbers from 0.
+            rows: indices.
 
         Raises:
-            InputError: the file is damaged there.
+            InputError: these rows are damaged.
         """
         array = self._arrays[name]
         if name in self._unchecked and len(rows):
             size = array.dtype.itemsize * int(np.prod(array.shape[1:]))
             first = rows.astype(np.int64) * size
             touched = np.zeros(len(self._unchecked[name]), bool)
-            # A row may reach over several blocks.
+            # A row may extend over several blocks.
             for offset in range(0, size + BLOCK_BYTES, BLOCK_BYTES):
                 touched[(first + min(offset, max(size - 1, 0))) // BLOCK_BYTES] = True
             self._check(name, np.flatnonzero(touched & self._unchecked[name]))
         values: np.ndarray = array[rows]
         return values
 
-    def part(self, name: str, first: int, last: int) -> np.ndarray:
-        """Rows `first` to `last` (which is left out) of an array; a view of the map.
+    def row_range(self, name: str, first: int, last: int) -> np.ndarray:
+        """Rows `first` to `last`, exclusive, of an array; a view of the map.
 
         Raises:
-            InputError: the file is damaged there.
+            InputError: these rows are damaged.
         """
         array = self._arrays[name]
         if name in self._unchecked and last > first:
@@ -107,7 +107,7 @@ class MappedArrays:
 
     def _check(self, name: str, blocks: Int64[np.ndarray, " n"]) -> None:
         assert self._checksums is not None
-        if wrong_blocks(self._bytes[name], self._checksums[name], blocks):
+        if damaged_blocks(self._bytes[name], self._checksums[name], blocks):
             raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
         self._unchecked[name][blocks] = False
         if not self._unchecked[name].any():

@@ -1,4 +1,4 @@
-"""Where models and tables are found: at the path that was given, or by bare name in the folder of models."""
+"""Search for the files of models and text tables: at a path, or by name in the folder of models."""
 
 import os
 from pathlib import Path
@@ -9,12 +9,12 @@ MODELS_VARIABLE = "GSENCODER_MODELS"
 
 
 def find_file(name: str, option: str, *, folder: bool = False) -> Path:
-    """The file at `name`, else the file of that name in the folder that GSENCODER_MODELS names.
+    """The file at `name`, else the file of that name in the folder GSENCODER_MODELS.
 
     Args:
         name: a path, or a bare file name.
-        option: what the user would set, for the error.
-        folder: whether a folder is sought, as models of several files have one.
+        option: name of the option, for the error.
+        folder: whether to look for a folder, for models of several files.
 
     Raises:
         InputError: neither exists.

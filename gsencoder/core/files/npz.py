@@ -1,4 +1,4 @@
-"""Arrays of an .npz without trust: nothing is unpickled, and no header takes more memory than the file accounts for."""
+"""A reader of untrusted .npz files: no pickle, and no more memory than the size of the file justifies."""
 
 import zipfile
 import zlib
@@ -10,25 +10,25 @@ import numpy as np
 from gsencoder.core.errors import InputError
 
 LARGEST_ARRAY = 1 << 30
-"""Bytes that an array may claim."""
-LONGEST_TEXT = 1 << 12
-"""Characters that every entry of an array of text may take: numpy gives all of them the length of the longest."""
+"""Largest size of an array, bytes."""
+MAX_TEXT = 1 << 12
+"""Largest number of characters of an entry of a text array; numpy stores all entries with the length of the longest."""
 
 
 def read_npz(
     file: Path,
-    wanted: Mapping[str, tuple[str, int]],
+    required: Mapping[str, tuple[str, int]],
     optional: Mapping[str, tuple[str, int]] | None = None,
     *,
-    longest_text: int = LONGEST_TEXT,
+    max_text: int = MAX_TEXT,
 ) -> dict[str, np.ndarray]:
-    """Arrays of an .npz by name.
+    """Reads arrays of an .npz by name.
 
     Args:
         file: the archive.
-        wanted: kind of type ("U" text, "f" floating point, "b" bool) and number of axes of each array.
-        optional: the same for arrays that need not be there.
-        longest_text: characters of an entry of text.
+        required: kind of type ("U" text, "f" floating point, "b" bool) and number of axes of each array.
+        optional: the same for arrays that may be missing.
+        max_text: largest number of characters of an entry of text.
 
     Raises:
         InputError: damaged or hostile, or an array is missing or of another kind.
@@ -36,11 +36,11 @@ def read_npz(
     try:
         with zipfile.ZipFile(file) as archive:
             present = set(archive.namelist())
-            missing = [name for name in wanted if f"{name}.npy" not in present]
+            missing = [name for name in required if f"{name}.npy" not in present]
             if missing:
-                raise InputError(f"{file}: expected the arrays {' and '.join(wanted)}, {missing[0]} is missing")
-            asked = {**wanted, **{k: v for k, v in (optional or {}).items() if f"{k}.npy" in present}}
-            return {name: _read_member(archive, name, *kind, file, longest_text) for name, kind in asked.items()}
+                raise InputError(f"{file}: expected the arrays {' and '.join(required)}, {missing[0]} is missing")
+            types = {**required, **{k: v for k, v in (optional or {}).items() if f"{k}.npy" in present}}
+            return {name: _read_member(archive, name, *kind, file, max_text) for name, kind in types.items()}
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, MemoryError) as error:
@@ -48,10 +48,8 @@ def read_npz(
         raise InputError(f"{file}: cannot be read as .npz: {message}") from error
 
 
-def _read_member(
-    archive: zipfile.ZipFile, name: str, kind: str, ndim: int, file: Path, longest_text: int
-) -> np.ndarray:
-    """One array, whose header must agree with the size that the archive states, before memory is taken."""
+def _read_member(archive: zipfile.ZipFile, name: str, kind: str, ndim: int, file: Path, max_text: int) -> np.ndarray:
+    """Reads an array; its header must match the size in the archive, which is checked before memory is allocated."""
     where, size = f"{file}: {name}", archive.getinfo(f"{name}.npy").file_size
     if size > LARGEST_ARRAY:
         raise InputError(f"{where} claims {size:,} bytes; at most {LARGEST_ARRAY:,} are read")
@@ -65,12 +63,12 @@ def _read_member(
         if dtype.kind != kind or len(shape) != ndim:
             raise InputError(f"{where}: expected {ndim} axes of type {kind!r}, got {dtype}{list(shape)}")
         length = dtype.itemsize // np.dtype("U1").itemsize
-        if kind == "U" and length > longest_text:
-            raise InputError(f"{where}: entries of {length:,} characters, expected at most {longest_text:,}")
-        wanted = size - stream.tell()
-        if count * dtype.itemsize != wanted:
-            raise InputError(f"{where}: header claims {count * dtype.itemsize:,} bytes, the file holds {wanted:,}")
-        data = stream.read(wanted)
-    if len(data) != wanted:
-        raise InputError(f"{where}: truncated, {wanted - len(data):,} of {wanted:,} bytes are missing")
+        if kind == "U" and length > max_text:
+            raise InputError(f"{where}: entries of {length:,} characters, expected at most {max_text:,}")
+        expected = size - stream.tell()
+        if count * dtype.itemsize != expected:
+            raise InputError(f"{where}: header claims {count * dtype.itemsize:,} bytes, the file holds {expected:,}")
+        data = stream.read(expected)
+    if len(data) != expected:
+        raise InputError(f"{where}: truncated, {expected - len(data):,} of {expected:,} bytes are missing")
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")

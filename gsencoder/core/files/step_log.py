@@ -1,4 +1,4 @@
-"""What a training writes down as it goes: a CSV that a resumed run continues, and TensorBoard events."""
+"""The log of a training: a CSV that a resumed run continues, and TensorBoard events."""
 
 import csv
 import io
@@ -17,17 +17,17 @@ LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
 
 
 class Log:
-    """Rows of numbers by step. The file is closed after every row, so that a kill loses none."""
+    """Writes a row of numbers for each step. The file is closed after every row, so that a kill loses none."""
 
     def __init__(self, folder: Path, *, done: int, events: bool, begun: bool = False) -> None:
         """Args:
-        folder: where the log lies; rows of steps that will be done again are taken out.
-        done: steps that are done; a row carries the number of steps that were done when it was written.
+        folder: of the log; rows of steps that will be repeated are removed.
+        done: number of completed steps; a row holds the number of steps that were completed when it was written.
         events: whether to write TensorBoard events too.
-        begun: whether rows have been written before.
+        begun: whether an earlier run wrote rows.
 
         Warns:
-            SceneWarning: they have, and are gone.
+            SceneWarning: an earlier run wrote rows, and the file is missing.
 
         Raises:
             InputError: TensorBoard is asked for and not installed, or the log cannot be written.
@@ -43,27 +43,27 @@ class Log:
                     "tensorboard=true needs the package tensorboard (pip install tensorboard), or tensorboard=false"
                 ) from error
             try:
-                # Events of later steps, left by a run that was killed, are no longer shown.
+                # Hides events of later steps, which a killed run left.
                 self._writer = SummaryWriter(str(folder / EVENTS_FOLDER), purge_step=done + 1)
             except OSError as error:
                 raise InputError(f"{folder / EVENTS_FOLDER}: cannot write: {error.strerror or error}") from error
         try:
             if begun and not self.path.is_file():
-                warnings.warn(f"{self.path}: is gone; the log begins again at step {done}", SceneWarning, stacklevel=2)
-            self._keep_until(done)
+                warnings.warn(f"{self.path}: is missing; the log starts at step {done}", SceneWarning, stacklevel=2)
+            self._drop_rows_after(done)
         except (OSError, ValueError, KeyError, csv.Error) as error:
             raise InputError(f"{self.path}: cannot be continued: {error}") from error
 
-    def _keep_until(self, done: int) -> None:
+    def _drop_rows_after(self, done: int) -> None:
         if not self.path.is_file():
             self._rewrite([])
             return
-        kept = [row for row in read_log(self.path) if int(row["step"]) <= done]
-        self._columns = list(dict.fromkeys(name for row in kept for name in row))
-        self._rewrite(kept)
+        rows = [row for row in read_log(self.path) if int(row["step"]) <= done]
+        self._columns = list(dict.fromkeys(name for row in rows for name in row))
+        self._rewrite(rows)
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
-        """One row; every number is also a TensorBoard scalar.
+        """Appends a row; every number is also a TensorBoard scalar.
 
         Raises:
             InputError: the disk is full.
@@ -74,7 +74,7 @@ class Log:
                 self._writer.add_scalar(name, value, step)
 
     def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
-        """A picture uint8 [H, W, 3]: a file `NAME_STEP.png` beside the log, and for TensorBoard.
+        """Writes a picture, uint8 [H, W, 3]: a file `NAME_STEP.png` beside the log, and for TensorBoard.
 
         Raises:
             InputError: the disk is full.
@@ -92,7 +92,7 @@ class Log:
         new = [name for name in row if name not in self._columns]
         try:
             if new and self._columns:
-                # Validation adds columns: the file is written anew, once, with empty cells before.
+                # Validation adds columns: the file is rewritten once, with empty cells in earlier rows.
                 self._columns += new
                 self._rewrite([*read_log(self.path), row])
                 return
@@ -107,15 +107,15 @@ class Log:
             stream.write((_text(self._columns, rows, header=True) if rows else "").encode())
 
     def close(self) -> None:
-        """Writes what TensorBoard still holds."""
+        """Flushes TensorBoard events."""
         if self._writer is not None:
             self._writer.close()
 
 
 def read_log(path: Path) -> list[dict[str, str]]:
-    """The rows of a log, as text; empty cells are left out, and so is a last line that a kill left unfinished."""
-    whole = path.read_text(encoding="utf-8").rpartition("\n")[0]
-    return [{name: cell for name, cell in row.items() if name and cell} for row in csv.DictReader(whole.splitlines())]
+    """The rows of a log, as text, without empty cells and without an incomplete last line that a kill left."""
+    lines = path.read_text(encoding="utf-8").rpartition("\n")[0]
+    return [{name: cell for name, cell in row.items() if name and cell} for row in csv.DictReader(lines.splitlines())]
 
 
 def _text(columns: Sequence[str], rows: Sequence[Mapping[str, Any]], *, header: bool) -> str:

@@ -85,10 +85,10 @@ def open_package(file: Path) -> CompactFeatures:
         if not 0 <= total <= 8 * len(seen) < total + 8:
             raise InputError(f"expected marks of {total} Gaussians, got {8 * len(seen)}")
         return CompactFeatures(
-            codes=mapped.whole("codes"),
+            codes=mapped.array("codes"),
             bits=archive.array("bits", "uint8", ("R",)),
             levels=archive.array("levels", "float32", ("L",)),
-            weight_codes=mapped.whole("weight_codes"),
+            weight_codes=mapped.array("weight_codes"),
             lightest=archive.value("lightest", float, int),
             heaviest=archive.value("heaviest", float, int),
             rows=np.flatnonzero(np.unpackbits(seen, count=total)),
