@@ -1,7 +1,7 @@
 """The command line: `gsencoder COMMAND [PATH…] [key=value …]`.
 
-Exit codes: 0 done; 1 a defect of the program (with its traceback); 2 a wrong input, told in one line; 130 interrupted;
-143 terminated. Warnings and errors go to standard error, one line each; results go to standard output.
+Exit codes: 0 success; 1 a bug (with its traceback); 2 wrong input (with a message of one line); 130 interrupted; 143
+terminated. Warnings and errors go to standard error, one line each; results go to standard output.
 """
 
 import errno
@@ -36,11 +36,11 @@ SHORT = {"-h": "--help", "-m": "--multirun"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command line (that of the process unless given); the exit code."""
+    """Runs a command line, by default that of the process, and returns the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words[: words.index("--") if "--" in words else None]
     for stream in (sys.stdout, sys.stderr):
-        # File names may hold bytes that the terminal's encoding has no character for.
+        # File names may hold bytes that the terminal's encoding cannot show.
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     try:
@@ -79,20 +79,20 @@ def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:
 
 def _report(kind: str, message: str, debug: bool) -> None:
     if debug:
-        # Messages of other programs and servers are in it.
+        # It may contain messages of other programs and of servers.
         for line in traceback.format_exc().splitlines():
             print(printable(clipped(line)), file=sys.stderr)
     print(f"{kind}: {one_line(message)}" if message else kind, file=sys.stderr)
 
 
 def _discard_stdout() -> None:
-    """Nobody reads it any more; without this the interpreter would complain when it flushes at exit."""
+    """Redirects standard output to nowhere: its reader is gone, and the interpreter would fail to flush it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager
 def _stop_signals() -> Iterator[None]:
-    """SIGTERM and SIGHUP end the run as an exception does, unless they are ignored (nohup)."""
+    """SIGTERM and SIGHUP raise an exception, unless they are ignored (nohup)."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -183,7 +183,7 @@ def _run(command: Command, config: Any, debug: bool) -> None:
 
 
 def _run_one(command: Command, config: Any, debug: bool) -> int:
-    """One run of many: its error is told, and the others go on."""
+    """Runs one of several runs; its error is printed, and the others continue."""
     try:
         _run(command, config, debug)
     except InputError as error:
@@ -193,8 +193,8 @@ def _run_one(command: Command, config: Any, debug: bool) -> int:
 
 
 @contextmanager
-def _collected_warnings(found: list[str], debug: bool) -> Iterator[None]:
-    """Each `SceneWarning` becomes one line on standard error and one entry of `found`."""
+def _collected_warnings(messages: list[str], debug: bool) -> Iterator[None]:
+    """Each `SceneWarning` becomes one line on standard error and one entry of `messages`."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", SceneWarning)
         usual = warnings.showwarning
@@ -204,7 +204,7 @@ def _collected_warnings(found: list[str], debug: bool) -> Iterator[None]:
                 usual(message, category, filename, lineno, file, line)
                 return
             text = one_line(str(message))
-            found.append(text)
+            messages.append(text)
             print(f"warning: {text}" + (f" ({filename}:{lineno})" if debug else ""), file=sys.stderr)
 
         warnings.showwarning = show

@@ -232,7 +232,7 @@ def test_brackets_around_a_list_of_text_are_text(conf: Path) -> None:
         ("+seed=1", "+seed=…: is neither an option (KEY=VALUE) nor an existing file"),
         ("~seed=1", "~seed=…: is neither an option (KEY=VALUE) nor an existing file"),
         ("/no/such=file", "/no/such=…: is neither an option (KEY=VALUE) nor an existing file"),
-        ("hydra.run.dir=x", "hydra.run.dir: settings of Hydra itself are taken only with -m"),
+        ("hydra.run.dir=x", "hydra.run.dir: settings of Hydra itself are accepted only with -m"),
         ("seed", "seed: needs a value: seed=…"),
         ("teacher=label", "teacher: expected one of dinov2, labels, onnx, got 'label'; did you mean labels?"),
         ("teacher=null", "teacher: expected one of dinov2, labels, onnx, got 'null'"),
@@ -354,7 +354,7 @@ def test_secrets_are_repeated_by_no_error_and_taken_by_no_sweep(
         (["vlm.key=sk-first1", "vlm.key=sk-second2"], "vlm.key: given twice; give it once"),
         (["vlm.kee=sk-first1"], "vlm.kee: no such option"),
         (["api_key=sk-first1"], "api_key: no such option"),
-        (["-m", "vlm.key=choice(sk-first1,sk-second2)", "out=o"], "vlm.key: is not taken with -m"),
+        (["-m", "vlm.key=choice(sk-first1,sk-second2)", "out=o"], "vlm.key: is not accepted with -m"),
     ):
         assert cli.main(["ask", str(tmp_path), *words]) == 2
         error = capsys.readouterr().err

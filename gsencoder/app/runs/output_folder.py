@@ -1,4 +1,4 @@
-"""Folders and files that appear whole or not at all, and the summary that every run leaves in its folder."""
+"""Atomic output folders, with the summary of the run, and checks of what they would replace."""
 
 import ctypes
 import errno
@@ -22,31 +22,31 @@ AT_FDCWD, RENAME_EXCHANGE = -100, 2
 
 @contextmanager
 def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary | None = None) -> Iterator[Path]:
-    """A folder to write into, which takes the name `path` when the block ends without an error.
+    """Opens a folder to write into, which is renamed to `path` when the block ends without an error.
 
-    Until then it is a hidden folder beside it, `.NAME.partial-XXXXXXXX`. Whatever ends the block early, an interrupt
-    included, removes it; what a killed run left is removed by the next run that writes to the same path. Everything
-    is synced to disk before the folder gets its name.
+    Until then it is a hidden folder beside it, `.NAME.partial-XXXXXXXX`. It is removed if the block ends early, also by
+    an interrupt; the folder of a killed run is removed by the next run that writes to the same path. Everything is
+    synced to disk before the folder is renamed.
 
     Args:
-        path: the folder to make; its parents are made too. It may exist if it is empty.
+        path: the folder; its parents are created. It may exist if it is empty.
         overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
-            old and new change places in one step.
+            old and new are exchanged in one step.
         summary: written into the folder at the end, as summary.json.
 
     Raises:
         InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
             or the disk is full.
     """
-    # Through a symbolic link the folder that it points to is replaced, not the link.
+    # Of a symbolic link the target is replaced, not the link.
     target = Path(os.path.realpath(path))
     _check_target(path, target, overwrite)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         partial, lock = _begin(target)
     except BlockingIOError:
-        told = f"{path}: another run is writing this folder now; wait for it or give another out="
-        raise InputError(told) from None
+        message = f"{path}: another run is writing this folder now; wait for it or give another out="
+        raise InputError(message) from None
     except FileExistsError as error:
         raise InputError(f"{path}: {error.filename} is a file, so no folder can be made in it") from error
     except OSError as error:
@@ -57,27 +57,27 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
             write_bytes(partial / SUMMARY_NAME, json_bytes(summary.to_dict())[0])
         _sync(partial)
         _check_target(path, target, overwrite)
-        _take_place(partial, target)
+        _move_into_place(partial, target)
     except Exception as error:
         message = _refusal(error, partial, target, path)
         if message is None:
             raise
         raise InputError(message) from error
     finally:
-        # After a swap this is the old output.
+        # After an exchange this is the old output.
         shutil.rmtree(partial, ignore_errors=True)
         if lock is not None:
             os.close(lock)
 
 
 def _begin(target: Path) -> tuple[Path, int | None]:
-    """The hidden folder, and its lock. Runs that begin in one moment do so one after the other: a folder that has been
-    made and not yet locked would be taken for one that a killed run left.
+    """Creates and locks the hidden folder. Runs that start at the same moment do so one after the other: a folder that
+    is created and not yet locked would be mistaken for that of a killed run.
 
     Raises:
-        BlockingIOError: a living run is writing `target`.
+        BlockingIOError: another run is writing `target`.
     """
-    turn = lock_folder(target.parent, wait=True)
+    parent_lock = lock_folder(target.parent, wait=True)
     try:
         if _remove_stale(target):
             raise BlockingIOError
@@ -85,8 +85,8 @@ def _begin(target: Path) -> tuple[Path, int | None]:
         partial.mkdir()
         return partial, lock_folder(partial)
     finally:
-        if turn is not None:
-            os.close(turn)
+        if parent_lock is not None:
+            os.close(parent_lock)
 
 
 def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
@@ -112,7 +112,7 @@ def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:
-    """For commands whose result is one file: complains if it exists and may not be replaced.
+    """Checks, for commands whose result is one file, that it does not exist or may be replaced.
 
     Raises:
         InputError: it exists.
@@ -124,14 +124,14 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
 
 
 def refuse_to_replace_inputs(out: Path | None, given: Mapping[str, Any]) -> None:
-    """Complains if a folder that is about to be replaced holds one of the inputs.
+    """Checks that a folder that is about to be replaced holds none of the inputs.
 
     Args:
         out: the folder.
         given: the settings of the run; every text in them that names an existing file or folder is an input.
 
     Raises:
-        InputError: it does.
+        InputError: it holds one.
     """
     if out is None or not os.path.isdir(out):
         return
@@ -141,13 +141,13 @@ def refuse_to_replace_inputs(out: Path | None, given: Mapping[str, Any]) -> None
 
 
 def lies_in(path: str | Path, folder: str | Path) -> bool:
-    """Whether a path is a folder, or lies in it, whatever names and links lead there."""
+    """Whether a path is in a folder or is the folder, with symbolic links resolved."""
     inner, outer = os.path.realpath(path), os.path.realpath(folder)
     return os.path.commonpath([inner, outer]) == outer
 
 
 def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """All texts in nested settings that could be paths, with their keys."""
+    """Yields all strings in nested settings that could be paths, with their keys."""
     if isinstance(value, str) and 0 < len(value) < 4096 and "\0" not in value:
         yield key, value
     elif isinstance(value, Mapping):
@@ -159,15 +159,15 @@ def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _short(name: str) -> str:
-    """The name, or a digest of it where the temporary name would grow longer than file systems allow."""
+    """The name, or a digest of it if the temporary name would be longer than file systems allow."""
     raw = os.fsencode(name)
     return name if len(raw) <= 200 else sha1(raw).hexdigest()
 
 
 def _remove_stale(target: Path) -> bool:
-    """Removes what killed runs left beside `target`; whether a living run is writing it now.
+    """Removes the hidden folders of killed runs beside `target`; returns whether another run is writing it now.
 
-    Where folders cannot be locked (some network file systems) nothing is removed and nobody is seen.
+    Where folders cannot be locked (some network file systems) nothing is removed and no run is detected.
     """
     pattern = re.compile(re.escape(f".{_short(target.name)}.partial-") + "[0-9a-f]{8}")
     for entry in list(os.scandir(target.parent)):
@@ -206,8 +206,8 @@ def _sync_one(path: str | Path) -> None:
         os.close(descriptor)
 
 
-def _take_place(partial: Path, target: Path) -> None:
-    """Gives `partial` the name `target`; what had it before, if anything, is then called `partial`."""
+def _move_into_place(partial: Path, target: Path) -> None:
+    """Renames `partial` to `target`; an existing `target` is renamed to `partial`."""
     old = target.is_dir() and any(target.iterdir())
     if not old:
         os.rename(partial, target)
@@ -224,7 +224,7 @@ def _take_place(partial: Path, target: Path) -> None:
 
 
 def _exchange(first: Path, second: Path) -> bool:
-    """Lets two names change places in one step, where the system knows how."""
+    """Exchanges two names in one step; False if the system does not support it."""
     try:
         renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError, TypeError):
@@ -233,9 +233,9 @@ def _exchange(first: Path, second: Path) -> bool:
 
 
 def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) -> str | None:
-    """What to tell the user if it was the system that refused to write, or None."""
+    """The message for an error of writing, or None for any other error."""
     if isinstance(error, InputError) and str(partial) not in str(error):
-        # What lies elsewhere, such as the state of a run that can go on, was not given up.
+        # Files elsewhere, such as the checkpoint of a run that can be resumed, still exist.
         return str(error)
     if (isinstance(error, OSError) and error.errno == errno.EFBIG) or os.strerror(errno.EFBIG) in str(error):
         return f"{path}: a file would grow larger than this system or shell allows (ulimit -f): no result was written"

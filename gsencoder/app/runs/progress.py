@@ -1,7 +1,7 @@
-"""What a running command shows: bars and lines on standard error, results on standard output.
+"""Progress bars on standard error, and the console for results on standard output.
 
-Functions below the command line know nothing of this. One that loops for long takes an argument
-`track: Callable[[Iterable[T], str], Iterable[T]]` and loops over `track(items, "views")`; `Progress` is such a thing.
+Stages do not import this module. A function with a long loop has an argument
+`track: Callable[[Iterable[T], str], Iterable[T]]` and loops over `track(items, "views")`; `Progress` is one.
 """
 
 import sys
@@ -17,13 +17,13 @@ T = TypeVar("T")
 
 
 def console(quiet: bool = False) -> Console:
-    """Where commands print results and tables: standard output, no markup, wide where it is not a terminal."""
+    """The console for results and tables: standard output without markup, 200 columns wide if it is not a terminal."""
     width = None if sys.stdout.isatty() else 200
     return Console(file=sys.stdout, quiet=quiet, markup=False, highlight=False, emoji=False, width=width)
 
 
 class Progress:
-    """Shows how far a loop is. On a terminal a bar that vanishes at the end; else a line now and then; or nothing.
+    """Shows the progress of loops: a transient bar on a terminal, else a line every few seconds.
 
     Example:
         track = Progress(quiet=config.quiet)
@@ -34,8 +34,8 @@ class Progress:
     def __init__(self, *, quiet: bool = False, stream: Any = None, every: float = 10.0) -> None:
         """Args:
         quiet: show nothing.
-        stream: the text stream to write to; standard error unless given.
-        every: seconds between two lines where the stream is not a terminal; loops shorter than that print nothing.
+        stream: the text stream to write to; None = standard error.
+        every: seconds between lines if the stream is not a terminal; shorter loops print nothing.
         """
         self._stream = sys.stderr if stream is None else stream
         self._quiet = quiet
@@ -44,7 +44,7 @@ class Progress:
         self._depth = 0
 
     def __call__(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """The items, one by one, shown as they are done."""
+        """Yields the items and shows how many are done."""
         if total is None and isinstance(items, Sized):
             total = len(items)
         if self._quiet:
@@ -56,7 +56,7 @@ class Progress:
             columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
             screen = Console(file=self._stream, markup=False, highlight=False)
             self._bars = Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=screen, transient=True)
-        # Loops inside loops share one display: rich draws one at a time.
+        # Nested loops share one display, since rich draws one at a time.
         if self._depth == 0:
             self._bars.start()
         self._depth += 1

@@ -1,9 +1,9 @@
-"""From the words of a command line to a command's settings: Hydra composes them, the user's text stays text.
+"""Composition of a command line into settings by Hydra, with text taken literally.
 
 Hydra's override grammar is made for numbers and sweeps. In it `query=mug,banana` is a sweep, `question=What's red?` a
 syntax error, `query=1` a number, `query=${oc.env:HOME}` a look-up. Options whose type is text, a path, or a list of
-those therefore never pass through it: their characters travel as hexadecimal digits inside an interpolation,
-`${text:x6d7567}`, which OmegaConf resolves to the very same characters when the settings are complete.
+those therefore bypass it: their characters are encoded as hexadecimal digits inside an interpolation,
+`${text:x6d7567}`, which OmegaConf resolves to the same characters when the settings are complete.
 
 Rules for words: one of the form `KEY=VALUE` sets an option if KEY is one; otherwise it is a path if a file of that
 name exists, and an error if not. Every other word is a path. After `--` all words are paths. KEY may leave out the
@@ -36,7 +36,7 @@ from gsencoder.core.removed_options import check_removed_option, removed_option
 Config = TypeVar("Config", bound=CommonConfig)
 
 SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
-"""Under -m, and only there, a text option is swept where its value has this form."""
+"""Form of the value of a text option that is swept, with -m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class Choices:
 
     Attributes:
         options: by full key.
-        members: for each key the members of a choice that have it; none where the option always applies.
+        members: for each key the members of a choice that have this option; empty if it always applies.
         groups: the names of each choice's members, by the choice's key.
         chosen: the default of each choice.
     """
@@ -57,25 +57,25 @@ class Choices:
 
 
 def conf_folder() -> Path:
-    """Where the YAML files are: inside an installed package, beside it in a source tree."""
+    """The folder of YAML files: inside an installed package, beside it in a source tree."""
     package = Path(__file__).resolve().parents[2]
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def seal(text: str) -> str:
-    """The text as a value of Hydra's grammar that resolves to exactly this text."""
+    """Encodes text as a value in Hydra's grammar that resolves to exactly this text."""
     digits = text.encode("utf-8", "surrogatepass").hex()
     return f"'${{text:x{digits}}}'"
 
 
 def unseal(digits: str) -> str:
-    """The text that `seal` wrote as these digits."""
+    """Decodes the digits that `seal` wrote."""
     return bytes.fromhex(digits[1:]).decode("utf-8", "surrogatepass")
 
 
 @contextmanager
 def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iterator[Any]:
-    """Hydra over a command's defaults and a folder of YAML files (ours unless given); its errors become one line."""
+    """Initializes Hydra with the defaults of a command and a folder of YAML files; its errors become InputErrors."""
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
@@ -93,7 +93,7 @@ def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iter
 
 
 def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
-    """The options and choices of a command; further members of a choice are YAML files (in our folder unless given)."""
+    """The options and choices of a command, including the members of choices that are YAML files in `conf`."""
     folder, groups, chosen = conf or conf_folder(), {}, {}
     for group in groups_of(cls):
         files = (path.stem for path in (folder / group.key).glob("*.yaml"))
@@ -119,10 +119,10 @@ def _full_key(key: str, choices: Choices) -> str | None:
 def read_words(
     words: Sequence[str], choices: Choices, *, sweep: bool = False
 ) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Sorts a command line into paths and settings, by the rules at the head of this file.
+    """Splits a command line into paths and settings, by the rules in the docstring of this module.
 
     Raises:
-        InputError: a word that is neither, a setting given twice, or paths for a command that takes none.
+        InputError: a word that is neither, a setting given twice, or paths for a command without paths.
     """
     paths: list[str] = []
     given: dict[str, str] = {}
@@ -148,10 +148,10 @@ def read_words(
             raise InputError(_unknown(word, key, choices))
         elif full in given:
             secret = full in choices.options and choices.options[full].secret
-            told = "" if secret else f", as {given[full]!r} and {value!r}"
-            raise InputError(f"{full}: given twice{told}; give it once")
+            values = "" if secret else f", as {given[full]!r} and {value!r}"
+            raise InputError(f"{full}: given twice{values}; give it once")
         elif sweep and full in choices.options and choices.options[full].secret:
-            raise InputError(f"{full}: is not taken with -m, which writes down what it was given")
+            raise InputError(f"{full}: is not accepted with -m, which writes its values to a file")
         else:
             given[full] = value
     if paths and "paths" not in choices.options:
@@ -171,21 +171,21 @@ def _unknown(word: str, key: str, choices: Choices) -> str:
     if not re.fullmatch(r"[A-Za-z_][\w.]*", key):
         return f"{shown}: is neither an option (KEY=VALUE) nor an existing file"
     if key.startswith("hydra"):
-        return f"{key}: settings of Hydra itself are taken only with -m"
+        return f"{key}: settings of Hydra itself are accepted only with -m"
     return f"{shown.removesuffix('=…')}: no such option, and no file has this name{near(shown, known)}"
 
 
 def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:
-    """The settings in Hydra's grammar, text sealed, each one parsed on its own so that errors name it.
+    """The settings in Hydra's grammar, with text encoded; each is parsed separately, so that errors name it.
 
     Raises:
-        InputError: an unknown member of a choice, or a value that is none of its option's type.
+        InputError: an unknown member of a choice, or a value of the wrong type.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
     parser = OverridesParser.create()
-    found = []
+    hydra_overrides = []
     for key, value in given.items():
         option = choices.options.get(key)
         written = value
@@ -197,7 +197,7 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
                 raise InputError(f"{key}: expected one of {', '.join(names)}{got}")
         elif option is not None and option.kind != "value":
             if not (sweep and SWEPT_TEXT.fullmatch(value)):
-                # Whoever knows Hydra writes brackets around a list; text may begin with one, words of a set do not.
+                # Users of Hydra write brackets around a list; text may begin with one, words of a closed set do not.
                 bracketed = is_list_of_words(option.annotation) and re.fullmatch(r"\[(.*)\]", value)
                 written = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
         elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
@@ -210,8 +210,8 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
             raise InputError(message) from error
         if swept and not sweep and option is not None:
             raise InputError(f"{wrong_value(option, value)}; several values, one run each, need -m")
-        found.append(f"{key}={written}")
-    return found
+        hydra_overrides.append(f"{key}={written}")
+    return hydra_overrides
 
 
 def _is_list(option: Option) -> bool:
@@ -219,7 +219,7 @@ def _is_list(option: Option) -> bool:
 
 
 def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) -> str:
-    """Hydra's complaint in our words where it is about an option of a member that was not chosen."""
+    """The message of an error of Hydra; it is explained if an option belongs to a member that was not chosen."""
     match = re.search(r"Could not override '([^']+)'", str(error))
     if match and match[1] in given:
         key = match[1]
@@ -233,10 +233,10 @@ def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) ->
 def compose(
     command: str, cls: type[Config], words: Sequence[str], conf: Path | None = None, choices: Choices | None = None
 ) -> Config:
-    """The settings of one run: the defaults of its class, YAML files that were chosen, the words of the command line.
+    """Composes the settings of a run: defaults of the class, then chosen YAML files, then the command line.
 
     Raises:
-        InputError: the words, or what they come to together, are not settings of this command.
+        InputError: the words, or their combination, are not settings of this command.
     """
     from hydra.errors import HydraException
     from hydra.types import RunMode
@@ -255,10 +255,10 @@ def compose(
 
 
 def plain_settings(composed: Any) -> dict[str, Any]:
-    """Hydra's result as plain dicts, lists and scalars, its own part left out."""
+    """The composed settings as plain dicts, lists and scalars, without Hydra's own."""
     from omegaconf import OmegaConf
 
-    own = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
-    data = OmegaConf.to_container(own, resolve=True)
+    settings = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
+    data = OmegaConf.to_container(settings, resolve=True)
     assert isinstance(data, dict)
     return {str(key): value for key, value in data.items()}

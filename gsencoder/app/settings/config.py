@@ -1,4 +1,4 @@
-"""Settings of the commands: frozen dataclasses, described once, checked against what the user and the YAML files say.
+"""Settings of the commands: frozen dataclasses, into which command lines and YAML files are parsed and validated.
 
 Each command owns a `@dataclass(frozen=True, slots=True, kw_only=True)` whose fields carry `metadata={"help": …}`;
 that text is what `gsencoder COMMAND --help` shows. Further metadata: `required=True` (the command cannot run without
@@ -33,12 +33,12 @@ from gsencoder.core.removed_options import REMOVED_OPTIONS, check_removed_option
 T = TypeVar("T")
 
 HIDDEN = "(not shown)"
-"""What stands for the value of a secret option wherever settings are shown or written."""
+"""Shown and written in place of the value of a secret option."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonConfig:
-    """What every command takes. Without slots, so that a command can inherit from its stage's settings as well."""
+    """The options of every command. Without slots, so that a command can also inherit the settings of its stage."""
 
     has_experiments: ClassVar[bool] = False
     """Whether `experiment=NAME` takes options of several sections from `conf/experiment/NAME.yaml`."""
@@ -49,7 +49,7 @@ class CommonConfig:
 
 
 def _strict(wanted: type, accepted: tuple[type, ...]) -> Any:
-    """A dacite hook: turns what is really such a value into `wanted`, and anything else into a wrong type."""
+    """A dacite hook that converts values of the accepted types to `wanted`, and refuses all others."""
     from dacite.exceptions import WrongTypeError
 
     def convert(value: Any) -> Any:
@@ -61,7 +61,7 @@ def _strict(wanted: type, accepted: tuple[type, ...]) -> Any:
 
 
 def _prepare(value: Any, annotation: Any) -> Any:
-    """Text lists become lists, one value where a list belongs becomes a list of one, an empty path becomes none."""
+    """Splits text of lists, makes a list of a single value where one is expected, and None of an empty path."""
     if value is None:
         return None
     if isinstance(value, str) and kind_of(annotation) == "list":
@@ -88,9 +88,9 @@ def _section(annotation: Any, value: Any, key: str) -> Any:
 
 
 def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
-    """The settings that `data` (plain dicts, lists and scalars) describes; what it leaves out has its default.
+    """Builds settings from plain dicts, lists and scalars; missing options have their defaults.
 
-    Numbers are taken as numbers only where they are written as such, and not-a-number is refused.
+    Numbers must be numbers, not text, and NaN is refused.
 
     Raises:
         InputError: an unknown key, a wrong type, or a value that the class refuses; the full key is named.
@@ -123,14 +123,14 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
 
 
 def _named(message: str, prefix: str, names: Iterable[str]) -> str:
-    """A complaint of a settings class, with the section's name before the field's."""
+    """The message of an error of a settings class, with the name of the section before that of the field."""
     if not prefix or message.partition(":")[0].split("[")[0] in names:
         return prefix + message
     return f"{prefix.rstrip('.')}: {message}"
 
 
 def check_required(cls: type, config: object) -> None:
-    """Complains about the first required option that was left empty."""
+    """Raises an InputError about the first required option that is empty."""
     for option in options_of(cls):
         if option.required and not option.member:
             value: Any = config
@@ -143,7 +143,7 @@ def check_required(cls: type, config: object) -> None:
 
 
 def settings(config: object) -> dict[str, Any]:
-    """The settings as plain values, as YAML and JSON write them."""
+    """The settings as plain values for YAML and JSON; values of secret options are hidden."""
 
     def plain(value: Any) -> Any:
         if is_dataclass(value) and not isinstance(value, type):

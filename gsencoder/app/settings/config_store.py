@@ -22,11 +22,11 @@ EXPERIMENT = "experiment"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Group:
-    """A config group: named settings of one section, of which a command line takes one, `KEY=MEMBER`.
+    """A config group: named settings of one section, of which a command line chooses one, `KEY=MEMBER`.
 
     Attributes:
         key: the section, with a slash before a nested one; also the name of the folder of YAML files.
-        default: the member that is taken where none is named.
+        default: name of the member that is used by default.
         members: the settings of the members that the dataclasses define, as plain dicts.
     """
 
@@ -60,7 +60,8 @@ def _section_groups(config: Any, prefix: str = "") -> Iterator[Group]:
 
 
 def store_settings(command: str, cls: type[CommonConfig]) -> None:
-    """Puts the defaults of a command and the members of its groups into Hydra's config store, over what is there."""
+    """Stores the defaults of a command and the members of its groups in Hydra's config store; earlier ones are
+    replaced."""
     from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance()

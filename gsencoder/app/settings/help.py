@@ -1,4 +1,4 @@
-"""What `gsencoder COMMAND --help` prints, read off the settings classes and the names of the YAML files."""
+"""The text of `gsencoder COMMAND --help`, from the settings classes and the names of the YAML files."""
 
 import shutil
 import textwrap
@@ -38,16 +38,16 @@ def _option(option: Option, width: int) -> list[str]:
 
 
 def command_help(
-    name: str, meaning: str, cls: type[CommonConfig], flags: Mapping[str, str], conf: Path | None = None
+    name: str, summary: str, cls: type[CommonConfig], flags: Mapping[str, str], conf: Path | None = None
 ) -> str:
     """The help of one command: usage, paths, settings with type, meaning and default, choices, flags."""
     width = min(shutil.get_terminal_size((100, 24)).columns, 110)
-    # The command's own options first, then those of its sections.
+    # The options of the command first, then those of its sections.
     options = sorted(options_of(cls), key=lambda option: "." in option.key)
     choices = choices_of(cls, conf)
     paths = next((option for option in options if option.key == "paths"), None)
     word = f" {paths.metavar or 'PATH'}…" if paths else ""
-    lines = [f"usage: gsencoder {name}{word} [key=value …]", "", *textwrap.wrap(meaning, width)]
+    lines = [f"usage: gsencoder {name}{word} [key=value …]", "", *textwrap.wrap(summary, width)]
     if paths:
         lines += ["", "paths:", *_entry(paths.metavar or "PATH", paths.help, width)]
     if choices.groups:

@@ -1,7 +1,8 @@
-"""Many runs from one command line (`-m`): Hydra's multirun, its sweepers and launchers.
+"""Several runs from one command line (`-m`), by Hydra's multirun, sweepers and launchers.
 
-Values follow Hydra's grammar here (`voxel=0.01,0.02`, `teacher=labels,palette`), but for text, which stays text
-unless it has the form `query=choice(mug,banana)`. Run k writes to OUT/k; Hydra leaves its `multirun.yaml` in OUT.
+Values follow Hydra's grammar here (`voxel=0.01,0.02`, `teacher=labels,palette`), except for text, which is taken
+literally unless it has the form `query=choice(mug,banana)`. Run k writes to OUT/k; Hydra leaves its `multirun.yaml` in
+OUT.
 """
 
 import sys
@@ -30,12 +31,12 @@ from gsencoder.app.settings.config import CommonConfig, typed
 from gsencoder.app.settings.options import join_list
 from gsencoder.core.errors import InputError
 
-# A launcher that runs jobs in other processes imports this module there, and only then resolves the settings.
+# A launcher that runs jobs in other processes imports this module there before it resolves the settings.
 OmegaConf.register_new_resolver("text", unseal, replace=True)
 
 
 def _job(composed: Any, *, cls: type[CommonConfig], run: Callable[[Any], int], swept: Sequence[str]) -> int:
-    """One run, with a folder of its own; the exit code, so that a failed run does not stop the others."""
+    """Runs one job in its folder and returns the exit code, so that a failed run does not stop the others."""
     from hydra.core.hydra_config import HydraConfig
 
     job = HydraConfig.get()
@@ -46,8 +47,8 @@ def _job(composed: Any, *, cls: type[CommonConfig], run: Callable[[Any], int], s
         return 2
     assert config.out is not None
     if not config.quiet:
-        told = [text for text in job.overrides.task if text.partition("=")[0] in swept]
-        print(one_line(f"run {job.job.num}: {' '.join(told)}"), file=sys.stderr)
+        values = [text for text in job.overrides.task if text.partition("=")[0] in swept]
+        print(one_line(f"run {job.job.num}: {' '.join(values)}"), file=sys.stderr)
     return run(replace(config, out=config.out / str(job.job.num)))
 
 
@@ -58,10 +59,10 @@ def run_many(
     run: Callable[[Any], int],
     conf: Path | None = None,
 ) -> int:
-    """Runs `run(settings)` for every combination of the values given; the largest exit code.
+    """Calls `run(settings)` for every combination of the values given and returns the largest exit code.
 
     Raises:
-        InputError: the words are no settings of this command, or there is no folder to write the runs to.
+        InputError: the words are not settings of this command, or out= is missing.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -71,7 +72,7 @@ def run_many(
     if paths:
         given["paths"] = join_list(paths)
     _check_out(command, given, choices)
-    own = {
+    hydra_settings = {
         "hydra.mode": "MULTIRUN",
         "hydra.output_subdir": "null",
         "hydra.sweep.dir": seal(given["out"]),
@@ -79,9 +80,9 @@ def run_many(
         "hydra/job_logging": "none",
         "hydra/hydra_logging": "none",
     }
-    asked = overrides(given, choices, sweep=True)
-    written = [f"{key}={value}" for key, value in own.items() if key not in given] + asked
-    parsed = OverridesParser.create().parse_overrides(asked)
+    requested = overrides(given, choices, sweep=True)
+    written = [f"{key}={value}" for key, value in hydra_settings.items() if key not in given] + requested
+    parsed = OverridesParser.create().parse_overrides(requested)
     swept = tuple(override.get_key_element() for override in parsed if override.is_sweep_override())
     job = partial(_job, cls=cls, run=run, swept=swept)
     with open_hydra(command, cls, conf) as hydra:

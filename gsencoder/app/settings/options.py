@@ -1,4 +1,4 @@
-"""What the options of a command are: their names, types, defaults and meanings, read off its settings class."""
+"""The options of a command: names, types, defaults and help texts, from its settings class."""
 
 import difflib
 import types
@@ -15,17 +15,17 @@ Kind = Literal["text", "list", "value"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
-    """One setting of a command, as the dataclasses declare it.
+    """An option of a command, as declared by a dataclass.
 
     Attributes:
-        key: its full dotted name.
+        key: its full name, with dots between sections.
         annotation: its type.
-        default: its value where nobody says otherwise.
-        help: its meaning, in one line.
-        metavar: what stands for its value in the help.
+        default: its default.
+        help: its meaning, one line.
+        metavar: placeholder of its value in the help.
         required: whether the command can run without it.
-        member: the member of a choice that it belongs to, such as "teacher=onnx"; empty where it always applies.
-        kind: "text" and "list" (of text) take the user's characters as they are; "value" is parsed.
+        member: the member of a choice that it belongs to, such as "teacher=onnx"; empty if it always applies.
+        kind: "text" and "list" (of text) are taken literally; "value" is parsed.
         secret: its value is never shown or written.
     """
 
@@ -40,18 +40,19 @@ class Option:
     secret: bool = False
 
 
-LONGEST_WORD = 200
-"""Characters of a word of the command line that an error repeats."""
+MAX_WORD = 200
+"""Number of characters of a word of the command line that an error repeats."""
 
 
 def without_value(word: str) -> str:
-    """A word that is no option, for an error: what follows its = may be a secret whose option is misspelt."""
+    """A word that is not an option, for an error message, without its value, which may be a misspelled option's
+    secret."""
     key, equals, _ = word.partition("=")
-    return key[:LONGEST_WORD] + ("=…" if equals else "")
+    return key[:MAX_WORD] + ("=…" if equals else "")
 
 
 def near(word: str, known: Iterable[str]) -> str:
-    """`; did you mean …?` where the last part of some known name is close to that of `word`, else nothing."""
+    """`; did you mean …?` if the last component of a known name is close to that of `word`, else nothing."""
 
     def distance(name: str) -> float:
         return -difflib.SequenceMatcher(None, word.rpartition(".")[2], name.rpartition(".")[2]).ratio()
@@ -62,7 +63,7 @@ def near(word: str, known: Iterable[str]) -> str:
 
 
 def union_members(annotation: Any) -> tuple[Any, ...]:
-    """The types that a value may have, None left out."""
+    """The types of a union except None, or the one type."""
     if get_origin(annotation) in (Union, types.UnionType):
         return tuple(member for member in get_args(annotation) if member is not type(None))
     return (annotation,)
@@ -81,7 +82,7 @@ def _is_word(annotation: Any) -> bool:
 
 
 def kind_of(annotation: Any) -> Kind:
-    """Whether an option's characters are the user's own ("text", "list") or Hydra's to parse ("value")."""
+    """Whether the value of an option is taken literally ("text", "list") or parsed by Hydra ("value")."""
     members = union_members(annotation)
     if all(_is_text(member) for member in members):
         return "text"
@@ -93,13 +94,13 @@ def kind_of(annotation: Any) -> Kind:
 
 
 def is_list_of_words(annotation: Any) -> bool:
-    """Whether an option is a list of words from a closed set, which hold no brackets, commas or blanks."""
+    """Whether an option is a list of words from a closed set, without brackets, commas or blanks."""
     items = get_args(annotation)
     return get_origin(annotation) is tuple and len(items) == 2 and items[1] is Ellipsis and _is_word(items[0])
 
 
 def describe(annotation: Any) -> str:
-    """A type in words, for error messages."""
+    """Describes a type for error messages."""
     names = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path"}
     members = union_members(annotation)
     words = []
@@ -119,9 +120,9 @@ def describe(annotation: Any) -> str:
 
 
 def split_list(text: str) -> tuple[str, ...]:
-    """The items of a list of text: commas separate, `\\,` is a comma, and a backslash elsewhere is itself.
+    """Splits a list of text: commas separate items, `\\,` is a comma, and a backslash elsewhere is literal.
 
-    Before a comma backslashes pair up (`\\\\,` is one backslash, then a separator), so every list can be written.
+    Before a comma, two backslashes are one (`\\\\,` is a backslash and a separator), so that every list can be written.
     Blanks belong to the items; the empty text is the empty list.
     """
     items, current, index = [], "", 0
@@ -143,7 +144,7 @@ def split_list(text: str) -> tuple[str, ...]:
 
 
 def join_list(items: Iterable[str]) -> str:
-    """The text that `split_list` reads as these items (a single empty item cannot be written)."""
+    """The text that `split_list` splits into these items (a single empty item cannot be written)."""
     written = []
     for number, item in enumerate(items := tuple(items)):
         pieces = item.split(",")
@@ -162,12 +163,12 @@ def field_types(cls: type) -> dict[str, Any]:
 
 
 def section_classes(annotation: Any) -> tuple[type, ...]:
-    """The dataclasses that a section's value may have; empty for a plain option."""
+    """The dataclasses of a section; empty for a plain option."""
     return tuple(member for member in union_members(annotation) if is_dataclass(member) and isinstance(member, type))
 
 
 def member_name(member: type) -> str:
-    """What a member of a choice is called: the literal of its field `name`."""
+    """The name of a member of a choice: the literal of its field `name`."""
     return str(get_args(field_types(member)["name"])[0])
 
 
@@ -179,7 +180,7 @@ def _default(item: Any) -> Any:
 
 def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
     """Every option of a settings class, sections included, in order of declaration."""
-    found = []
+    options: list[Option] = []
     annotations = field_types(cls)
     for item in fields(cls):
         key, annotation = prefix + item.name, annotations[item.name]
@@ -187,9 +188,9 @@ def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
         if classes:
             for section in classes:
                 owner = f"{key.replace('.', '/')}={member_name(section)}" if len(classes) > 1 else member
-                found += options_of(section, key + ".", owner)
+                options += options_of(section, key + ".", owner)
         elif not (item.name == "name" and get_origin(annotation) is Literal and len(get_args(annotation)) == 1):
-            found.append(
+            options.append(
                 Option(
                     key=key,
                     annotation=annotation,
@@ -202,15 +203,15 @@ def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
                     secret=item.metadata.get("secret", False),
                 )
             )
-    return found
+    return options
 
 
 def options_by_key(cls: type, prefix: str = "") -> dict[str, Option]:
-    """The options of a class by full key; where members of a choice share a key, the first one's."""
-    found: dict[str, Option] = {}
+    """The options of a class by full key; where members of a choice share a key, the option of the first."""
+    options: dict[str, Option] = {}
     for option in options_of(cls, prefix):
-        found.setdefault(option.key, option)
-    return found
+        options.setdefault(option.key, option)
+    return options
 
 
 def wrong_value(option: Option, value: Any) -> str:
@@ -225,10 +226,10 @@ def wrong_value(option: Option, value: Any) -> str:
 
 
 def _words(annotation: Any) -> tuple[Any, ...]:
-    found: tuple[Any, ...] = ()
+    words: tuple[Any, ...] = ()
     for member in union_members(annotation):
         if get_origin(member) is Literal:
-            found += get_args(member)
+            words += get_args(member)
         elif get_origin(member) is tuple:
-            found += tuple(word for item in get_args(member) if item is not Ellipsis for word in _words(item))
+            words += tuple(word for item in get_args(member) if item is not Ellipsis for word in _words(item))
     return found
