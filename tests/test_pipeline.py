@@ -52,7 +52,7 @@ def test_the_demo_finds_what_was_seen_and_shows_it_in_one_page(demo: Path) -> No
     assert results["colors"]["mean_iou"] > 0.4
     page = (demo / results["report"]).read_text()
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
-    for heading in ("What went in", "Gaussians", "Features", "Where is each object?", "Where the time went"):
+    for heading in ("Input", "Gaussians", "Features", "Where is each object?", "Seconds of each step"):
         assert f"<h2>{heading}</h2>" in page
     # Four views as pictures, renders, depths and two fields; a picture a word; two color bars.
     assert page.count("<img") == 5 * 4 + 2 * 6 + 2

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gsencoder.app.runs.work_folder import WORK_MARK, WorkFolder
+from gsencoder.app.runs.work_folder import MARKER_FILE, WorkFolder
 from gsencoder.core.errors import InputError
 
 
@@ -37,10 +37,10 @@ def contents(path: Path) -> list[str]:
 def test_state_is_kept_when_a_run_is_cut_off_and_goes_when_it_ends(tmp_path: Path) -> None:
     path = tmp_path / "run.training"
     cut_off(path, "state")
-    assert contents(path) == ["state", WORK_MARK]
+    assert contents(path) == ["state", MARKER_FILE]
     with WorkFolder(path) as work:
         work.take(anew=False)
-        assert contents(path) == ["state", WORK_MARK]
+        assert contents(path) == ["state", MARKER_FILE]
     assert not path.exists()
 
 
@@ -50,14 +50,14 @@ def test_a_run_that_begins_anew_forgets_what_there_was(tmp_path: Path) -> None:
     (tmp_path / "run" / "folder" / "deep").touch()
     with WorkFolder(tmp_path / "run") as work:
         work.take(anew=True)
-        assert contents(tmp_path / "run") == [WORK_MARK]
+        assert contents(tmp_path / "run") == [MARKER_FILE]
 
 
 def test_a_folder_that_was_not_taken_is_left_alone(tmp_path: Path) -> None:
     cut_off(tmp_path / "run", "state")
     with WorkFolder(tmp_path / "run"):
         pass
-    assert contents(tmp_path / "run") == ["state", WORK_MARK]
+    assert contents(tmp_path / "run") == ["state", MARKER_FILE]
 
 
 @pytest.mark.parametrize("anew", [True, False])
@@ -67,7 +67,7 @@ def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path, *, 
         work.take(anew=anew)
     assert (tmp_path / "notes.txt").is_file()
     with (
-        pytest.raises(InputError, match="cannot keep the state of this run here.*give another out="),
+        pytest.raises(InputError, match="cannot save the state of this run here.*give another out="),
         WorkFolder(tmp_path / "notes.txt") as work,
     ):
         work.take(anew=anew)
@@ -77,7 +77,7 @@ def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path, *, 
 def test_a_run_that_was_killed_in_its_first_moments_does_not_block_the_next(tmp_path: Path, *, anew: bool) -> None:
     path = tmp_path / "run"
     path.mkdir()
-    (path / f".{WORK_MARK}.0123456789ab.tmp").touch()
+    (path / f".{MARKER_FILE}.0123456789ab.tmp").touch()
     with WorkFolder(path) as work:
         work.take(anew=anew)
     assert not path.exists()
@@ -98,7 +98,7 @@ def test_a_kill_while_the_folder_is_removed_leaves_one_that_is_known(
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         run(path, lambda _: patched.setattr(Path, "unlink", killed))
-    assert WORK_MARK in contents(path)
+    assert MARKER_FILE in contents(path)
     run(path, anew=True)
     assert not path.exists()
 
@@ -108,9 +108,9 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path, *, anew: bool) -> None:
     with WorkFolder(tmp_path / "run") as first:
         first.take(anew=False)
         (first.path / "state").touch()
-        with pytest.raises(InputError, match="another run keeps its state here now"), WorkFolder(first.path) as second:
+        with pytest.raises(InputError, match="another run saves its state here now"), WorkFolder(first.path) as second:
             second.take(anew=anew)
-        assert contents(first.path) == ["state", WORK_MARK]
+        assert contents(first.path) == ["state", MARKER_FILE]
     with WorkFolder(tmp_path / "run") as third:
         third.take(anew=False)
 
@@ -119,7 +119,7 @@ def test_behind_a_link_the_folder_itself_is_emptied(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "run").symlink_to(tmp_path / "elsewhere")
     cut_off(tmp_path / "run", "state")
-    assert cut_off(tmp_path / "run", anew=True) == [WORK_MARK]
+    assert cut_off(tmp_path / "run", anew=True) == [MARKER_FILE]
 
 
 @pytest.mark.parametrize("anew", [True, False])
@@ -129,7 +129,7 @@ def test_what_cannot_be_removed_is_said(tmp_path: Path, monkeypatch: pytest.Monk
     def refused(self: Path, **_: object) -> None:
         raise PermissionError(1, "Operation not permitted", str(self))
 
-    told = "cannot keep the state of this run here" if anew else "results are in place.*remove it"
+    told = "cannot save the state of this run here" if anew else "results are written.*remove it"
     monkeypatch.setattr(Path, "unlink", refused)
     with pytest.raises(InputError, match=told):
         run(tmp_path / "run", anew=anew)

@@ -1,4 +1,4 @@
-"""The commands, one small file each. Nothing is imported before it is asked for, so that `--help` is quick."""
+"""The table of commands. A command's module is imported when it is used, so that `--help` is quick."""
 
 import importlib
 from collections.abc import Callable
@@ -10,12 +10,12 @@ from gsencoder.app.settings.config import CommonConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """One entry of the command line.
+    """A command of the command line.
 
     Attributes:
-        name: what the user types; `gsencoder.app.commands.NAME` is its module.
+        name: as the user types it; `gsencoder.app.commands.NAME` is its module.
         config: the name of the settings class in that module.
-        help: what it does, in one line.
+        help: its purpose, one line.
     """
 
     name: str
@@ -32,20 +32,42 @@ COMMANDS = {
     command.name: command
     for command in (
         Command(
-            name="demo", config="DemoConfig", help="the whole pipeline on a built-in scene, offline, in one report"
+            name="demo", config="DemoConfig", help="run the pipeline on a built-in scene, offline, and write a report"
         ),
-        Command(name="reconstruct", config="ReconstructCommandConfig", help="photographs to Gaussians, posed or not"),
-        Command(name="fuse", config="FuseCommandConfig", help="per-Gaussian features from a teacher's maps"),
+        Command(
+            name="reconstruct",
+            config="ReconstructCommandConfig",
+            help="make a splat from photographs, with or without poses",
+        ),
+        Command(
+            name="fuse", config="FuseCommandConfig", help="lift a teacher's feature maps onto the Gaussians of a scene"
+        ),
         Command(name="train", config="TrainCommandConfig", help="distil a teacher into an encoder of splats"),
-        Command(name="encode", config="EncodeCommandConfig", help="per-Gaussian features of a splat in one pass"),
-        Command(name="pack", config="PackConfig", help="features in a few bytes a Gaussian, or for other programs"),
-        Command(name="export", config="ExportConfig", help="an encoder as one ONNX file that takes raw Gaussians"),
-        Command(name="localize", config="LocalizeCommandConfig", help="boxes, scores and pictures for words"),
-        Command(name="views", config="ViewsCommandConfig", help="the views that show best what a word found"),
-        Command(name="ask", config="AskCommandConfig", help="a vision-language model's answer from such views"),
-        Command(name="evaluate", config="EvaluateConfig", help="a paper's metric on labeled scenes"),
-        Command(name="tradeoff", config="TradeoffConfig", help="what each accuracy knob costs and gives, measured"),
-        Command(name="inspect", config="InspectConfig", help="what is in a splat file, and what is wrong with it"),
-        Command(name="repair", config="RepairConfig", help="mend a splat file, and say what was changed"),
+        Command(
+            name="encode", config="EncodeCommandConfig", help="compute features of a splat with an encoder, in one pass"
+        ),
+        Command(
+            name="pack", config="PackConfig", help="store features in a few bytes a Gaussian, or for other programs"
+        ),
+        Command(
+            name="export", config="ExportConfig", help="export an encoder as one ONNX file that takes raw Gaussians"
+        ),
+        Command(
+            name="localize", config="LocalizeCommandConfig", help="find words in a scene: boxes, scores and pictures"
+        ),
+        Command(
+            name="views",
+            config="ViewsCommandConfig",
+            help="choose and render the views that show best what a word stands for",
+        ),
+        Command(name="ask", config="AskCommandConfig", help="ask a vision-language model about such views"),
+        Command(name="evaluate", config="EvaluateConfig", help="compute metrics on labeled scenes"),
+        Command(
+            name="tradeoff",
+            config="TradeoffConfig",
+            help="measure the seconds and the accuracy of each setting of fusion",
+        ),
+        Command(name="inspect", config="InspectConfig", help="show the contents and the defects of a splat file"),
+        Command(name="repair", config="RepairConfig", help="repair the defects of a splat file and report the changes"),
     )
 }

@@ -1,11 +1,11 @@
-"""`gsencoder ask FEATURES question=…`: a VLM's answer from the views that show best what the question is about."""
+"""`gsencoder ask FEATURES question=…`: the answer of a VLM that sees the best views of what the question names."""
 
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import words_of
+from gsencoder.app.commands.query_words import load_words
 from gsencoder.app.commands.views import shown_scene
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import printable
@@ -32,29 +32,33 @@ class AskCommandConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "a folder that fuse, encode or pack made", "metavar": "FEATURES", "required": True},
+        metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
     )
-    question: str = field(default="", metadata={"help": "what to ask"})
+    question: str = field(default="", metadata={"help": "the question"})
     questions: str = field(
-        default="", metadata={"help": "a file of many: JSON lines with question and, if need be, id, task, query, aabb"}
+        default="",
+        metadata={"help": "a file of questions: JSON lines with question and, optionally, id, task, query, aabb"},
     )
     task: Task = field(
         default="answer",
-        metadata={"help": "answer a question, ground (say which of the marked things is meant), or caption one thing"},
+        metadata={"help": "answer a question, ground (say which of the marked objects is meant), or caption an object"},
     )
     query: tuple[str, ...] = field(
-        default=(), metadata={"help": "words to look for; empty = those of the table that the question holds"}
+        default=(),
+        metadata={"help": "words to localize; empty = the names of the text table that the question contains"},
     )
     aabb: tuple[float, ...] = field(
-        default=(), metadata={"help": "a box to look at in place of words: lower and upper corner in world coordinates"}
+        default=(), metadata={"help": "a box to show instead of words: lower and upper corner in world coordinates"}
     )
-    words: str = field(default="", metadata={"help": "text table; empty = the one beside the features"})
-    space: str = field(default="", metadata={"help": "which features, where the folder holds several"})
+    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
+    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
     photos: str = field(
-        default="", metadata={"help": "the scene that was fused: frames are shown as its photographs, not as renders"}
+        default="", metadata={"help": "the scene that was fused; its photographs are shown instead of renders"}
     )
-    dry_run: bool = field(default=False, metadata={"help": "write the prompt and the pictures, and ask nobody"})
-    resume: bool = field(default=True, metadata={"help": "keep the answers of a run that was cut off"})
+    dry_run: bool = field(default=False, metadata={"help": "write the prompt and the pictures without sending them"})
+    resume: bool = field(
+        default=True, metadata={"help": "continue an interrupted batch; false = ask every question again"}
+    )
     ask: AskConfig = field(default_factory=AskConfig)
     vlm: VlmConfig = field(default_factory=VlmConfig)
     choose: ViewsConfig = field(default_factory=ViewsConfig)
@@ -65,17 +69,17 @@ class AskCommandConfig(CommonConfig):
         if len(self.paths) > 1:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
         if self.questions and (self.question or self.query or self.aabb):
-            raise InputError("questions: the file says what is asked; leave out question=, query= and aabb=")
+            raise InputError("questions: the file contains the questions; leave out question=, query= and aabb=")
         if not self.questions:
-            self.asked()
+            self.single_question()
 
-    def asked(self) -> Question:
-        """The one question of the command line."""
+    def single_question(self) -> Question:
+        """The question on the command line."""
         return Question(text=self.question, task=self.task, query=self.query, aabb=self.aabb)
 
 
 def run(config: AskCommandConfig, summary: Summary) -> None:
-    """Finds what the question is about, chooses and renders views, asks, and writes all of it."""
+    """Localizes the words of the question, chooses and renders views, asks the VLM, and writes everything."""
     folder = Path(config.paths[0])
     server = None if config.dry_run else VlmServer(config.vlm)
     request_body([], config.vlm, named=server is not None)
@@ -84,7 +88,7 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         check_question(config.task, config.question)
     with summary.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
-        table = words_of(folder, config.words) if config.words or (folder / WORDS_FILE).is_file() else None
+        table = load_words(folder, config.words) if config.words or (folder / WORDS_FILE).is_file() else None
     asker = Asker(
         scene,
         table,
@@ -100,7 +104,7 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         return
     clock = Clock()
     with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
-        row = ask_question(config.asked(), asker, server, target, clock)
+        row = ask_question(config.single_question(), asker, server, target, clock)
         summary.add_seconds(clock.seconds)
         summary.results.update(row)
     screen = console(config.quiet)
@@ -117,7 +121,7 @@ def ask_file(
     config: AskCommandConfig,
     summary: Summary,
 ) -> None:
-    """Asks the questions of a file; the answers of a run that is interrupted stay in a folder beside out=."""
+    """Asks the questions of a file; the answers of an interrupted run stay in a folder beside out=."""
     target, clock = Path(os.path.realpath(out)), Clock()
     given = settings(config)
     made_from = {name: given[name] for name in ("space", "photos", "data")}

@@ -1,4 +1,4 @@
-"""`gsencoder demo`: the whole pipeline on a built-in scene, offline, ending in one HTML report with pictures."""
+"""`gsencoder demo`: the pipeline on a built-in scene, offline, with an HTML report."""
 
 import time
 from dataclasses import dataclass, field, replace
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.app.commands.demo_report import Asked, write_report
+from gsencoder.app.commands.demo_report import TeacherResult, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
@@ -34,22 +34,24 @@ from gsencoder.types import Scene, SceneObject
 class DemoConfig(CommonConfig):
     """Settings of `demo`."""
 
-    seed: int = field(default=0, metadata={"help": "which room is made"})
-    objects: int = field(default=8, metadata={"help": "named objects in it"})
-    views: int = field(default=16, metadata={"help": "pictures taken of it"})
-    width: int = field(default=320, metadata={"help": "of the pictures, pixels; the height is three quarters of it"})
+    seed: int = field(default=0, metadata={"help": "seed of the random room"})
+    objects: int = field(default=8, metadata={"help": "number of named objects"})
+    views: int = field(default=16, metadata={"help": "number of views"})
+    width: int = field(
+        default=320, metadata={"help": "width of the views in pixels; the height is three quarters of it"}
+    )
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
     def __post_init__(self) -> None:
-        for name, least in (("seed", 0), ("objects", 1), ("views", 1), ("width", 16)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        for name, minimum in (("seed", 0), ("objects", 1), ("views", 1), ("width", 16)):
+            if getattr(self, name) < minimum:
+                raise InputError(f"{name}: expected {minimum} or more, got {getattr(self, name)}")
 
 
 def run(config: DemoConfig, summary: Summary) -> None:
-    """Makes a room, reads it back, seeds, fuses two teachers, finds words, and reports it all in OUT/report.html."""
+    """Makes a room, reads it back, seeds Gaussians, fuses two teachers, localizes words, and writes OUT/report.html."""
     out = config.out or Path("outputs") / "demo"
     screen = console(config.quiet)
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
@@ -68,28 +70,28 @@ def run(config: DemoConfig, summary: Summary) -> None:
         hues = color_words(config.seed, objects=config.objects)
         by_name = [(thing.name, thing) for thing in named if thing.name]
         by_color = [(hues[thing.id], thing) for thing in named]
-        asked = (
+        results = (
             search(scene, labels, names, by_name, config, folder / "names", summary),
             search(scene, palette, colors, unrepeated(by_color), config, folder / "colors", summary),
         )
-        for one in asked:
+        for one in results:
             screen.print(
                 f"{one.title}: features of {one.features.features.shape[1]} of {one.features.space.channels} channels; "
-                f"{one.found_count} of {len(one.words)} words found (IoU ≥ 0.5), mean IoU {one.mean_iou:.2f}"
+                f"{one.num_localized} of {len(one.words)} words localized (IoU ≥ 0.5), mean IoU {one.mean_iou:.2f}"
             )
         summary.results.update(
             gaussians=len(scene.gaussians),
             views=config.views,
             report="report.html",
-            **{one.title: one.to_dict() for one in asked},
+            **{one.title: one.to_dict() for one in results},
         )
         with summary.step("report"):
-            write_report(folder / "report.html", scene, asked, summary)
-    screen.print(f"{out}/report.html shows it all; {out}/room is a scene folder to try the other commands on")
+            write_report(folder / "report.html", scene, results, summary)
+    screen.print(f"{out}/report.html is the report; {out}/room is a scene folder for the other commands")
 
 
 def photographed_room(config: DemoConfig, folder: Path, summary: Summary) -> Scene:
-    """Makes a room and writes it as a capture would be, then reads that: nothing but files reaches what follows."""
+    """Makes a room, writes it as files like those of a capture, and reads these."""
     with summary.step("make the scene"):
         height = config.width * 3 // 4
         room = make_room(config.seed, objects=config.objects, views=config.views, width=config.width, height=height)
@@ -99,13 +101,13 @@ def photographed_room(config: DemoConfig, folder: Path, summary: Summary) -> Sce
 
 
 def room_words(scene: Scene) -> TextTable:
-    """One unit vector a name: a vocabulary in which no two words are alike, as small as the scene needs."""
+    """A text table with an orthogonal unit vector for each name in the scene."""
     names = sorted({thing.name for thing in scene.objects if thing.name})
     return make_text_table(names, np.eye(len(names), dtype=np.float32), "demo-words")
 
 
 def unrepeated(pairs: list[tuple[str, SceneObject]]) -> list[tuple[str, SceneObject]]:
-    """The pairs whose word stands for one object only."""
+    """The pairs whose word stands for one object alone."""
     words = [word for word, _ in pairs]
     return [(word, thing) for word, thing in pairs if words.count(word) == 1]
 
@@ -118,8 +120,8 @@ def search(
     config: DemoConfig,
     folder: Path,
     summary: Summary,
-) -> Asked:
-    """Fuses a teacher, stores the features, reads them back, asks for words, and holds boxes against the truth."""
+) -> TeacherResult:
+    """Fuses a teacher, stores the features, reads them back, localizes words, and compares boxes with the true ones."""
     title = folder.name
     fusion = fuse(scene, teacher, config.fusion, track=Progress(quiet=config.quiet))
     summary.timings[f"fuse {title}"] = sum(fusion.seconds.values())
@@ -131,12 +133,14 @@ def search(
         save_text_table(folder / WORDS_FILE, words)
         stored = load_features(folder)
     start = time.perf_counter()
-    found = localize(stored, [word for word, _ in pairs], words, config.localize)
+    localization = localize(stored, [word for word, _ in pairs], words, config.localize)
     summary.timings[f"localize {title}"] = time.perf_counter() - start
-    write_json(folder / "boxes.json", localization_to_json(found))
-    write_boxes_ply(folder / "boxes.ply", stored, found)
+    write_json(folder / "boxes.json", localization_to_json(localization))
+    write_boxes_ply(folder / "boxes.ply", stored, localization)
     ious = []
     for word, thing in pairs:
-        box = next((box for box in found.boxes if box.query == word), None)
+        box = next((box for box in localization.boxes if box.query == word), None)
         ious.append(aabb_iou(box.aabb_min, box.aabb_max, thing.aabb_min, thing.aabb_max) if box is not None else 0.0)
-    return Asked(title=title, words=tuple(word for word, _ in pairs), ious=tuple(ious), fusion=fusion, found=found)
+    return TeacherResult(
+        title=title, words=tuple(word for word, _ in pairs), ious=tuple(ious), fusion=fusion, localization=localization
+    )

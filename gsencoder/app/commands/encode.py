@@ -1,4 +1,4 @@
-"""`gsencoder encode SPLAT weights=FILE`: features on every Gaussian in one pass, without photographs or teacher."""
+"""`gsencoder encode SPLAT weights=FILE`: features of every Gaussian in one pass, without photographs or a teacher."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +30,7 @@ class EncodeCommandConfig(CommonConfig):
     )
     weights: str = field(
         default="house_cpu",
-        metadata={"help": "what `train` or `export` wrote, or a name that comes with gsencoder"},
+        metadata={"help": "folder or file written by `train` or `export`, or the name of shipped weights"},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -39,7 +39,7 @@ class EncodeCommandConfig(CommonConfig):
 
 
 def run(config: EncodeCommandConfig, summary: Summary) -> None:
-    """Encodes one scene into out=, or each of several into a folder of its name below out=."""
+    """Encodes one scene into out=, or each of several into the folder OUT/NAME."""
     retain_freed_memory()
     paths = find_scenes(config.paths)
     check_names(paths)

@@ -47,7 +47,10 @@ class EvaluateConfig(CommonConfig):
         metadata={"help": "labeled scenes, or folders of scenes", "metavar": "SCENE", "required": True},
     )
     weights: str = field(
-        default="", metadata={"help": "encoder whose features are judged (see encode); empty = the teacher's, fused"}
+        default="",
+        metadata={
+            "help": "encoder whose features are evaluated (see encode); empty = the fused features of the teacher"
+        },
     )
     protocol: LocalizationProtocol | NamingProtocol = field(default_factory=LocalizationProtocol)
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
@@ -60,11 +63,11 @@ class EvaluateConfig(CommonConfig):
 
 
 def run(config: EvaluateConfig, summary: Summary) -> None:
-    """Evaluates, prints the scores, and writes them with their details beside them."""
+    """Evaluates, prints the scores, and writes them with one row for each object or name."""
     words = text_table_of(config.teacher)
     if words is None:
         raise InputError(
-            f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words="
+            f"evaluate: there is no text table for the space of teacher {config.teacher.name}; give teacher.words="
         )
     if config.weights:
         retain_freed_memory()
@@ -120,15 +123,15 @@ def _naming(
     each = []
     for scene in scenes:
         counted = {name: count for name, count in scene.total.items() if name in scores["names"]}
-        own = naming_scores([replace(scene, total=counted)]) if counted else {}
-        each.append({"scene": scene.scene, "gaussians": sum(scene.total.values()), **own})
+        scene_scores = naming_scores([replace(scene, total=counted)]) if counted else {}
+        each.append({"scene": scene.scene, "gaussians": sum(scene.total.values()), **scene_scores})
     summary.results.update(protocol="naming", **scores, names_table="names.csv", scenes=each)
     rows = [{"name": name, **row} for name, row in scores["names"].items()]
     write_bytes(folder / "names.csv", csv_text(rows).encode())
 
 
 def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
-    """Puts scores, scenes and seconds into the summary."""
+    """Adds scores, scenes and seconds to the summary."""
     hits = [hit for outcome in outcomes for hit in outcome.hits]
     for outcome in outcomes:
         summary.add_seconds(outcome.seconds)
@@ -169,7 +172,7 @@ def scores_line(results: dict) -> str:
 
 
 def names_table(results: dict) -> Table:
-    """The names that were found worst."""
+    """A table of the names with the lowest scores."""
     naming = results["protocol"] == "naming"
     names = results["names"]
     table = Table(title="hardest names" if len(names) > SHOWN_NAMES else "names", title_justify="left")

@@ -36,18 +36,18 @@ class ExportConfig(CommonConfig):
     paths: tuple[str, ...] = field(
         default=(),
         metadata={
-            "help": "splats or scenes to compare on, in addition to random clouds",
+            "help": "splats or scenes for the comparison, in addition to random clouds",
             "metavar": "SPLAT",
         },
     )
     weights: str = field(
         default="house_cpu",
-        metadata={"help": "what `train` wrote: its folder or file, or a name that comes with gsencoder"},
+        metadata={"help": "folder or file written by `train`, or the name of shipped weights"},
     )
     out: Path | None = field(
         default=None,
         metadata={
-            "help": "the .onnx file to write; FILE.summary.json beside it says how well it agrees",
+            "help": "the .onnx file; FILE.summary.json beside it holds the differences from torch",
             "metavar": "FILE",
             "required": True,
         },
@@ -60,7 +60,8 @@ class ExportConfig(CommonConfig):
         },
     )
     sizes: tuple[int, ...] = field(
-        default=(1, 2, 31, 1000, 20000), metadata={"help": "Gaussians of the random clouds to compare on"}
+        default=(1, 2, 31, 1000, 20000),
+        metadata={"help": "numbers of Gaussians of the random clouds for the comparison"},
     )
     tolerance: float = field(
         default=TOLERANCE,
@@ -87,7 +88,7 @@ class ExportConfig(CommonConfig):
 
 
 def run(config: ExportConfig, summary: Summary) -> None:
-    """Exports, compares, and writes only what agrees."""
+    """Exports, compares with torch, and writes the file if it agrees."""
     assert config.out is not None
     if config.out.suffix.lower() != SUFFIX:
         raise InputError(f"out: expected a file that ends in {SUFFIX}, got {config.out.name}")
@@ -104,7 +105,7 @@ def run(config: ExportConfig, summary: Summary) -> None:
         exact = model = export_onnx(encoder, lowered)
     with summary.step("compare"):
         parity = check_parity(exact, encoder, [*clouds, *scenes], tolerance=config.tolerance, track=track)
-    told = f"within {max(parity.values()):.1g} of torch's largest output"
+    agreement = f"within {max(parity.values()):.1g} of torch's largest output"
     cosines: dict[str, float] = {}
     if config.precision != "float32":
         with summary.step("convert"):
@@ -113,7 +114,7 @@ def run(config: ExportConfig, summary: Summary) -> None:
             model = export_onnx(encoder, lowered, config.precision)
         with summary.step("judge"):
             cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=track)
-        told = (
+        agreement = (
             f"{config.precision}, {len(model) / len(exact):.2f} of float32's size, mean centered cosine to it "
             f"{min(cosines.values()):.4f} or more"
         )
@@ -136,13 +137,13 @@ def run(config: ExportConfig, summary: Summary) -> None:
     )
     write_json(f"{config.out}.summary.json", summary.to_dict())
     screen.print(
-        f"{config.out}: {len(model) / 1e6:.1f} MB; {told} on {len(compared)} clouds of {min(compared):,} to "
+        f"{config.out}: {len(model) / 1e6:.1f} MB; {agreement} on {len(compared)} clouds of {min(compared):,} to "
         f"{max(compared):,} Gaussians"
     )
 
 
 def _scenes(config: ExportConfig, voxel: float) -> list[Cloud]:
-    """The user's own clouds."""
+    """The splats that the user gave, for the comparison."""
     clouds = []
     for path in find_scenes(config.paths) if config.paths else ():
         scene = load_scene(path, splat=config.splat or None, options=config.data)

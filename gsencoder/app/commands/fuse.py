@@ -31,7 +31,7 @@ class FuseCommandConfig(CommonConfig):
         metadata={"help": "scenes, or folders of scenes: views, or a bare splat", "metavar": "SCENE", "required": True},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
-    orbits: int = field(default=24, metadata={"help": "cameras put around a splat that has no views"})
+    orbits: int = field(default=24, metadata={"help": "number of cameras placed around a splat without views"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
@@ -42,7 +42,7 @@ class FuseCommandConfig(CommonConfig):
 
 
 def run(config: FuseCommandConfig, summary: Summary) -> None:
-    """Fuses one scene into out=, or each of several into a folder of its name below out=."""
+    """Fuses one scene into out=, or each of several into the folder OUT/NAME."""
     paths = find_scenes(config.paths)
     check_names(paths)
     with summary.step("teacher"):
@@ -67,7 +67,7 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
 
 
 def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Scene:
-    """A scene with Gaussians and views: seeds where it has no splat, orbits where it has no views."""
+    """Loads a scene with Gaussians and views: seeds if it has no splat, orbit cameras if it has no views."""
     with summary.step("load"):
         scene = load_scene(path, splat=config.splat or None, options=config.data)
     if scene.gaussians is None:
@@ -77,7 +77,7 @@ def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Sce
 
 
 def work_folder(out: Path) -> Path:
-    """Where a fusion under way keeps its maps and sums, until `out` is whole."""
+    """The folder for the maps and sums of an unfinished fusion."""
     return out.parent / f".{out.name}.fusing"
 
 
@@ -89,7 +89,7 @@ def fuse_scene(
     summary: Summary,
     out: Path,
 ) -> Fusion:
-    """Fuses, and adds the steps' seconds to the summary."""
+    """Fuses, and adds the seconds of the steps to the summary."""
     built = build_teacher(teacher, scene, words)
     work = None if built.cheap else work_folder(out)
     fusion = fuse(scene, built, config.fusion, work=work, track=Progress(quiet=config.quiet))
@@ -100,7 +100,7 @@ def fuse_scene(
 def write_features(
     folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, config: FuseCommandConfig, summary: Summary
 ) -> None:
-    """Writes features, scene and words, and says in the summary what was chosen and what it cost."""
+    """Writes features, scene and words, and adds the figures of the fusion to the summary."""
     features = fusion.features
     with summary.step("write"):
         chosen = {"teacher": settings(config.teacher), "fusion": settings(config.fusion)}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.app.commands.query_words import asked_words, words_of
+from gsencoder.app.commands.query_words import load_words, query_words
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
@@ -24,13 +24,13 @@ class LocalizeCommandConfig(CommonConfig):
     """Settings of `localize`."""
 
     paths: tuple[str, ...] = field(
-        default=(), metadata={"help": "a folder that fuse or encode made", "metavar": "FEATURES", "required": True}
+        default=(), metadata={"help": "a folder written by fuse or encode", "metavar": "FEATURES", "required": True}
     )
     query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
     queries: str = field(default="", metadata={"help": "a text file with one query a line"})
-    words: str = field(default="", metadata={"help": "text table; empty = the one beside the features"})
-    space: str = field(default="", metadata={"help": "which features, where the folder holds several"})
-    pictures: int = field(default=4, metadata={"help": "views drawn for each word; 0 = no pictures"})
+    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
+    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
+    pictures: int = field(default=4, metadata={"help": "number of views drawn for each word; 0 = none"})
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
     def __post_init__(self) -> None:
@@ -43,31 +43,31 @@ class LocalizeCommandConfig(CommonConfig):
 def run(config: LocalizeCommandConfig, summary: Summary) -> None:
     """Reads features, finds each word, writes boxes as JSON and .ply, and draws them."""
     folder = Path(config.paths[0])
-    words = asked_words(config.query, config.queries)
+    words = query_words(config.query, config.queries)
     with summary.step("load"):
         scene = load_features(folder)
-        table = words_of(folder, config.words)
+        table = load_words(folder, config.words)
     with summary.step("localize"):
-        found = localize(scene, words, table, config.localize, space=config.space or None)
+        localization = localize(scene, words, table, config.localize, space=config.space or None)
     out = config.out or Path("outputs") / scene.name / "boxes"
-    boxes = localization_to_json(found)
-    summary.results.update(boxes=boxes, thresholds=dict(zip(words, found.thresholds.tolist(), strict=True)))
+    boxes = localization_to_json(localization)
+    summary.results.update(boxes=boxes, thresholds=dict(zip(words, localization.thresholds.tolist(), strict=True)))
     summary.results["metres_per_unit"] = scene.metres_per_unit
     with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
         write_json(target / "boxes.json", boxes)
-        write_boxes_ply(target / "boxes.ply", scene, found)
+        write_boxes_ply(target / "boxes.ply", scene, localization)
         if config.pictures and scene.views is not None:
             with summary.step("pictures"):
-                for name, picture in relevancy_pictures(scene, found, per_word=config.pictures):
+                for name, picture in relevancy_pictures(scene, localization, per_word=config.pictures):
                     picture.save(target / f"{name}.png")
     screen = console(config.quiet)
     for word in words:
-        screen.print(f"{word}: {_first_box(found, word)}")
+        screen.print(f"{word}: {_first_box(localization, word)}")
     screen.print(f"{out}: boxes.json, boxes.ply and pictures; boxes are drawn around Gaussian {config.localize.extent}")
 
 
-def _first_box(found: Localization, word: str) -> str:
-    boxes = [box for box in found.boxes if box.query == word]
+def _first_box(localization: Localization, word: str) -> str:
+    boxes = [box for box in localization.boxes if box.query == word]
     if not boxes:
         return "not found"
     best = boxes[0]

@@ -1,4 +1,4 @@
-"""`gsencoder pack FEATURES form=…`: a splat and its features as a small package, or as other programs read them."""
+"""`gsencoder pack FEATURES form=…`: a splat and its features as a small package, or in formats of other programs."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,25 +21,27 @@ class PackConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "a folder that fuse, encode or pack made", "metavar": "FEATURES", "required": True},
+        metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
     )
     form: Form = field(
         default="compact",
         metadata={
-            "help": "compact = a few bytes a Gaussian, for gsencoder; npz, safetensors = arrays; ply = properties "
-            "feature_0 … of the splat"
+            "help": "compact = a few bytes a Gaussian, for gsencoder; npz, safetensors = arrays; ply = a splat "
+            "with the "
+            "properties feature_0 …"
         },
     )
     error: float = field(
         default=0.01,
         metadata={
-            "help": "of form=compact: the mean loss of centered cosine that is allowed, over Gaussians and over kinds"
+            "help": "largest mean loss of centered cosine, over Gaussians and over kinds of features, for form=compact"
         },
     )
     decoded: bool = field(
         default=False,
         metadata={
-            "help": "of the other forms: whole vectors in place of coordinates in a basis; in float16, but for ply"
+            "help": "write complete vectors instead of coordinates in a basis, for the other forms; float16, "
+            "float32 in ply"
         },
     )
 
@@ -49,11 +51,11 @@ class PackConfig(CommonConfig):
         if not 0 < self.error < 1:
             raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
         if self.decoded and self.form == "compact":
-            raise InputError("decoded=true: form=compact holds codes; take form=npz, safetensors or ply")
+            raise InputError("decoded=true: form=compact holds codes; use form=npz, safetensors or ply")
 
 
 def run(config: PackConfig, summary: Summary) -> None:
-    """Reads features, and writes them with their splat into out=."""
+    """Reads features and writes them with their splat into out=."""
     source = Path(config.paths[0])
     with summary.step("load"):
         scene = load_features(source)
@@ -61,13 +63,13 @@ def run(config: PackConfig, summary: Summary) -> None:
     out = config.out or Path("outputs") / scene.name / "package"
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         with summary.step("pack"):
-            told = _write(folder, scene, features, config, summary)
+            message = _write(folder, scene, features, config, summary)
         if (source / WORDS_FILE).is_file():
             if config.form == "compact":
                 save_text_table(folder / WORDS_FILE, load_text_table(source / WORDS_FILE), dtype="float16")
             else:
                 copyfile(source / WORDS_FILE, folder / WORDS_FILE)
-    console(config.quiet).print(f"{out}: {told}")
+    console(config.quiet).print(f"{out}: {message}")
 
 
 def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:

@@ -1,4 +1,4 @@
-"""The words that a command is asked about, and what turns them into features' space."""
+"""The words of query= and queries=, and the text table that maps them into the feature space."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,15 +7,15 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.text.table import TextTable, load_text_table
 
-LARGEST_QUERIES = 1 << 20
-"""Bytes of a file of queries."""
+MAX_QUERIES_BYTES = 1 << 20
+"""Largest size of a file of queries, bytes."""
 
 
-def asked_words(query: Sequence[str], queries: str) -> list[str]:
-    """The words of query= and of the file queries=, blanks stripped, each once, in order.
+def query_words(query: Sequence[str], queries: str) -> list[str]:
+    """The words of query= and of the file queries=, stripped, without repetitions, in order.
 
     Raises:
-        InputError: no words, or a file that is no text.
+        InputError: no words, or the file is not text.
     """
     lines = list(query)
     if queries:
@@ -32,21 +32,22 @@ def _lines_of(file: Path) -> list[str]:
         raise InputError(f"queries: {file} is no file; expected a text file with one query a line")
     try:
         with file.open("rb") as stream:
-            data = stream.read(LARGEST_QUERIES + 1)
-        if len(data) > LARGEST_QUERIES:
-            raise InputError(f"queries: {file} holds more than {LARGEST_QUERIES:,} bytes; expected one word a line")
+            data = stream.read(MAX_QUERIES_BYTES + 1)
+        if len(data) > MAX_QUERIES_BYTES:
+            raise InputError(f"queries: {file} holds more than {MAX_QUERIES_BYTES:,} bytes; expected one word a line")
         return data.decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"queries: {file} cannot be read as text: {error}") from error
 
 
-def words_of(folder: Path, given: str) -> TextTable:
-    """The text table that was given, or the one that lies beside the features."""
+def load_words(folder: Path, given: str) -> TextTable:
+    """The text table that was given, or the one in the folder of the features."""
     if given:
         return load_text_table(given)
     path = folder / WORDS_FILE
     if not path.is_file():
         raise InputError(
-            f"{folder}: no words lead into these features; fuse with a teacher that has words, or give words="
+            f"{folder}: the folder holds no text table for these features; fuse with a teacher that has words, or "
+            "give words="
         )
     return load_text_table(path)

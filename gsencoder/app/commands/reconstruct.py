@@ -39,8 +39,8 @@ class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
         },
     )
     splat: str = field(default="", metadata={"help": f"Gaussians to refine; empty = seeds. {READABLE}"})
-    resume: bool = field(default=True, metadata={"help": "go on where a run that was cut off stopped"})
-    device: Device = field(default="auto", metadata={"help": "where to compute; on CUDA gsplat renders"})
+    resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
+    device: Device = field(default="auto", metadata={"help": "where to compute; on CUDA gsplat rasterizes"})
     data: SceneConfig = field(default_factory=SceneConfig)
     sfm: SfmConfig = field(default_factory=SfmConfig)
 
@@ -51,9 +51,9 @@ class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
 
 
 def run(config: ReconstructCommandConfig, summary: Summary) -> None:
-    """Reads or places photographs, reconstructs, and writes splat, log and pictures into out=."""
+    """Reads a scene or registers photographs, reconstructs, and writes splat, log and pictures into out=."""
     retain_freed_memory()
-    choose_device(config.device)  # A device that is not there is refused before anything is read.
+    choose_device(config.device)  # A missing device is an error before anything is read.
     path, screen = Path(config.paths[0]), console(config.quiet)
     out = config.out or Path("outputs") / (path.resolve().name or "scene") / "reconstruction"
     target = Path(os.path.realpath(out))
@@ -66,8 +66,8 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
         opened = open_scene(path, work.path, splat=config.splat, data=config.data, sfm=config.sfm)
         summary.add_seconds(opened.seconds)
         if opened.sfm is not None:
-            placed = opened.sfm
-            summary.results.update(placed=len(placed.placed), missing=list(placed.missing), sfm_error=placed.error)
+            sfm = opened.sfm
+            summary.results.update(placed=len(sfm.placed), missing=list(sfm.missing), sfm_error=sfm.error)
         reading = {"data": settings(config.data), "sfm": settings(config.sfm)}
         made_from = {"scene": str(path.resolve()), "splat": config.splat, **reading}
         result = reconstruct(
@@ -100,7 +100,7 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
 
 
 def draw(path: Path, comparisons: tuple[Comparison, ...]) -> None:
-    """Writes held-out photographs and renders side by side; nothing where there are none."""
+    """Writes held-out photographs and renders side by side, if there are any."""
     if not comparisons:
         return
     from PIL import Image

@@ -1,4 +1,4 @@
-"""`gsencoder repair SPLAT out=FILE fix=…`: mends the named defects of a splat file, and says what it changed."""
+"""`gsencoder repair SPLAT out=FILE fix=…`: repairs defects of a splat file and reports the changes."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,14 +29,14 @@ class RepairConfig(CommonConfig):
     out: Path | None = field(
         default=None,
         metadata={
-            "help": f"the file to write: {WRITABLE}; FILE.summary.json beside it says what changed",
+            "help": f"the file to write: {WRITABLE}; FILE.summary.json beside it holds the changes",
             "metavar": "FILE",
             "required": True,
         },
     )
     fix: tuple[Fix, ...] = field(
         default=("nonfinite", "quats", "scales", "opacities"),
-        metadata={"help": "defects to mend: the four that stop loading, and huge, duplicates, floaters, or all"},
+        metadata={"help": "defects to repair: the four that prevent loading, and huge, duplicates, floaters, or all"},
     )
 
     def __post_init__(self) -> None:
@@ -47,16 +47,16 @@ class RepairConfig(CommonConfig):
 
 
 def run(config: RepairConfig, summary: Summary) -> None:
-    """Reads, mends, writes, and tells each change with its count."""
+    """Reads, repairs and writes a splat, and prints each change with its count."""
     assert config.out is not None
     refuse_existing(config.out, config.overwrite)
     with summary.step("read"):
         raw = read_raw(config.paths[0])
     with summary.step("repair"):
-        mended, report = repair_splat(raw, config.fix)
-        origin = float64_origin(mended)
+        repaired, report = repair_splat(raw, config.fix)
+        origin = float64_origin(repaired)
         gaussians = gaussians_from_raw(
-            mended, origin=origin, where=f"{config.paths[0]} after fix={','.join(config.fix)}"
+            repaired, origin=origin, where=f"{config.paths[0]} after fix={','.join(config.fix)}"
         )
     with summary.step("write"):
         save_splat(config.out, gaussians, origin=origin)
@@ -69,7 +69,7 @@ def run(config: RepairConfig, summary: Summary) -> None:
 
 
 def float64_origin(raw: RawSplat) -> Float64[np.ndarray, "3"] | None:
-    """Whole coordinates near the splat's middle if float32 cannot hold its positions, so that none is rounded."""
+    """Integer coordinates near the middle of the splat if its positions need float64; None if float32 holds them."""
     if np.array_equal(raw.means, raw.means.astype(np.float32)):
         return None
     return np.floor(np.median(raw.means, axis=0))

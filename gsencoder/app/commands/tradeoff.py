@@ -1,4 +1,4 @@
-"""`gsencoder tradeoff SCENE…`: what each accuracy knob of fusion costs and gives, as a table and a plot."""
+"""`gsencoder tradeoff SCENE…`: seconds and accuracy of each setting of fusion, as a table and a plot."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,8 +49,8 @@ class TradeoffConfig(CommonConfig):
 
 
 def run(config: TradeoffConfig, summary: Summary) -> None:
-    """Sweeps, prints the table, writes it with a plot, and names the setting that a budget asks for."""
-    sweep_settings(config.sweep, config.fusion)  # A knob out of range is refused before hours of work.
+    """Measures all settings, prints and writes the table with a plot, and names the setting for a budget."""
+    sweep_settings(config.sweep, config.fusion)  # A setting out of range is an error before hours of work.
     out = config.out or Path("outputs") / "tradeoff"
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         with summary.step("sweep"):
@@ -79,7 +79,7 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
 
 
 def _advice(trades: list[SettingResult], budget: BudgetConfig) -> str:
-    """What keeps to the budget, or that nothing does: measurements of an hour are not thrown away for that."""
+    """The setting within the budget, or a message that there is none; the measurements are written in both cases."""
     if budget.seconds is None and budget.error is None:
         return ""
     try:
@@ -99,7 +99,7 @@ def _table(trades: list[SettingResult]) -> Table:
     for title in ("seconds", "MiB", "rank", "error", "covered", "Acc@0.25", "Acc@0.5", ""):
         table.add_column(title, justify="right")
     for row in map(table_row, trades):
-        found = (f"{row['acc_25']:.3f}", f"{row['acc_50']:.3f}") if row["objects"] else ("", "")
+        accuracies = (f"{row['acc_25']:.3f}", f"{row['acc_50']:.3f}") if row["objects"] else ("", "")
         figures = (f"{row['seconds']:.3f}", f"{row['mib']:.0f}", f"{row['rank']:.1f}", f"{row['error']:.5f}")
-        table.add_row(row["setting"], *figures, f"{row['covered']:.4f}", *found, "●" if row["on_front"] else "")
+        table.add_row(row["setting"], *figures, f"{row['covered']:.4f}", *accuracies, "●" if row["on_front"] else "")
     return table

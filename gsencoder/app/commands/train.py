@@ -1,4 +1,5 @@
-"""`gsencoder train SCENE… out=FOLDER`: distil a teacher into an encoder that needs neither photographs nor teacher."""
+"""`gsencoder train SCENE… out=FOLDER`: distil a teacher into an encoder that needs neither photographs nor the
+teacher."""
 
 import os
 import shutil
@@ -40,14 +41,14 @@ class TrainCommandConfig(TrainConfig, CommonConfig):
         default=(), metadata={"help": "scenes, or folders of scenes", "metavar": "SCENE", "required": True}
     )
     holdout: tuple[str, ...] = field(
-        default=(), metadata={"help": "names of scenes kept for validation, with * and ? as in file names"}
+        default=(), metadata={"help": "names of scenes for validation, with * and ? as in file names"}
     )
     prepared: Path | None = field(
         default=None,
-        metadata={"help": "folder of prepared scenes, made if missing; empty = OUT.prepared", "metavar": "PATH"},
+        metadata={"help": "folder of prepared scenes, created if missing; empty = OUT.prepared", "metavar": "PATH"},
     )
     prepare_only: bool = field(default=False, metadata={"help": "prepare the scenes and stop"})
-    resume: bool = field(default=True, metadata={"help": "go on where a run that was cut off stopped"})
+    resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
     store: Literal["float16", "float32"] = field(
         default="float16", metadata={"help": "type of the written weights and words"}
     )
@@ -62,7 +63,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
     work, prepared = real.with_name(f"{real.name}.training"), config.prepared or real.with_name(f"{real.name}.prepared")
     for name, taken in (("out", real), ("the state of the run", work)):
         if lies_in(prepared, taken):
-            raise InputError(f"prepared={prepared}: lies in the folder of {name}, {taken}; give another folder")
+            raise InputError(f"prepared={prepared}: is in the folder of {name}, {taken}; give another folder")
     training, held_out = split_scenes(find_scenes(config.paths), config.holdout)
     words = text_table_of(config.teacher)
     with WorkFolder(work) as state, join_processes(config.device) as (process, device), ExitStack() as results:
@@ -107,7 +108,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
 
 
 def names(paths: Sequence[Path]) -> list[str]:
-    """The names that scenes have in a prepared dataset."""
+    """The names of scenes in a prepared dataset."""
     return [path.name for path in paths]
 
 

@@ -1,9 +1,9 @@
-"""`gsencoder views FEATURES query=…`: the views that show best what was found, rendered, and why they were chosen."""
+"""`gsencoder views FEATURES query=…`: renders of the views that show best what a word stands for, with their scores."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import asked_words, words_of
+from gsencoder.app.commands.query_words import load_words, query_words
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
@@ -33,22 +33,24 @@ class ViewsCommandConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "a folder that fuse, encode or pack made", "metavar": "FEATURES", "required": True},
+        metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
     )
     query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
     queries: str = field(default="", metadata={"help": "a text file with one query a line"})
-    words: str = field(default="", metadata={"help": "text table; empty = the one beside the features"})
-    space: str = field(default="", metadata={"help": "which features, where the folder holds several"})
+    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
+    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
     photos: str = field(
-        default="", metadata={"help": "the scene that was fused: frames are shown as its photographs, not as renders"}
+        default="", metadata={"help": "the scene that was fused; its photographs are shown instead of renders"}
     )
-    boxes: int = field(default=1, metadata={"help": "boxes of each word that are looked at, best first"})
+    boxes: int = field(default=1, metadata={"help": "number of boxes of each word that are shown, best first"})
     grid: tuple[int, ...] = field(
         default=(),
-        metadata={"help": "lines and columns of a vision tower's patches: features are rendered on them, too"},
+        metadata={
+            "help": "rows and columns of the patches of a vision tower, on which features are rendered in addition"
+        },
     )
     fit: Fit = field(
-        default="stretch", metadata={"help": "how the tower's preprocessing brings a picture to its own shape"}
+        default="stretch", metadata={"help": "how the preprocessing of the tower fits a picture to its input size"}
     )
     choose: ViewsConfig = field(default_factory=ViewsConfig)
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -60,13 +62,13 @@ class ViewsCommandConfig(CommonConfig):
         if self.boxes < 1:
             raise InputError(f"boxes: expected 1 or more, got {self.boxes}")
         if len(self.grid) not in (0, 2):
-            raise InputError(f"grid: expected lines and columns, such as [27,27], got {list(self.grid)}")
+            raise InputError(f"grid: expected rows and columns, such as [27,27], got {list(self.grid)}")
         if self.grid:
             tower_grid(1, 1, (self.grid[0], self.grid[1]))
 
 
 def run(config: ViewsCommandConfig, summary: Summary) -> None:
-    """Finds the words, chooses views of them, renders these, and writes what was chosen and why."""
+    """Localizes the words, chooses and renders views of them, and writes the pictures and their scores."""
     folder = Path(config.paths[0])
     with summary.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
@@ -74,13 +76,15 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     targets: tuple[Target, ...] = ()
     if config.query or config.queries or config.choose.method == "greedy":
         with summary.step("localize"):
-            words = asked_words(config.query, config.queries)
-            found = localize(scene, words, words_of(folder, config.words), config.localize, space=config.space or None)
+            words = query_words(config.query, config.queries)
+            localization = localize(
+                scene, words, load_words(folder, config.words), config.localize, space=config.space or None
+            )
             assert scene.gaussians is not None
-            targets = targets_of(scene.gaussians, found, config.boxes)
+            targets = targets_of(scene.gaussians, localization, config.boxes)
         if not targets:
             raise InputError(f"views: none of {', '.join(words)} was found in scene {scene.name}")
-        boxes = best_boxes(found, config.boxes)
+        boxes = best_boxes(localization, config.boxes)
         summary.results.update(boxes=[box_to_json(box) for box in boxes])
     with summary.step("choose"):
         views = choose_views(scene, targets, config.choose)
@@ -102,13 +106,13 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
 
 
 def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
-    """The scene of a folder of features, with photographs where a scene that has them is given."""
+    """Loads a folder of features, with the photographs of the scene `photos` if one is given."""
     scene = load_features(folder)
     return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
 
 
 def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:
-    """Rendered features as tokens [V, lines · columns, D] float32, under the name "tokens"."""
+    """Writes rendered features as tokens [V, rows · columns, D] float32, under the name "tokens"."""
     assert scene.gaussians is not None
     _, features = select_features(scene, config.space or None)
     grid = (config.grid[0], config.grid[1])

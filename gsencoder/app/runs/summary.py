@@ -1,4 +1,4 @@
-"""What a run did, as summary.json records it."""
+"""The record of a run in summary.json."""
 
 import math
 import os
@@ -36,8 +36,8 @@ LIBRARIES = {
 
 
 def peak_memory_mb() -> float:
-    """The most memory this process ever held, in MiB."""
-    # Linux counts ru_maxrss from the parent's size at the fork; VmHWM is the process's own.
+    """Peak resident memory of this process, MiB."""
+    # On Linux ru_maxrss starts from the size of the parent at the fork; VmHWM is that of the process alone.
     try:
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
@@ -53,10 +53,10 @@ def peak_memory_mb() -> float:
 
 
 class Summary:
-    """Collects what one run did: its settings, the seconds of each step, warnings and results.
+    """Collects the settings of a run, the seconds of each step, warnings and results.
 
     Attributes:
-        results: what the command found or made; the command fills it.
+        results: figures and file names; filled by the command.
         warnings: one line each, in order; the command line adds every `SceneWarning` of the run.
         timings: seconds by step, in order of first start.
     """
@@ -71,7 +71,7 @@ class Summary:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Adds the seconds that the block takes to the step's, also when it fails."""
+        """Adds the seconds of the block to the step, also if it fails."""
         start = time.perf_counter()
         self.timings.setdefault(name, 0.0)
         try:
@@ -80,12 +80,12 @@ class Summary:
             self.timings[name] += time.perf_counter() - start
 
     def add_seconds(self, steps: Mapping[str, float]) -> None:
-        """Adds what steps took that were timed elsewhere."""
+        """Adds the seconds of steps that were timed elsewhere."""
         for name, seconds in steps.items():
             self.timings[name] = self.timings.get(name, 0.0) + seconds
 
     def to_dict(self) -> dict[str, Any]:
-        """The record in JSON's terms. `non_finite` lists the results that were not finite and are null."""
+        """The record as JSON values. `non_finite` lists the results that were not finite and are null."""
         lost: list[str] = []
         results = plain(self.results, "results", lost)
         total = time.perf_counter() - self._start
@@ -112,11 +112,11 @@ def _processors() -> int:
 
 
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for module, distribution in LIBRARIES.items():
         if module in sys.modules:
             try:
-                found[module] = version(distribution)
+                versions[module] = version(distribution)
             except PackageNotFoundError:
-                found[module] = "unknown"
-    return found
+                versions[module] = "unknown"
+    return versions

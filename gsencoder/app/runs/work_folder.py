@@ -1,4 +1,4 @@
-"""The folder in which a run that may be cut off keeps its state; it goes when the results have their place."""
+"""The folder for the state of a run that can be resumed; it is removed once the results are written."""
 
 import os
 import re
@@ -9,60 +9,60 @@ from types import TracebackType
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file, lock_folder
 
-WORK_MARK = "unfinished.txt"
-_HALF_A_MARK = re.compile(re.escape(f".{WORK_MARK}.") + "[0-9a-f]+[.]tmp")
+MARKER_FILE = "unfinished.txt"
+_PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "[0-9a-f]+[.]tmp")
 
 
 class WorkFolder:
-    """A folder with a mark in it, by which later runs know it for one of theirs.
+    """A folder with a marker file, by which later runs recognize it.
 
-    Enter it before the output folder and `take` it inside: then it is held, and kept from other runs, until the results
-    have taken their place, and is removed after that. Whatever ends the block early leaves it as it is.
+    Enter it before the output folder and `take` it inside: it is then locked until the results have been renamed into
+    place, and removed after that. If the block ends early, the folder stays as it is.
 
     Attributes:
-        path: of the folder, behind all links.
+        path: of the folder, with symbolic links resolved.
     """
 
     def __init__(self, path: Path) -> None:
         """Args:
-        path: the folder, which need not exist.
+        path: the folder, which may not exist yet.
         """
         self.path = Path(os.path.realpath(path))
         self._descriptor: int | None = None
         self._taken = False
 
     def take(self, *, anew: bool) -> None:
-        """Makes the folder, or takes up the one that a run has left; one that no run has made is never touched.
+        """Creates and locks the folder, or that of an interrupted run; a folder without the marker is never changed.
 
         Args:
-            anew: forget what an earlier run left in it.
+            anew: whether to remove the state of an earlier run.
 
         Raises:
-            InputError: it holds something else, another run is at work in it, or it cannot be made or emptied.
+            InputError: it holds something else, another run uses it, or it cannot be created or emptied.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             names = [entry.name for entry in self.path.iterdir()]
-            # A run that was killed within its first moments has left no more than the beginning of a mark.
-            if WORK_MARK not in names and not all(_HALF_A_MARK.fullmatch(name) for name in names):
+            # A run that was killed at its start may have left an incomplete marker file alone.
+            if MARKER_FILE not in names and not all(_PARTIAL_MARKER.fullmatch(name) for name in names):
                 raise InputError(
-                    f"{self.path}: this run would keep its state here, and the folder holds something else "
-                    f"(no {WORK_MARK}); give another out="
+                    f"{self.path}: this run would save its state here, and the folder holds something else "
+                    f"(no {MARKER_FILE}); give another out="
                 )
             try:
                 self._descriptor = lock_folder(self.path)
             except BlockingIOError:
                 raise InputError(
-                    f"{self.path}: another run keeps its state here now; wait for it or give another out="
+                    f"{self.path}: another run saves its state here now; wait for it or give another out="
                 ) from None
             if anew:
                 self._empty()
-            with atomic_file(self.path / WORK_MARK) as stream:
+            with atomic_file(self.path / MARKER_FILE) as stream:
                 stream.write(b"The state of a run that is not finished, which removes this folder.\n")
         except OSError as error:
             self._release()
             raise InputError(
-                f"{self.path}: cannot keep the state of this run here: {error.strerror or error}; give another out="
+                f"{self.path}: cannot save the state of this run here: {error.strerror or error}; give another out="
             ) from error
         except BaseException:
             self._release()
@@ -70,9 +70,9 @@ class WorkFolder:
         self._taken = True
 
     def _empty(self) -> None:
-        """Removes everything but the mark, which goes last, so that a kill leaves a folder that is known."""
+        """Removes everything except the marker, so that after a kill the folder is still recognized."""
         for entry in self.path.iterdir():
-            if entry.name != WORK_MARK:
+            if entry.name != MARKER_FILE:
                 if entry.is_dir() and not entry.is_symlink():
                     shutil.rmtree(entry)
                 else:
@@ -92,11 +92,12 @@ class WorkFolder:
         try:
             if kind is None and self._taken:
                 self._empty()
-                (self.path / WORK_MARK).unlink(missing_ok=True)
+                (self.path / MARKER_FILE).unlink(missing_ok=True)
                 self.path.rmdir()
         except OSError as refused:
             raise InputError(
-                f"{self.path}: the run is finished and its results are in place, but what it kept here cannot be "
+                f"{self.path}: the run is finished and its results are written, but the state that it saved here "
+                "cannot be "
                 f"removed: {refused.strerror or refused}; remove it"
             ) from refused
         finally:

@@ -211,7 +211,7 @@ def test_questions_in_another_language_have_its_words() -> None:
         (("question=x", "aabb=[1,0,0,0,1,1]", "dry_run=true"), "not below the upper one"),
         (("question=x", "aabb=[0,0,0,1,1,1]", "dry_run=true"), "no Gaussian of scene room is in the box"),
         (("question=x", "aabb=[0,0,0,1,1,1]", "query=cube", "dry_run=true"), "give one of them"),
-        (("question=x", "questions=q.jsonl", "dry_run=true"), "the file says what is asked"),
+        (("question=x", "questions=q.jsonl", "dry_run=true"), "the file contains the questions"),
         (("question=the cube", "task=ground", "ask.marks=false", "dry_run=true"), "needs marks"),
     ],
 )

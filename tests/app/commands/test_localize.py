@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 
 from gsencoder.app.commands.localize import LocalizeCommandConfig
-from gsencoder.app.commands.query_words import LARGEST_QUERIES, asked_words
+from gsencoder.app.commands.query_words import MAX_QUERIES_BYTES, query_words
 from gsencoder.core.errors import InputError
 
 
 def words(**settings: object) -> list[str]:
     config = LocalizeCommandConfig(**settings)  # type: ignore[arg-type]
-    return asked_words(config.query, config.queries)
+    return query_words(config.query, config.queries)
 
 
 def test_words_of_query_and_file_are_asked_once_each_in_order(tmp_path: Path) -> None:
@@ -31,7 +31,7 @@ def test_a_file_of_queries_must_be_a_text_file_of_sensible_size(tmp_path: Path) 
     (tmp_path / "q.txt").write_bytes(bytes(range(256)))
     with pytest.raises(InputError, match="cannot be read as text"):
         words(queries=str(tmp_path / "q.txt"))
-    (tmp_path / "q.txt").write_bytes(b"x" * (LARGEST_QUERIES + 1))
+    (tmp_path / "q.txt").write_bytes(b"x" * (MAX_QUERIES_BYTES + 1))
     with pytest.raises(InputError, match="holds more than 1,048,576 bytes"):
         words(queries=str(tmp_path / "q.txt"))
 
