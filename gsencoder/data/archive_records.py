@@ -66,8 +66,8 @@ def read_space(file: Archive) -> tuple[FeatureSpace, Float32[np.ndarray, " D"], 
     space, mean = FeatureSpace(**values), file.array("mean", "float32", ("D",))
     if "components" not in file and "energy_kept" not in file:
         return space, mean, None
-    components, kept = file.array("components", "float32", ("R", "D")), file.value("energy_kept", float, int)
-    return space, mean, FeatureBasis(mean=mean, components=components, energy_kept=kept, space=space)
+    components, energy_kept = file.array("components", "float32", ("R", "D")), file.value("energy_kept", float, int)
+    return space, mean, FeatureBasis(mean=mean, components=components, energy_kept=energy_kept, space=space)
 
 
 def scene_parts(scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -170,7 +170,7 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
     Raises:
         InputError: a path that does not exist, or a folder with no scene in it.
     """
-    found: dict[Path, Path] = {}
+    scenes: dict[Path, Path] = {}
     for given in map(Path, paths):
         try:
             if not given.exists():
@@ -186,8 +186,8 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
                 "model, a ScanNet export or a splat"
             )
         for path in inside:
-            found.setdefault(path.resolve(), path)
-    return tuple(found.values())
+            scenes.setdefault(path.resolve(), path)
+    return tuple(scenes.values())
 
 
 def is_scene(path: Path) -> bool:
@@ -327,10 +327,10 @@ def _check_sizes(image: PosedImage, depth_camera: CameraModel, where: str) -> bo
         )
     for file, wanted in ((image.depth, depth_camera), (image.mask, camera), (image.instance, camera)):
         if file is not None:
-            found = picture_size(file)
-            if found != (wanted.width, wanted.height):
+            actual = picture_size(file)
+            if actual != (wanted.width, wanted.height):
                 raise InputError(
-                    f"{where}: {file} has {found[0]}×{found[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
+                    f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
                     "both must have the same size"
                 )
     return transparent
@@ -341,8 +341,8 @@ def _have_empty_pixels(cameras: list[tuple[Pinhole, CameraModel]], remaps: Remap
     distorted = [camera for camera in cameras if not camera[1].is_pinhole]
     if len(distorted) > FEW_CAMERAS:
         return True
-    found = [remaps.get(*camera) for camera in distorted]
-    return any(remap is not None and not remap.valid.all() for remap in found)
+    maps = [remaps.get(*camera) for camera in distorted]
+    return any(remap is not None and not remap.valid.all() for remap in maps)
 
 
 def _warn(message: str) -> None:

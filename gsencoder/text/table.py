@@ -110,8 +110,8 @@ class TextTable:
         sharing = [name for name in row_of if tokens & set(name.split())]
         sharing.sort(key=lambda name: (-difflib.SequenceMatcher(None, key, name).ratio(), name))
         alike = difflib.get_close_matches(key, list(row_of), n=count, cutoff=0.6)
-        found = dict.fromkeys([*alike[:1], *sharing, *alike])
-        return tuple(self.names[row_of[name]] for name in list(found)[:count])
+        near_names = dict.fromkeys([*alike[:1], *sharing, *alike])
+        return tuple(self.names[row_of[name]] for name in list(near_names)[:count])
 
     def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
         """The embeddings of words, forgiving case, blanks, `_`, `-`, a leading article and simple plurals.

@@ -56,12 +56,12 @@ def read_colmap(model: Path, images: Path, root: Path, *, allow_outside: bool = 
         if image.camera_id not in cameras:
             if image.camera_id not in reconstruction.cameras:
                 raise InputError(f"{where}: its camera {image.camera_id} is not in the model")
-            found = reconstruction.cameras[image.camera_id]
+            colmap_camera = reconstruction.cameras[image.camera_id]
             camera = CameraModel(
-                model=found.model.name,
-                width=int(found.width),
-                height=int(found.height),
-                params=tuple(float(value) for value in found.params),
+                model=colmap_camera.model.name,
+                width=int(colmap_camera.width),
+                height=int(colmap_camera.height),
+                params=tuple(float(value) for value in colmap_camera.params),
             )
             check_camera(camera, f"{model}: camera {image.camera_id}")
             cameras[image.camera_id] = camera
@@ -160,9 +160,9 @@ def _check_text_counts(model: Path, reconstruction: Any) -> None:
 
 
 def _points(reconstruction: Any, model: Path) -> tuple[np.ndarray, np.ndarray]:
-    found = list(reconstruction.points3D.values())
-    points = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
-    colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)
+    sfm_points = list(reconstruction.points3D.values())
+    points = np.array([point.xyz for point in sfm_points], np.float64).reshape(-1, 3)
+    colors = np.array([point.color for point in sfm_points], np.uint8).reshape(-1, 3)
     with np.errstate(invalid="ignore"):
         good = np.abs(points).max(axis=1, initial=0) <= FARTHEST
     if not good.all():

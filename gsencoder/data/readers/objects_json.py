@@ -54,10 +54,10 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
             )
         )
     seen: set[int] = set()
-    for found in objects:
-        if found.id in seen:
-            raise InputError(f"{path}: id {found.id} belongs to several objects")
-        seen.add(found.id)
+    for item in objects:
+        if item.id in seen:
+            raise InputError(f"{path}: id {item.id} belongs to several objects")
+        seen.add(item.id)
     return tuple(objects)
 
 

@@ -99,10 +99,10 @@ def _by_stem(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     """Files by stem, numbers in their own order."""
     if not folder.is_dir():
         return {}
-    found = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".")]
-    found.sort(key=lambda path: (not path.stem.isdecimal(), int(path.stem) if path.stem.isdecimal() else 0, path.name))
+    files = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".")]
+    files.sort(key=lambda path: (not path.stem.isdecimal(), int(path.stem) if path.stem.isdecimal() else 0, path.name))
     stems: dict[str, Path] = {}
-    for path in found:
+    for path in files:
         if path.stem in stems:
             raise InputError(f"{folder}: frame {path.stem} is there twice ({stems[path.stem].name}, {path.name})")
         stems[path.stem] = path

@@ -29,12 +29,12 @@ def find_splat(root: Path) -> Path:
         raise InputError(f"{root}: expected a transforms.json or a splat ({', '.join(SPLAT_SUFFIXES)})")
     if (root / "meta.json").is_file():
         return root
-    found = sorted(path for path in root.iterdir() if path.is_file() and path.suffix.lower() in SPLAT_SUFFIXES)
-    if len(found) == 1:
-        return found[0]
-    if found:
-        names = ", ".join(path.name for path in found[:5])
-        raise InputError(f"{root}: holds {len(found)} splats ({names}) and no views; give one of them")
+    files = sorted(path for path in root.iterdir() if path.is_file() and path.suffix.lower() in SPLAT_SUFFIXES)
+    if len(files) == 1:
+        return files[0]
+    if files:
+        names = ", ".join(path.name for path in files[:5])
+        raise InputError(f"{root}: holds {len(files)} splats ({names}) and no views; give one of them")
     raise InputError(
         f"{root}: not a scene; looked for {' or '.join(TRANSFORMS)}, a COLMAP model (sparse/0, sparse, cameras.bin or "
         f"cameras.txt), a ScanNet export (color/, pose/) and a splat ({', '.join(SPLAT_SUFFIXES)}, meta.json)"

@@ -101,9 +101,9 @@ def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: flo
                 continue
             if not isinstance(listed, str):
                 raise InputError(f"{where}: {keys[0]} must be a path, got {str(listed)[:40]!r}")
-            found = inside(root, listed, where, allow_outside=allow_outside)
-            if found.is_file():
-                beside[kind] = found
+            file = inside(root, listed, where, allow_outside=allow_outside)
+            if file.is_file():
+                beside[kind] = file
             else:
                 missing[kind].append(listed)
         camera = _camera(data, frame, image, where)
@@ -151,9 +151,9 @@ def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: flo
 def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
     """The file of a frame; Blender leaves the suffix away."""
     for suffix in ("", *GUESSED_SUFFIXES):
-        found = inside(root, name + suffix, where, allow_outside=allow_outside)
-        if found.is_file():
-            return found
+        file = inside(root, name + suffix, where, allow_outside=allow_outside)
+        if file.is_file():
+            return file
     return None
 
 
@@ -165,10 +165,10 @@ def _matrix(value: object, where: str) -> Float64[np.ndarray, "4 4"]:
     matrix = np.eye(4)
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):
-            found = number({"transform_matrix": entry}, "transform_matrix", where)
-            if found is None:
+            element = number({"transform_matrix": entry}, "transform_matrix", where)
+            if element is None:
                 raise InputError(f"{where}: transform_matrix has an empty entry in row {i}")
-            matrix[i, j] = found
+            matrix[i, j] = element
     return matrix
 
 

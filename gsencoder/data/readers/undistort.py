@@ -264,7 +264,7 @@ class RemapCache:
 
     def __init__(self, budget: int = 256 << 20) -> None:
         self._budget = budget
-        self._kept: dict[tuple[Pinhole, CameraModel], Remap] = {}
+        self._remaps: dict[tuple[Pinhole, CameraModel], Remap] = {}
 
     def get(self, target: Pinhole, source: CameraModel) -> Remap | None:
         """The remap, or None where the pictures are the same pixel for pixel."""
@@ -274,11 +274,11 @@ class RemapCache:
             and (target.fx, target.fy, target.cx, target.cy) == source.pinhole_params()
         ):
             return None
-        found = self._kept.pop((target, source), None)
-        if found is None:
-            found = build_remap(target, source)
-            size = found.x.nbytes + found.y.nbytes
-            while self._kept and sum(r.x.nbytes + r.y.nbytes for r in self._kept.values()) + size > self._budget:
-                del self._kept[next(iter(self._kept))]
-        self._kept[(target, source)] = found
-        return found
+        remap = self._remaps.pop((target, source), None)
+        if remap is None:
+            remap = build_remap(target, source)
+            size = remap.x.nbytes + remap.y.nbytes
+            while self._remaps and sum(r.x.nbytes + r.y.nbytes for r in self._remaps.values()) + size > self._budget:
+                del self._remaps[next(iter(self._remaps))]
+        self._remaps[(target, source)] = remap
+        return remap

@@ -80,11 +80,11 @@ def _disc_spacing(distances: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Spacing by the disc that reaches to the ENOUGHth neighbor that counts, or the last one; infinite without any."""
     count = np.minimum(counts.cumsum(axis=1), ENOUGH)
     last = count.argmax(axis=1)  # The first place where the largest count is reached.
-    found = np.take_along_axis(count, last[:, None], 1)[:, 0]
+    neighbors_within = np.take_along_axis(count, last[:, None], 1)[:, 0]
     radius = np.take_along_axis(distances, last[:, None], 1)[:, 0]
     # The disc's rim passes through its last sample, which is half inside; the point itself is wholly inside.
     # Coincident points have no spacing of their own.
-    return np.where((found > 0) & (radius > 0), radius * np.sqrt(np.pi / (found + 0.5)), np.inf)
+    return np.where((neighbors_within > 0) & (radius > 0), radius * np.sqrt(np.pi / (neighbors_within + 0.5)), np.inf)
 
 
 def nearest(

@@ -132,8 +132,8 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
             f"{path}: has {rest} f_rest properties; expected f_rest_0 … with 0, 9, 24 or 45 of them (SH 0 to 3)"
         )
     per_channel = rest // 3
-    kept = min(per_channel + 1, SH_COEFFICIENTS[-1])
-    if kept < per_channel + 1:
+    coefficients = min(per_channel + 1, SH_COEFFICIENTS[-1])
+    if coefficients < per_channel + 1:
         warnings.warn(f"{path}: SH degree 4 was cut to degree 3", SceneWarning, stacklevel=2)
 
     count = vertex.count
@@ -144,7 +144,7 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
         rows = None
     means = np.empty((count, 3), np.float64)
     quats, scales = np.empty((count, 4), np.float32), np.empty((count, 3), np.float32)
-    opacities, sh = np.empty(count, np.float32), np.empty((count, kept, 3), np.float32)
+    opacities, sh = np.empty(count, np.float32), np.empty((count, coefficients, 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         for start in range(0, count, _BLOCK):
             stop = min(start + _BLOCK, count)
@@ -158,7 +158,7 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
             for axis in range(3):
                 scales[start:stop, axis] = block[f"scale_{axis}"]
                 sh[start:stop, 0, axis] = block[f"f_dc_{axis}"]
-                for k in range(1, kept):
+                for k in range(1, coefficients):
                     sh[start:stop, k, axis] = block[f"f_rest_{axis * per_channel + k - 1}"]
             opacities[start:stop] = block["opacity"]
     return RawSplat(

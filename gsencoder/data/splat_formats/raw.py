@@ -118,13 +118,13 @@ def unusable_rows(raw: RawSplat) -> dict[str, Bool[np.ndarray, " N"]]:
         scales = np.exp(raw.log_scales)
         tiny = np.finfo(np.float32).tiny
         bad_scales = ~((scales >= tiny) & np.isfinite(scales)).all(axis=1)
-    found = {"nonfinite": nonfinite, "quats": norms < 1e-24, "scales": bad_scales}
-    found["opacities"] = np.isinf(raw.logit_opacities)
+    defects = {"nonfinite": nonfinite, "quats": norms < 1e-24, "scales": bad_scales}
+    defects["opacities"] = np.isinf(raw.logit_opacities)
     seen = nonfinite
     for name in ("quats", "scales", "opacities"):
-        found[name] = found[name] & ~seen
-        seen = seen | found[name]
-    return found
+        defects[name] = defects[name] & ~seen
+        seen = seen | defects[name]
+    return defects
 
 
 def check_expansion(path: Path, wanted: int, size: int) -> None:

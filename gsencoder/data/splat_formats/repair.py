@@ -183,13 +183,13 @@ def _find(name: str, raw: RawSplat, unusable: dict[str, Bool[np.ndarray, " N"]])
     if name == "duplicates":
         return _duplicates(raw)
     finite = ~unusable["nonfinite"]
-    found = np.zeros(len(raw), bool)
+    defective = np.zeros(len(raw), bool)
     if finite.any():
         means = raw.means[finite]
-        found[finite] = _huge(means, raw.log_scales[finite]) if name == "huge" else _floaters(means)
+        defective[finite] = _huge(means, raw.log_scales[finite]) if name == "huge" else _floaters(means)
     if name == "huge":
-        found &= ~unusable["scales"]
-    return found
+        defective &= ~unusable["scales"]
+    return defective
 
 
 def _robust_box(means: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "2 3"]:
@@ -219,11 +219,11 @@ def _duplicates(raw: RawSplat) -> Bool[np.ndarray, " N"]:
         raw.logit_opacities[:, None],
         raw.sh.reshape(len(raw), raw.sh.shape[1] * 3),
     ]
-    found = np.zeros(len(raw), bool)
+    defective = np.zeros(len(raw), bool)
     # Equal rows have equal means: only those few need their other columns hashed.
     rows = _repeated(_hash(arrays[:1]))
     if rows.size == 0:
-        return found
+        return defective
     arrays = [array[rows] for array in arrays]
     hashes = _hash(arrays)
     order = np.argsort(hashes, kind="stable")
@@ -233,8 +233,8 @@ def _duplicates(raw: RawSplat) -> Bool[np.ndarray, " N"]:
     for array in arrays:
         bits = np.ascontiguousarray(array).view(np.uint32)
         equal &= (bits[order] == bits[first]).all(axis=1)
-    found[rows[order[equal]]] = True
-    return found
+    defective[rows[order[equal]]] = True
+    return defective
 
 
 def _hash(arrays: Sequence[np.ndarray]) -> UInt64[np.ndarray, " N"]:

@@ -85,9 +85,9 @@ def _read(path: Path, load: Load, size: int) -> RawSplat:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: meta.json is not JSON: {str(error)[:120]}") from error
     if not isinstance(meta, dict) or meta.get("version") != 2:
-        found = meta.get("version", 1) if isinstance(meta, dict) else "none"
+        version = meta.get("version", 1) if isinstance(meta, dict) else "none"
         raise InputError(
-            f"{path}: meta.json has version {str(found)[:20]}; expected SOG version 2 (splat-transform converts)"
+            f"{path}: meta.json has version {str(version)[:20]}; expected SOG version 2 (splat-transform converts)"
         )
     count = meta.get("count")
     if not isinstance(count, int) or isinstance(count, bool) or count < 0:

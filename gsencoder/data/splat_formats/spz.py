@@ -117,7 +117,7 @@ def _section_sizes(path: Path, count: int, degree: int, bits: int, *, rotation_b
 def _decode(data: bytes, count: int, degree: int, bits: int, version: int) -> RawSplat:
     """Sections to values. Opacity is the byte over 255, log-scale byte/16 − 10, SH (byte − 128)/128."""
     coefficients = (degree + 1) ** 2 - 1
-    kept = min(coefficients + 1, SH_COEFFICIENTS[-1])
+    kept_coefficients = min(coefficients + 1, SH_COEFFICIENTS[-1])
     flat = np.frombuffer(data, np.uint8)
     offset = 0
 
@@ -132,11 +132,11 @@ def _decode(data: bytes, count: int, degree: int, bits: int, version: int) -> Ra
     fixed -= (fixed >> 23) << 24
     alphas, colors, scales = take(1), take(3), take(3)
     rotations = take(4 if version >= 3 else 3)
-    sh = np.empty((count, kept, 3), np.float32)
+    sh = np.empty((count, kept_coefficients, 3), np.float32)
     sh[:, 0] = (colors / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE)
     if coefficients:
         rest = take(3 * coefficients).reshape(count, coefficients, 3)
-        sh[:, 1:] = rest[:, : kept - 1]
+        sh[:, 1:] = rest[:, : kept_coefficients - 1]
         sh[:, 1:] -= 128
         sh[:, 1:] /= 128
     if version >= 3:

@@ -194,10 +194,10 @@ def _objects(plan: tuple[PlannedObject, ...], instances: list[np.ndarray]) -> tu
     counts = np.array(
         [np.bincount(labels.ravel(), minlength=largest) for labels in instances] or np.zeros((1, largest), int)
     )
-    found = []
+    objects = []
     for thing in plan:
         lower, upper = thing.aabb()
-        found.append(
+        objects.append(
             SceneObject(
                 id=thing.id,
                 name=thing.name,
@@ -208,4 +208,4 @@ def _objects(plan: tuple[PlannedObject, ...], instances: list[np.ndarray]) -> tu
                 max_pixels=int(counts[:, thing.id].max()),
             )
         )
-    return tuple(found)
+    return tuple(objects)

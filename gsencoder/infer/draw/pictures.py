@@ -125,7 +125,7 @@ def draw_boxes(
     image = Image.fromarray(enlarge(rgb, factor))
     draw = ImageDraw.Draw(image)
     pose, intrinsics = cam_from_world.astype(np.float64), K.astype(np.float64) * [[factor], [factor], [1]]
-    order = {word: place for place, word in enumerate(dict.fromkeys(box.query for box in boxes))}
+    order = {word: index for index, word in enumerate(dict.fromkeys(box.query for box in boxes))}
     labels: list[tuple[np.ndarray, str, tuple[int, int, int]]] = []
     # The best box of a word is drawn last, over the others.
     for box in sorted(boxes, key=lambda one: -one.rank):

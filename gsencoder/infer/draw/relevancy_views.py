@@ -30,16 +30,16 @@ def best_views(
     for column, rows in enumerate(groups):
         chosen[rows, column] = 1
     members = torch.from_numpy(chosen)
-    worth = np.array(
+    visible_share = np.array(
         [blend(gaussians, small, view).render(members).mean(dim=0).numpy() for view in range(len(cameras))]
     )
     # A stable sort of negated values: of equal views the first.
-    return [order[:count].tolist() for order in np.argsort(-worth, axis=0, kind="stable").T]
+    return [order[:count].tolist() for order in np.argsort(-visible_share, axis=0, kind="stable").T]
 
 
 def relevancy_pictures(
     scene: Scene,
-    found: Localization,
+    localization: Localization,
     *,
     per_word: int,
     config: BlendConfig = BlendConfig(),
@@ -48,7 +48,7 @@ def relevancy_pictures(
 
     Args:
         scene: Gaussians and cameras.
-        found: what was asked and found.
+        localization: relevancy and boxes of the words.
         per_word: views drawn for each word.
         config: accuracy of the rendering.
 
@@ -61,18 +61,20 @@ def relevancy_pictures(
     if scene.gaussians is None or scene.views is None:
         raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
     cameras = scene.views.cameras
-    boxes_of = {word: [box for box in found.boxes if box.query == word] for word in found.queries}
+    boxes_of = {word: [box for box in localization.boxes if box.query == word] for word in localization.queries}
     groups = [
         boxes_of[word][0].rows if boxes_of[word] else np.flatnonzero(relevancy >= threshold)
-        for word, relevancy, threshold in zip(found.queries, found.relevancy, found.thresholds, strict=True)
+        for word, relevancy, threshold in zip(
+            localization.queries, localization.relevancy, localization.thresholds, strict=True
+        )
     ]
     chosen = best_views(scene.gaussians, cameras, groups, per_word)
-    for index, word in enumerate(found.queries):
+    for index, word in enumerate(localization.queries):
         boxes = boxes_of[word]
         for view in chosen[index]:
             b = blend(scene.gaussians, cameras, view, config=config)
             rgb = render_image(scene.gaussians, cameras, view, blended=b)
-            scores = torch.from_numpy(np.nan_to_num(found.relevancy[index], nan=0.0))
+            scores = torch.from_numpy(np.nan_to_num(localization.relevancy[index], nan=0.0))
             heat = b.render(scores).reshape(b.shape).numpy()
             picture = relevancy_overlay(rgb, heat)
             pose, K = cameras.cam_from_world[view], cameras.Ks[view]

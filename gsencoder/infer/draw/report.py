@@ -104,12 +104,12 @@ class HtmlReport:
         Raises:
             InputError: a row of another length than the head.
         """
-        bad = [place for place, row in enumerate(rows) if len(row) != len(columns)]
+        bad = [index for index, row in enumerate(rows) if len(row) != len(columns)]
         if bad:
             raise InputError(f"HtmlReport.table: row {bad[0]} has {len(rows[bad[0]])} cells, expected {len(columns)}")
         kinds = [
-            ' class="number"' if rows and all(_is_number(row[place]) for row in rows) else ""
-            for place in range(len(columns))
+            ' class="number"' if rows and all(_is_number(row[index]) for row in rows) else ""
+            for index in range(len(columns))
         ]
         head = "".join(f"<th{kind}>{escape(name)}</th>" for name, kind in zip(columns, kinds, strict=True))
         body = "".join(
@@ -137,11 +137,11 @@ class HtmlReport:
         facts = "".join(
             f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in self._facts.items()
         )
-        headed = [(place, heading) for place, (heading, _) in enumerate(self._sections) if heading]
-        links = "".join(f'<a href="#s{place}">{escape(heading)}</a>' for place, heading in headed)
+        headed = [(index, heading) for index, (heading, _) in enumerate(self._sections) if heading]
+        links = "".join(f'<a href="#s{index}">{escape(heading)}</a>' for index, heading in headed)
         sections = "".join(
-            f'<section id="s{place}">{f"<h2>{escape(heading)}</h2>" if heading else ""}{"".join(parts)}</section>'
-            for place, (heading, parts) in enumerate(self._sections)
+            f'<section id="s{index}">{f"<h2>{escape(heading)}</h2>" if heading else ""}{"".join(parts)}</section>'
+            for index, (heading, parts) in enumerate(self._sections)
         )
         return (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'

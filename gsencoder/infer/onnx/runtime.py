@@ -53,10 +53,10 @@ class OnnxEncoder:
         try:
             self.header: OnnxHeader = from_metadata(self._session.get_modelmeta().custom_metadata_map)
             expected = {f"{name}: {self._type(name)}" for name in (*FIELDS, *SETTINGS)}
-            found = {f"{each.name}: {each.type}" for each in self._session.get_inputs()}
-            found |= {f"{each.name}: {each.type}" for each in self._session.get_overridable_initializers()}
-            if found != expected or OUTPUT not in [each.name for each in self._session.get_outputs()]:
-                raise InputError(f"expected inputs {', '.join(sorted(expected))}, got {', '.join(sorted(found))}")
+            inputs = {f"{each.name}: {each.type}" for each in self._session.get_inputs()}
+            inputs |= {f"{each.name}: {each.type}" for each in self._session.get_overridable_initializers()}
+            if inputs != expected or OUTPUT not in [each.name for each in self._session.get_outputs()]:
+                raise InputError(f"expected inputs {', '.join(sorted(expected))}, got {', '.join(sorted(inputs))}")
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from error
         if not summed:
@@ -131,12 +131,12 @@ class OnnxEncoder:
     ) -> Float32[np.ndarray, "n channels"]:
         feed = feed_of(subset, scene_curves, voxel)
         try:
-            (found,) = self._session.run([OUTPUT], feed)
+            (features,) = self._session.run([OUTPUT], feed)
         except Exception as error:  # onnxruntime raises its own classes, which share only this base
             raise InputError(f"{self.name}: onnxruntime could not run it: {_first_line(error)}") from error
-        if found.shape != (len(subset), self.header.outputs.channels):
-            raise InputError(f"{self.name}: expected {self.header.outputs.channels} channels, got {found.shape}")
-        return np.asarray(found, np.float32)
+        if features.shape != (len(subset), self.header.outputs.channels):
+            raise InputError(f"{self.name}: expected {self.header.outputs.channels} channels, got {features.shape}")
+        return np.asarray(features, np.float32)
 
 
 def feed_of(subset: Gaussians, scene_curves: SceneCurves | None, voxel: float) -> dict[str, np.ndarray]:

@@ -148,31 +148,33 @@ def _candidates(
     config: ViewsConfig,
     judged: BlendConfig,
 ) -> _Candidates:
-    own = scene.views.cameras if scene.views is not None and len(scene.views) else None
-    if config.source == "frames" and own is None:
+    scene_cameras = scene.views.cameras if scene.views is not None and len(scene.views) else None
+    if config.source == "frames" and scene_cameras is None:
         raise InputError(f"views: scene {scene.name} has no cameras of its own; take choose.source=shells")
     names: list[str] = []
     frames: list[int | None] = []
     parts: list[Cameras] = []
     spaces = [free.without(target.rows) for target in targets]
-    if config.source != "shells" and own is not None and scene.views is not None:
+    if config.source != "shells" and scene_cameras is not None and scene.views is not None:
         room = config.candidates if config.source == "frames" else config.candidates // 2
         if scene.views.images is not None and room >= 2 * len(targets):
             large = photograph_cameras(scene.views)
             for target, space, part in zip(targets, spaces, _split_evenly(room // 2, len(targets)), strict=True):
-                best = frames_on(own, gaussians, [target], part, [space])
+                best = frames_on(scene_cameras, gaussians, [target], part, [space])
                 near, rows = closeups(large.select(best), gaussians, target, width=config.width, height=config.height)
                 parts.append(near)
                 names += [f"{scene.views.names[view]} near {target.name}" for view in best[rows]]
                 frames += best[rows].tolist()
-        photograph_at = frames_on(own, gaussians, targets, room - len(frames), spaces)
-        parts.append(_downscaled(own.select(photograph_at), config))
+        photograph_at = frames_on(scene_cameras, gaussians, targets, room - len(frames), spaces)
+        parts.append(_downscaled(scene_cameras.select(photograph_at), config))
         names += [scene.views.names[view] for view in photograph_at]
         frames += photograph_at.tolist()
     if config.source != "frames":
-        if own is not None:
-            watchers = frames_on(own, gaussians, targets, max(CONSTANTS.free_space_cameras, len(targets)), spaces)
-            free = free.seen_by(own.select(watchers), judged)
+        if scene_cameras is not None:
+            watchers = frames_on(
+                scene_cameras, gaussians, targets, max(CONSTANTS.free_space_cameras, len(targets)), spaces
+            )
+            free = free.seen_by(scene_cameras.select(watchers), judged)
         for target, room in zip(targets, _split_evenly(config.candidates - len(frames), len(targets)), strict=True):
             around = shell_cameras(
                 gaussians,
@@ -195,7 +197,11 @@ def _candidates(
         raise InputError(
             f"views: there is no room for a camera around {', '.join(target.name for target in targets)} "
             f"(pictures of {config.width} x {config.height} pixels, {config.fov:g} degrees); "
-            + ("choose.method=uniform looks at all of the splat" if own is None else "take choose.source=frames")
+            + (
+                "choose.method=uniform looks at all of the splat"
+                if scene_cameras is None
+                else "take choose.source=frames"
+            )
         )
     return _Candidates(cameras, names, frames)
 

@@ -48,13 +48,13 @@ def closeups(
         K[:2] *= (np.array([width, height]) / window)[:, None]
         rows.append(view)
         Ks.append(K)
-    found = np.array(rows, np.int64)
+    chosen_rows = np.array(rows, np.int64)
     return (
         Cameras(
-            cam_from_world=frames.cam_from_world[found],
+            cam_from_world=frames.cam_from_world[chosen_rows],
             Ks=np.array(Ks, np.float32).reshape(-1, 3, 3),
-            widths=np.full(len(found), width, np.int32),
-            heights=np.full(len(found), height, np.int32),
+            widths=np.full(len(chosen_rows), width, np.int32),
+            heights=np.full(len(chosen_rows), height, np.int32),
         ),
-        found,
+        chosen_rows,
     )

@@ -78,8 +78,8 @@ def _fill_shares(cameras: Cameras, target: Target) -> Float64[np.ndarray, " V"]:
     radius = target.radius * cameras.Ks[:, 0, 0] / np.maximum(depths, CONSTANTS.min_frame_depth)
     radius = np.minimum(radius, cameras.widths + cameras.heights)
     filled = np.ones(len(cameras))
-    for place, size in zip(pixels.T, (cameras.widths, cameras.heights), strict=True):
-        filled *= np.clip(np.minimum(place + radius, size) - np.maximum(place - radius, 0), 0, None) / size
+    for position, size in zip(pixels.T, (cameras.widths, cameras.heights), strict=True):
+        filled *= np.clip(np.minimum(position + radius, size) - np.maximum(position - radius, 0), 0, None) / size
     return np.where(depths > -target.radius, filled, 0)
 
 

@@ -35,8 +35,8 @@ class FreeSpace:
             solid = np.arange(len(gaussians))
         self._gaussians, self._quats = gaussians, gaussians.quats[solid]
         means = gaussians.means[solid].astype(np.float64)
-        asked = means[even_indices(len(means), CONSTANTS.spacing_sample)]
-        distances = cKDTree(means).query(asked, k=[min(NEIGHBOR + 1, len(means))])[0]
+        sample = means[even_indices(len(means), CONSTANTS.spacing_sample)]
+        distances = cKDTree(means).query(sample, k=[min(NEIGHBOR + 1, len(means))])[0]
         # Of a single Gaussian, and of many in one place, the size is known.
         self.cell = CONSTANTS.cell_spacings * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))
         self._patches = patches(gaussians.select(solid), self.cell)
@@ -87,8 +87,8 @@ class FreeSpace:
         codes = self._codes(points)
         if not len(self._occupied):
             return np.zeros(len(points), bool)
-        places = np.searchsorted(self._occupied, codes).clip(max=len(self._occupied) - 1)
-        return np.asarray(self._occupied[places] == codes)
+        slots = np.searchsorted(self._occupied, codes).clip(max=len(self._occupied) - 1)
+        return np.asarray(self._occupied[slots] == codes)
 
     def first_hit(
         self,
@@ -128,11 +128,11 @@ class FreeSpace:
 
     def seen_empty(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether some watcher looked through each point, at a surface at least a cell behind it."""
-        found = np.zeros(len(points), bool)
+        free = np.zeros(len(points), bool)
         for view, depth in enumerate(self._depths):
             assert self.watchers is not None
             pixels, z = self.watchers.project(points, view)
             shown = self.watchers.in_image(pixels, z, view)
             column, row = (np.where(shown, part, 0).astype(np.int64) for part in pixels.T)
-            found |= shown & (depth[row, column] >= z + self.cell)
-        return found
+            free |= shown & (depth[row, column] >= z + self.cell)
+        return free

@@ -68,19 +68,19 @@ def _mark_position(
     on = pixels[np.linalg.norm(pixels - pixels.mean(axis=0), axis=1).argmin()]
     size = np.array([shown.shape[1], shown.shape[0]], np.float64)
     inner = np.minimum(radius + 1.0, size / 2)
-    places = [on] if math.pi * radius**2 <= MAX_MARK_COVER * len(pixels) else []
+    candidates = [on] if math.pi * radius**2 <= MAX_MARK_COVER * len(pixels) else []
     half = (pixels.max(axis=0) - pixels.min(axis=0)) / 2
     middle = (pixels.max(axis=0) + pixels.min(axis=0)) / 2
     for ring in (1.5, 4.0, 6.5):
         for turn in np.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS) - math.pi / 2:
             way = np.array([math.cos(turn), math.sin(turn)])
-            places.append(middle + way * (np.minimum(half, 4 * radius) + ring * radius))
-    inside = [np.clip(place, inner, size - inner) for place in places]
+            candidates.append(middle + way * (np.minimum(half, 4 * radius) + ring * radius))
+    inside = [np.clip(position, inner, size - inner) for position in candidates]
     others = np.array(photograph_at, np.float64).reshape(-1, 2)
 
-    def faults(place: Float64[np.ndarray, "2"]) -> tuple[bool, bool]:
-        near = np.linalg.norm(others - place, axis=1).min(initial=math.inf) < 2 * radius + 2
-        return bool(near), bool((np.linalg.norm(pixels - place, axis=1) <= radius).mean() > MAX_MARK_COVER)
+    def faults(position: Float64[np.ndarray, "2"]) -> tuple[bool, bool]:
+        near = np.linalg.norm(others - position, axis=1).min(initial=math.inf) < 2 * radius + 2
+        return bool(near), bool((np.linalg.norm(pixels - position, axis=1) <= radius).mean() > MAX_MARK_COVER)
 
     # Of equal places the first: on the target, then nearest to it.
     x, y = min(inside, key=faults)

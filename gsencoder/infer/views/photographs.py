@@ -11,7 +11,7 @@ from PIL import Image
 from gsencoder.core.errors import InputError, listed
 from gsencoder.types import Cameras, Scene, Views
 
-ANGLE, PLACE = 0.01, 1e-3
+ANGLE_TOLERANCE, POSITION_TOLERANCE = 0.01, 1e-3
 """How far two readings of one camera may be from each other: radians or parts of a focal length, and parts of the
 distance between cameras."""
 MAX_NAMED = 3
@@ -69,11 +69,11 @@ def photograph_of(views: Views, frame: int, cameras: Cameras, view: int) -> UInt
     assert views.images is not None
     picture = views.images.photograph_at(frame) if isinstance(views.images, FramePhotographs) else views.images[frame]
     image = Image.fromarray(picture)
-    own, other = views.cameras.Ks[frame].astype(np.float64), cameras.Ks[view].astype(np.float64)
+    frame_K, view_K = views.cameras.Ks[frame].astype(np.float64), cameras.Ks[view].astype(np.float64)
     size = np.array([cameras.widths[view], cameras.heights[view]])
     # Pixels of the frame's camera: where the window begins, and how large it is; then pixels as they were taken.
-    zoom = np.diag(own)[:2] / np.diag(other)[:2]
-    begins = own[:2, 2] - zoom * other[:2, 2]
+    zoom = np.diag(frame_K)[:2] / np.diag(view_K)[:2]
+    begins = frame_K[:2, 2] - zoom * view_K[:2, 2]
     photograph_at = np.array(image.size) / (views.cameras.widths[frame], views.cameras.heights[frame])
     low, high = (np.clip(photograph_at * edge, 0, image.size) for edge in (begins, begins + zoom * size))
     if max(np.abs(low).max(), np.abs(high - image.size).max()) < POSE_TOLERANCE_PIXELS:
@@ -95,37 +95,43 @@ def with_photographs(scene: Scene, photographed: Scene) -> Scene:
         raise InputError(f"photos: the features of {scene.name} have no cameras that photographs could belong to")
     if photographed.views is None or photographed.views.images is None:
         raise InputError(f"photos: scene {photographed.name} has no photographs")
-    place = {name: row for row, name in enumerate(photographed.views.names)}
-    missing = [name for name in scene.views.names if name not in place]
+    row_of = {name: row for row, name in enumerate(photographed.views.names)}
+    missing = [name for name in scene.views.names if name not in row_of]
     if missing:
         raise InputError(
             f"photos: scene {photographed.name} has no photograph of {len(missing)} of {len(scene.views)} frames: "
             f"{listed(missing, MAX_NAMED)}"
         )
-    rows = np.array([place[name] for name in scene.views.names], np.int64)
-    own, other = scene.views.cameras, photographed.views.cameras.select(rows)
+    rows = np.array([row_of[name] for name in scene.views.names], np.int64)
+    scene_cameras, photo_cameras = scene.views.cameras, photographed.views.cameras.select(rows)
     apart = [
-        scene.views.names[view] for view in np.flatnonzero(_differ(own, other, photographed.origin - scene.origin))
+        scene.views.names[view]
+        for view in np.flatnonzero(_differ(scene_cameras, photo_cameras, photographed.origin - scene.origin))
     ]
     if apart:
         raise InputError(
             f"photos: the cameras of scene {photographed.name} are not those of the features: {len(apart)} of "
             f"{len(scene.views)} differ, {listed(apart, MAX_NAMED)}; give the scene that the features were made from"
         )
-    return replace(scene, views=replace(scene.views, images=FramePhotographs(photographed.views, rows, own)))
+    return replace(scene, views=replace(scene.views, images=FramePhotographs(photographed.views, rows, scene_cameras)))
 
 
-def _differ(own: Cameras, other: Cameras, offset: np.ndarray) -> np.ndarray:
+def _differ(scene_cameras: Cameras, photo_cameras: Cameras, offset: np.ndarray) -> np.ndarray:
     """Which cameras of two lists are not the same, whatever the sizes of their pictures."""
-    sizes = [np.stack((each.widths, each.heights), axis=1) for each in (own, other)]
+    sizes = [np.stack((each.widths, each.heights), axis=1) for each in (scene_cameras, photo_cameras)]
     fields = [
-        each.Ks[:, :2].astype(np.float64) / size[:, :, None] for each, size in zip((own, other), sizes, strict=True)
+        each.Ks[:, :2].astype(np.float64) / size[:, :, None]
+        for each, size in zip((scene_cameras, photo_cameras), sizes, strict=True)
     ]
-    turned = np.abs(own.cam_from_world[:, :3, :3] - other.cam_from_world[:, :3, :3]).max(axis=(1, 2))
-    centers = own.centers
-    away = np.linalg.norm(other.centers + offset - centers, axis=1)
+    rotation_error = np.abs(scene_cameras.cam_from_world[:, :3, :3] - photo_cameras.cam_from_world[:, :3, :3]).max(
+        axis=(1, 2)
+    )
+    centers = scene_cameras.centers
+    distance = np.linalg.norm(photo_cameras.centers + offset - centers, axis=1)
     # Single precision keeps positions to a ten-millionth of their distance from the origin.
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    room = PLACE * spread + 1e-5 * np.abs(centers).max()
-    bent = np.abs(fields[0] - fields[1]).max(axis=(1, 2))
-    return np.asarray((turned > ANGLE) | (away > room) | (bent > ANGLE))
+    position_tolerance = POSITION_TOLERANCE * spread + 1e-5 * np.abs(centers).max()
+    intrinsics_error = np.abs(fields[0] - fields[1]).max(axis=(1, 2))
+    return np.asarray(
+        (rotation_error > ANGLE_TOLERANCE) | (distance > position_tolerance) | (intrinsics_error > ANGLE_TOLERANCE)
+    )

@@ -70,8 +70,8 @@ def score_views(
         return [each.seen(b, weights, small, view, config) for each in watched]
 
     # Whole views share the threads out better than parts of small ones.
-    found = parallel(one, range(len(cameras)))
-    return tuple(_stack_scores([each[place] for each in found]) for place in range(len(targets)))
+    per_view = parallel(one, range(len(cameras)))
+    return tuple(_stack_scores([each[index] for each in per_view]) for index in range(len(targets)))
 
 
 def replace_with_photographs(looks: ViewScores, photograph_at: Bool[np.ndarray, " V"]) -> ViewScores:
@@ -125,14 +125,14 @@ class _TargetProbe:
         shown = b.render(self._member)
         # What is half transparent at a target's rim belongs to what is behind it, too.
         solid = alone >= CONSTANTS.solid_share * float(alone.max())
-        whole = float(alone[solid].sum())
+        total = float(alone[solid].sum())
         mine = weights[self._rows]
         depths = b.depths.numpy()[self._rows].astype(np.float64)
         pixels = float(small.Ks[view, 0, 0]) * self._sizes / np.maximum(depths, config.near)
         target, context = (weights[rows].astype(np.float32) for rows in self._samples)
         inside = small.in_image(*small.project(self._alone.means.astype(np.float64), view), view)
         return _TargetInView(
-            visible=min(float(shown[solid].sum()) / whole, 1.0) if whole > CONSTANTS.min_weight else 0.0,
+            visible=min(float(shown[solid].sum()) / total, 1.0) if total > CONSTANTS.min_weight else 0.0,
             share=float(shown.mean()),
             inside=float(inside.mean()),
             alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
@@ -146,11 +146,11 @@ def _around(alone: torch.Tensor, alpha: torch.Tensor) -> float:
     """Mean alpha in the rectangle around what shows the target, with a frame; 0 where nothing shows it."""
     spans = []
     for axis in (1, 0):
-        places = np.flatnonzero((alone > CONSTANTS.min_weight).any(dim=axis).numpy())
-        if not len(places):
+        covered = np.flatnonzero((alone > CONSTANTS.min_weight).any(dim=axis).numpy())
+        if not len(covered):
             return 0.0
-        margin = int(np.ceil(CONSTANTS.frame_margin * (places[-1] - places[0] + 1)))
-        spans.append(slice(max(int(places[0]) - margin, 0), int(places[-1]) + 1 + margin))
+        margin = int(np.ceil(CONSTANTS.frame_margin * (covered[-1] - covered[0] + 1)))
+        spans.append(slice(max(int(covered[0]) - margin, 0), int(covered[-1]) + 1 + margin))
     return float(alpha[spans[0], spans[1]].mean())
 
 

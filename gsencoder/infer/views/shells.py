@@ -65,9 +65,9 @@ def shell_cameras(
         return looking_cameras(centers[tried], -outward[tried], vertical, focal, width, height)
     backed = _background_fraction(target, centers[tried], vertical, free)
     enough = np.sort(backed)[::-1][min(count, len(backed)) - 1]
-    kept = tried[backed >= enough]
-    kept = kept[even_indices(len(kept), count)]
-    return looking_cameras(centers[kept], -outward[kept], vertical, focal, width, height)
+    chosen = tried[backed >= enough]
+    chosen = chosen[even_indices(len(chosen), count)]
+    return looking_cameras(centers[chosen], -outward[chosen], vertical, focal, width, height)
 
 
 def _background_fraction(

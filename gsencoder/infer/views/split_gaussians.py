@@ -52,8 +52,8 @@ def patches(gaussians: Gaussians, edge: float) -> Patches:
         means = gaussians.means[chosen].astype(np.float64)
         if len(offsets) > 1:
             reach = CONSTANTS.surface_sigmas * gaussians.scales[chosen].astype(np.float64)
-            places = np.einsum("nij,nkj->nki", turns[turn_of[chosen]], offsets[None] * reach[:, None])
-            means = (means[:, None] + places).reshape(-1, 3)
+            offsets_rotated = np.einsum("nij,nkj->nki", turns[turn_of[chosen]], offsets[None] * reach[:, None])
+            means = (means[:, None] + offsets_rotated).reshape(-1, 3)
         centers.append(means)
         rows.append(np.repeat(chosen, len(offsets)))
         scales.append(np.repeat(gaussians.scales[chosen] / kind.astype(np.float32), len(offsets), axis=0))

@@ -44,20 +44,20 @@ def target_of(name: str, gaussians: Gaussians, rows: Integer[np.ndarray, " n"]) 
     return Target(name=name, rows=np.asarray(rows), center=center, radius=radius)
 
 
-def best_boxes(found: Localization, per_word: int) -> tuple[Box, ...]:
+def best_boxes(localization: Localization, per_word: int) -> tuple[Box, ...]:
     """So many boxes of each word, best first within it."""
-    return tuple(box for box in found.boxes if box.rank < per_word)
+    return tuple(box for box in localization.boxes if box.rank < per_word)
 
 
-def targets_of(gaussians: Gaussians, found: Localization, per_word: int = 1) -> tuple[Target, ...]:
+def targets_of(gaussians: Gaussians, localization: Localization, per_word: int = 1) -> tuple[Target, ...]:
     """The best boxes of each word as targets; words without a box give none.
 
     Args:
         gaussians: the scene's.
-        found: what was asked and found.
+        localization: relevancy and boxes of the words.
         per_word: boxes taken of each word, best first.
     """
-    boxes = best_boxes(found, per_word)
+    boxes = best_boxes(localization, per_word)
     names = [box.query if box.rank == 0 else f"{box.query} {box.rank + 1}" for box in boxes]
     return tuple(target_of(name, gaussians, box.rows) for name, box in zip(names, boxes, strict=True))
 

@@ -108,7 +108,7 @@ def feature_tokens(blends: Sequence[Blend], features: GaussianFeatures) -> Float
     if features.basis is None:
         values = values - torch.from_numpy(features.mean)
     values = values * torch.from_numpy(features.seen)[:, None]
-    found = torch.stack([each.render(values) for each in blends])
+    tokens = torch.stack([each.render(values) for each in blends])
     if features.basis is not None:
-        found = found @ torch.from_numpy(features.basis.components)
-    return found + torch.from_numpy(features.mean)
+        tokens = tokens @ torch.from_numpy(features.basis.components)
+    return tokens + torch.from_numpy(features.mean)
