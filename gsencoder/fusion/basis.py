@@ -114,6 +114,6 @@ def table_basis(
     return fit_basis(mean.astype(np.float64), centered.T @ centered / len(table), space, energy=energy)
 
 
-def encode(basis: FeatureBasis, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:
+def to_coordinates(basis: FeatureBasis, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:
     """Coordinates of vectors: (x − mean) @ componentsᵀ."""
     return ((vectors - basis.mean) @ basis.components.T).astype(np.float32)

@@ -9,7 +9,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.types import GaussianFeatures
 
-SAMPLE = 20_000
+DEFAULT_SAMPLE = 20_000
 CHUNK = 4096
 
 
@@ -33,7 +33,7 @@ class FieldError:
         return 1 - self.covered * (1 - self.centered)
 
 
-def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, sample: int = SAMPLE) -> FieldError:
+def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, sample: int = DEFAULT_SAMPLE) -> FieldError:
     """Compares two fields in the full space.
 
     Args:

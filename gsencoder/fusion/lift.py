@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float32
 
 from gsencoder.core.runtime.clock import timed
-from gsencoder.fusion.basis import encode
+from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import depth_image
@@ -67,7 +67,7 @@ class FeatureSums:
             vectors = np.where(scale[:, None] > 0, vectors, np.float32(0))
         if share is not None:
             scale *= share
-        maps = encode(self.basis, vectors) if self.basis is not None else vectors
+        maps = to_coordinates(self.basis, vectors) if self.basis is not None else vectors
         if scale.min() < 1:
             maps = maps * scale[:, None]
         b.lift_into(torch.from_numpy(maps), torch.from_numpy(self.sums))
@@ -80,7 +80,7 @@ class FeatureSums:
             weights, sums = self.weights, self.sums
         else:
             weights = self.sums.sum(axis=1)
-            sums = self.sums @ (encode(self.basis, self.table) if self.basis is not None else self.table)
+            sums = self.sums @ (to_coordinates(self.basis, self.table) if self.basis is not None else self.table)
         # A row whose whole weight is below the smallest normal number would divide into noise or infinity.
         seen = weights > np.finfo(np.float32).tiny
         features = np.divide(sums, weights[:, None], where=seen[:, None], out=np.zeros_like(sums))

@@ -93,7 +93,7 @@ class DenseSeeds:
     coverage: tuple[float, float]
 
 
-def coverage(cameras: Cameras, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
+def covered_share(cameras: Cameras, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
     """Mean share of the pictures' cells into which some point projects; occlusion is not tested."""
     shares = []
     for view in views:
@@ -126,7 +126,7 @@ def densify(
         track: progress.
     """
     cameras = photographs.cameras
-    before = coverage(cameras, training, points)
+    before = covered_share(cameras, training, points)
     if before >= config.enough:
         return None
     neighbors = source_views(cameras, points, training, config.sources)
@@ -152,7 +152,7 @@ def densify(
     filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
     filled = carve(*filled, consistent, photos, poses, DEPTH_TOLERANCE)
     positions, tints = (np.concatenate(arrays) for arrays in zip((points, colors), swept, filled, strict=True))
-    after = coverage(cameras, training, positions)
+    after = covered_share(cameras, training, positions)
     return DenseSeeds(
         points=positions, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after)
     )

@@ -17,7 +17,7 @@ from gsencoder.core.files.archive import open_archive, warn_without_checksums, w
 from gsencoder.core.files.npz import read_npz
 from gsencoder.types import FeatureSpace
 
-UNIT_TOLERANCE = 1e-2
+NORM_TOLERANCE = 1e-2
 """How far from 1 the norm of a stored embedding may be: float16 rounding is about 1e-3."""
 FORMAT_1 = "gsencoder text table 1"
 LONGEST_SHOWN = 80
@@ -82,7 +82,7 @@ class TextTable:
                 f"{table.shape[1]} and a mean of {self.mean.shape}"
             )
         norms = np.sqrt((table.astype(np.float64) ** 2).sum(axis=1))
-        bad = np.flatnonzero(~(np.abs(norms - 1) <= UNIT_TOLERANCE))
+        bad = np.flatnonzero(~(np.abs(norms - 1) <= NORM_TOLERANCE))
         if bad.size or not np.isfinite(self.mean).all():
             first = "the mean is not finite"
             if bad.size:
@@ -153,7 +153,7 @@ def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) 
 def unrounded(table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C D"]:
     """Unit vectors from rounded ones; rows far from unit length stay as they are, for TextTable to complain about."""
     norms = np.linalg.norm(table, axis=1, keepdims=True)
-    rounded = np.abs(norms - 1) <= UNIT_TOLERANCE
+    rounded = np.abs(norms - 1) <= NORM_TOLERANCE
     return np.asarray(np.where(rounded, table / np.where(rounded, norms, 1), table))
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
-from gsencoder.fusion.basis import Moments, encode, fit_basis, table_basis
+from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers import Teacher
@@ -89,7 +89,7 @@ def _coded_space(
     use_basis = config.basis and teacher.space.channels > config.narrow
     basis = table_basis(table, mean, teacher.space, energy=config.table_energy) if use_basis else None
     space = OutputSpace(space=teacher.space, mean=mean, scale=scale, basis=basis)
-    return space, space.standardize(encode(basis, table) if basis is not None else table)
+    return space, space.standardize(to_coordinates(basis, table) if basis is not None else table)
 
 
 def _dense_space(moments: Moments, teacher: Teacher, config: FuseConfig) -> OutputSpace:

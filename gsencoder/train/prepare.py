@@ -17,7 +17,7 @@ from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.runtime.tracking import Track
-from gsencoder.fusion.basis import encode
+from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import capped
 from gsencoder.fusion.teacher_maps import CachedTeacher
@@ -309,5 +309,5 @@ def _pool_map(
 def _standardize(vectors: np.ndarray, outputs: OutputSpace) -> np.ndarray:
     """Projects vectors [..., D] to the basis, if there is one, and converts them to standard units."""
     flat = vectors.reshape(-1, vectors.shape[-1])
-    coordinates = encode(outputs.basis, flat) if outputs.basis is not None else flat
+    coordinates = to_coordinates(outputs.basis, flat) if outputs.basis is not None else flat
     return outputs.standardize(coordinates).reshape(*vectors.shape[:-1], -1)

@@ -6,7 +6,7 @@ import torch
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.basis import Moments, encode, fit_basis, table_basis
+from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
 from gsencoder.render import blend
 from gsencoder.types import FeatureSpace
 
@@ -67,7 +67,7 @@ def test_all_the_energy_of_exactly_low_rank_vectors_needs_only_that_rank(rng: np
     moments = moments_of(x)
     basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=1.0)
     assert basis.rank == 5
-    np.testing.assert_allclose(encode(basis, x) @ basis.components + basis.mean, x, atol=1e-4)
+    np.testing.assert_allclose(to_coordinates(basis, x) @ basis.components + basis.mean, x, atol=1e-4)
 
 
 def test_components_are_orthonormal_and_the_same_on_a_rerun(rng: np.random.Generator) -> None:
@@ -89,7 +89,7 @@ def test_a_constant_feature_has_a_basis_of_rank_one_that_reproduces_it() -> None
     moments = moments_of(x)
     basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=0.9)
     assert basis.rank == 1
-    np.testing.assert_allclose(encode(basis, x) @ basis.components + basis.mean, x)
+    np.testing.assert_allclose(to_coordinates(basis, x) @ basis.components + basis.mean, x)
 
 
 def test_rendering_coordinates_then_decoding_equals_rendering_features(rng: np.random.Generator) -> None:
@@ -98,7 +98,7 @@ def test_rendering_coordinates_then_decoding_equals_rendering_features(rng: np.r
     moments = moments_of(x)
     basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=1.0)
     b = blend(random_gaussians(200), front_camera(), patch=7)
-    rendered = b.render(torch.from_numpy(encode(basis, x))).numpy()
+    rendered = b.render(torch.from_numpy(to_coordinates(basis, x))).numpy()
     decoded = rendered @ basis.components + b.alpha.numpy()[:, None] * basis.mean
     np.testing.assert_allclose(decoded, b.render(torch.from_numpy(x)).numpy(), atol=1e-3)
 
@@ -107,7 +107,7 @@ def test_a_table_basis_serves_every_row_alike(rng: np.random.Generator) -> None:
     table = rng.normal(size=(6, 24)).astype(np.float32)
     basis = table_basis(table, table.mean(axis=0), SPACE, energy=1.0)
     assert basis.rank == 5
-    np.testing.assert_allclose(encode(basis, table) @ basis.components + basis.mean, table, atol=1e-5)
+    np.testing.assert_allclose(to_coordinates(basis, table) @ basis.components + basis.mean, table, atol=1e-5)
 
 
 def test_bad_knobs_and_bad_vectors_are_refused() -> None:

@@ -19,7 +19,7 @@ from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 MAX_BITS = 8
 """Of a coordinate."""
-SAMPLE = 10_000
+FIT_SAMPLE = 10_000
 """Gaussians that levels are fitted to."""
 SAME_KIND_COSINE = 0.9
 """Rows whose centered cosine is above are of one kind."""
@@ -143,14 +143,14 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
     rows = np.flatnonzero(features.seen)
     if not len(rows):
         raise InputError("compact: no Gaussian has features")
-    sample = rows[even_indices(len(rows), SAMPLE)]
+    sample = rows[even_indices(len(rows), FIT_SAMPLE)]
     bound = min(MIN_COSINE, 1 - 10 * error)
     for _ in range(RETRIES):
         compacted, cosines = _within(features, rows, sample, error)
         missed = np.setdiff1d(rows[cosines < bound], sample)
         if not len(missed):
             break
-        sample = np.union1d(sample, missed[even_indices(len(missed), SAMPLE // 4)])
+        sample = np.union1d(sample, missed[even_indices(len(missed), FIT_SAMPLE // 4)])
     return compacted
 
 
