@@ -75,7 +75,7 @@ def test_a_rare_kind_is_kept_as_well_as_a_common_one() -> None:
 
 
 def test_a_kind_that_the_sample_misses_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "SAMPLE", 200)
+    monkeypatch.setattr(module, "FIT_SAMPLE", 200)
     features = make_features(n=10_000, rank=12, kinds=6)
     values = features.features.copy()
     hidden = np.arange(5001, 5040)
