@@ -1,4 +1,4 @@
-"""How cameras, scenes, feature spaces and bases lie in an archive: written and read here for every file."""
+"""Cameras, scenes, feature spaces and bases in archives: the arrays and header values that all files share."""
 
 from typing import Any
 
@@ -13,26 +13,26 @@ from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, Gaussians, Scen
 
 
 def check_splat(file: Archive, gaussians: Gaussians, advice: str) -> None:
-    """Raises an error with advice unless a file of features was made for exactly these Gaussians.
+    """Checks that a file of features was made for exactly these Gaussians.
 
     Raises:
-        InputError: the fingerprint in its header is of others.
+        InputError: the fingerprint in its header differs; the message ends with `advice`.
     """
-    belongs, actual = file.value("fingerprint", str), fingerprint(gaussians)
-    if belongs != actual:
-        raise InputError(f"the features belong to splat {belongs[:8]}…, the folder holds {actual[:8]}…; {advice}")
+    expected, actual = file.value("fingerprint", str), fingerprint(gaussians)
+    if expected != actual:
+        raise InputError(f"the features belong to splat {expected[:8]}…, the folder holds {actual[:8]}…; {advice}")
 
 
 def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:
-    """The arrays that hold cameras."""
+    """The arrays of cameras, by name."""
     return {name: getattr(cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights")}
 
 
 def read_cameras(file: Archive) -> Cameras:
-    """The cameras that a file holds.
+    """Reads cameras.
 
     Raises:
-        InputError: missing, damaged, or no cameras.
+        InputError: missing, damaged, or not cameras.
     """
     return Cameras(
         cam_from_world=file.array("cam_from_world", "float32", ("V", 4, 4)),
@@ -45,7 +45,7 @@ def read_cameras(file: Archive) -> Cameras:
 def space_parts(
     space: FeatureSpace, mean: Float32[np.ndarray, " D"], basis: FeatureBasis | None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the header values that hold a feature space, its mean, and a basis where there is one."""
+    """The arrays and header values of a feature space, its mean, and its basis if there is one."""
     arrays: dict[str, np.ndarray] = {"mean": mean}
     header: dict[str, Any] = {"space": {name: getattr(space, name) for name in space.__dataclass_fields__}}
     if basis is not None:
@@ -55,7 +55,7 @@ def space_parts(
 
 
 def read_space(file: Archive) -> tuple[FeatureSpace, Float32[np.ndarray, " D"], FeatureBasis | None]:
-    """The feature space that a file holds, its mean, and its basis.
+    """Reads a feature space, its mean, and its basis or None.
 
     Raises:
         InputError: missing, damaged, or other fields than a feature space has.
@@ -71,7 +71,7 @@ def read_space(file: Archive) -> tuple[FeatureSpace, Float32[np.ndarray, " D"], 
 
 
 def scene_parts(scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the header values that hold what a scene is beside its Gaussians and features."""
+    """The arrays and header values of a scene, without its Gaussians and features."""
     arrays: dict[str, np.ndarray] = {"origin": scene.origin}
     header: dict[str, Any] = {"name": scene.name, "metres_per_unit": scene.metres_per_unit}
     header["up"] = None if scene.up is None else scene.up.tolist()
@@ -82,7 +82,7 @@ def scene_parts(scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def read_scene(file: Archive, gaussians: Gaussians) -> Scene:
-    """The scene that a file holds, of Gaussians that may lie elsewhere.
+    """Reads a scene; its Gaussians are given, since they may be in another file.
 
     Raises:
         InputError: missing or damaged.

@@ -11,12 +11,13 @@ from gsencoder.types.cameras import intrinsic_matrix
 from gsencoder.types.poses import look_at, perpendicular
 
 COVERED = 0.95
-"""The opacity-weighted share of the Gaussians that must fit into the picture, …"""
-FARTHEST_COVERED = 3.0
-"""… but none further than this many opacity-weighted median distances from the center: those are floaters."""
+"""Opacity-weighted share of the Gaussians that must fit into the picture."""
+MAX_COVERED = 3.0
+"""Largest radius that must fit, in opacity-weighted median distances from the center; farther Gaussians are floaters.
+"""
 MARGIN = 1.1
-NEAREST = 0.05
-"""Cameras are never closer than this to the center: renderers cut everything nearer than 0.01 off."""
+MIN_DISTANCE = 0.05
+"""Smallest distance of cameras from the center, since renderers clip everything nearer than 0.01."""
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
@@ -32,18 +33,18 @@ def orbit_cameras(
     """Cameras on a sphere around a splat, looking at its center.
 
     The center is the opacity-weighted median of the means, coordinate by coordinate, and the radius 1.1 times the
-    opacity-weighted 95 % quantile of the distance from it, at most 3.3 times its median, so that floaters move neither
-    far (and at least 3 median standard deviations, for a single Gaussian). The distance is the one at which a ball of
-    that radius fits into the smaller field of view. Directions follow a golden-angle spiral.
+    opacity-weighted 95 % quantile of the distance from it, at most 3.3 times its median, so that floaters change
+    neither much (and at least 3 median standard deviations, for a single Gaussian). The distance is the one at which a
+    ball of that radius fits into the smaller field of view. Directions follow a golden-angle spiral.
 
     Args:
         gaussians: at least one.
-        count: cameras.
+        count: number of cameras.
         width: of the pictures, pixels.
         height: of the pictures, pixels.
         fov_degrees: horizontal field of view.
-        up: where known, cameras keep between 15° below and 60° above the horizon. Where not (None), nothing says which
-            way is down: they surround the splat on all sides, and -y is upward in the pictures, as in COLMAP's worlds.
+        up: if known, cameras are between 15° below and 60° above the horizon. If None, cameras surround the splat on
+            all sides, and -y is upward in the pictures, as in COLMAP's worlds.
 
     Returns:
         `count` cameras, relative to the origin of the Gaussians.
@@ -61,7 +62,7 @@ def orbit_cameras(
     center, radius = robust_ball(gaussians)
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
     half_field = math.atan(min(width, height) / 2 / focal)
-    distance = max(radius / math.sin(half_field), NEAREST)
+    distance = max(radius / math.sin(half_field), MIN_DISTANCE)
     outward, vertical = spiral_directions(count, up)
     return looking_cameras(center + distance * outward, -outward, vertical, focal, width, height)
 
@@ -69,22 +70,22 @@ def orbit_cameras(
 def spiral_directions(
     count: int, up: Float64[np.ndarray, "3"] | None
 ) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "3"]]:
-    """Unit vectors spread evenly over the directions from which things are looked at, and the vertical.
+    """Unit vectors from the center to the cameras, evenly spread, and the vertical.
 
     Args:
-        count: how many, along a golden-angle spiral.
-        up: where known, they keep between 15° below and 60° above the horizon; else they go all around, but for the
+        count: number of directions, along a golden-angle spiral.
+        up: if known, they are between 15° below and 60° above the horizon; else they cover all directions except the
             poles of -y.
 
     Raises:
-        InputError: an up that is no direction.
+        InputError: `up` is not a direction.
     """
     vertical = np.array([0.0, -1.0, 0.0]) if up is None else np.asarray(up, np.float64)
     length = float(np.linalg.norm(vertical))
     if not 1e-6 < length < 1e6:
         raise InputError(f"orbit cameras: up must be a direction, got {vertical.tolist()}")
     vertical = vertical / length
-    # Equal steps of the sine of the elevation share the sphere out evenly.
+    # Equal steps of the sine of the elevation sample the sphere evenly.
     low, high = (-0.9, 0.9) if up is None else (math.sin(math.radians(-15)), math.sin(math.radians(60)))
     steps = (np.arange(count) + 0.5) / count
     sines, turns = low + (high - low) * steps, GOLDEN_ANGLE * np.arange(count)
@@ -104,7 +105,7 @@ def looking_cameras(
 ) -> Cameras:
     """Cameras at `centers` that look along unit vectors, level with `up`, which must not be parallel to any of them.
 
-    They share a focal length and a size in pixels; the principal point is the middle.
+    All have the same focal length and size in pixels; the principal point is the center of the image.
     """
     count = len(centers)
     K = intrinsic_matrix(focal, focal, width / 2, height / 2).astype(np.float32)
@@ -126,7 +127,7 @@ def robust_ball(gaussians: Gaussians) -> tuple[Float64[np.ndarray, "3"], float]:
     distances = np.linalg.norm(means - center, axis=1)
     middle, far = (_weighted_quantile(distances, weights, share) for share in (0.5, COVERED))
     size = _weighted_quantile(gaussians.scales.max(axis=1).astype(np.float64), weights, 0.5)
-    return center, max(MARGIN * min(far, FARTHEST_COVERED * middle), 3 * size)
+    return center, max(MARGIN * min(far, MAX_COVERED * middle), 3 * size)
 
 
 def _weighted_quantile(values: Float64[np.ndarray, " N"], weights: Float64[np.ndarray, " N"], share: float) -> float:

@@ -1,4 +1,4 @@
-"""A scene from whatever folder or file it comes in: transforms.json, COLMAP, ScanNet, or a splat alone."""
+"""Loading of scenes in any supported layout: transforms.json, COLMAP, ScanNet, or a splat alone."""
 
 import math
 import warnings
@@ -43,19 +43,22 @@ FEW_CAMERAS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneConfig:
-    """How a scene is read."""
+    """Options of reading a scene."""
 
-    allow_outside: bool = field(default=False, metadata={"help": "let paths in a scene's files lead out of its folder"})
-    max_views: int = field(default=0, metadata={"help": "at most so many views, evenly spaced; 0 = all"})
+    allow_outside: bool = field(default=False, metadata={"help": "allow files outside the folder of the scene"})
+    max_views: int = field(default=0, metadata={"help": "largest number of views, evenly spaced; 0 = all"})
     depth_scale: float | None = field(
-        default=None, metadata={"help": "world units for each step of a depth file; empty = what the format says"}
+        default=None, metadata={"help": "world units for one step of a depth file; empty = that of the format"}
     )
     image_scale: float = field(
-        default=1.0, metadata={"help": "pictures, depth, masks and intrinsics are made smaller by this, in (0, 1]"}
+        default=1.0,
+        metadata={"help": "factor in (0, 1] by which pictures, depth maps, masks and intrinsics are downscaled"},
     )
-    metres_per_unit: float | None = field(default=None, metadata={"help": "unit of length; empty = what the files say"})
+    metres_per_unit: float | None = field(
+        default=None, metadata={"help": "meters in a world unit; empty = that of the files"}
+    )
     images: str = field(
-        default="", metadata={"help": "folder of the photographs of a COLMAP model; empty = images beside it"}
+        default="", metadata={"help": "folder of the photographs of a COLMAP model; empty = images/ beside the model"}
     )
 
     def __post_init__(self) -> None:
@@ -70,27 +73,27 @@ class SceneConfig:
 
 
 def load_scene(path: str | Path, *, splat: str | Path | None = None, options: SceneConfig = SceneConfig()) -> Scene:
-    """Reads a scene; pictures are opened for their size now and decoded when they are asked for.
+    """Reads a scene; of pictures the size is read now, and they are decoded on access.
 
     Recognized, in this order: a transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender), a COLMAP
     model (sparse/0, sparse, or its files themselves, with images/ beside), a ScanNet export (color/, pose/, …), a
     splat file, or a folder with one splat file or an unpacked .sog.
 
     Cameras and Gaussians are relative to `Scene.origin`: the mean of the camera centers (for a bare splat the median
-    of its means), each coordinate rounded to a multiple of 1000 units. It is taken off in float64.
+    of its means), each coordinate rounded to a multiple of 1000 units. It is subtracted in float64.
 
     Args:
         path: a folder or file.
         splat: the Gaussians of a scene that has views; relative to the scene or else to the current folder. They must
-            be in the world of the cameras. Without it a splat that lies beside the views is not used.
+            be in the world of the cameras. Without it a splat beside the views is not used.
         options: see SceneConfig.
 
     Returns:
-        A scene with views, or with Gaussians only, or both. `views.masks` exists where there are mask files,
+        A scene with views, or with Gaussians only, or both. `views.masks` exists if there are mask files,
         transparency, or pinhole pixels that the distorted picture does not cover.
 
     Raises:
-        InputError: nothing recognized, no view left, or anything in the files that cannot be used.
+        InputError: no scene is recognized, no view is left, or a file is wrong.
     """
     given = Path(path)
     try:
@@ -129,25 +132,25 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
 
 
 def scene_name(path: Path) -> str:
-    """What `load_scene` will call the scene at a path that exists."""
+    """The name that `load_scene` gives the scene at an existing path."""
     if path.is_file():
         return _name_of(path.absolute().parent) if _is_transforms(path) else path.stem
     return _name_of(path)
 
 
 def check_names(paths: Sequence[Path]) -> None:
-    """Complains of two scenes of one name, whose results would lie in one folder.
+    """Checks that no two scenes have the same name, since their results would be in one folder.
 
     Raises:
-        InputError: there are such.
+        InputError: two have.
     """
     first: dict[str, Path] = {}
     for path in paths:
         name = scene_name(path)
         if name in first:
             raise InputError(
-                f"{path} and {first[name]} are both called {name!r}, so their results would lie in one folder; "
-                "rename one, or give each an out= of its own"
+                f"{path} and {first[name]} are both called {name!r}, so their results would be in one folder; "
+                "rename one, or run them with different out="
             )
         first[name] = path
 
@@ -157,18 +160,18 @@ def _is_transforms(path: Path) -> bool:
 
 
 def _name_of(folder: Path) -> str:
-    """What a scene and its output folders are called; of "..", the name of the folder that it leads to."""
+    """The name of a scene and of its output folder; "." and ".." are resolved."""
     return (folder if folder.name not in ("", "..") else folder.resolve()).name or "scene"
 
 
 def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
-    """The scenes that paths name: a path that is a scene itself stays, a folder of scenes becomes its scenes by name.
+    """The scenes at paths: a path is a scene, or a folder of scenes, which are sorted by name.
 
-    A folder is a scene if it holds what `load_scene` looks for; of any other the direct subfolders are looked at. A
-    scene that is named twice, in whatever spelling, is taken once.
+    A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched. A scene
+    that is named twice, also by different paths, is returned once.
 
     Raises:
-        InputError: a path that does not exist, or a folder with no scene in it.
+        InputError: a path does not exist, or a folder holds no scene.
     """
     scenes: dict[Path, Path] = {}
     for given in map(Path, paths):
@@ -179,7 +182,7 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
         except (OSError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(f"{str(given)[:200]!r} cannot be looked into ({type(error).__name__})") from error
+            raise InputError(f"{str(given)[:200]!r} cannot be read ({type(error).__name__})") from error
         if not inside:
             raise InputError(
                 f"{given}: neither a scene nor a folder of scenes; a scene holds {' or '.join(TRANSFORMS)}, a COLMAP "
@@ -191,7 +194,7 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
 
 
 def is_scene(path: Path) -> bool:
-    """Whether `load_scene` would find something to read in a folder, and not below it; files are left to it."""
+    """Whether `load_scene` recognizes a folder itself as a scene; True for any file."""
     if path.is_file():
         return True
     return (
@@ -207,7 +210,7 @@ def _is_listed(entry: Path) -> bool:
 
 
 def _read_views(root: Path, options: SceneConfig) -> tuple[PosedImages | None, Path]:
-    """The posed pictures, and the scene folder; None for a bare splat."""
+    """The posed images, None for a bare splat, and the folder of the scene."""
     outside, scale = options.allow_outside, options.depth_scale
     if root.is_file():
         if _is_transforms(root):
@@ -240,7 +243,7 @@ def _read_colmap(root: Path, model: Path, options: SceneConfig) -> tuple[PosedIm
         images = images if images.is_absolute() or images.is_dir() else root / images
         if not images.is_dir():
             raise InputError(f"images={options.images}: no such folder (looked from here and in {root})")
-        # Naming the folder is leave to read it.
+        # A folder that the user names may be read.
         return read_colmap(model, images, images, allow_outside=options.allow_outside), root
     home = _home(root, model)
     if home is None:
@@ -250,8 +253,8 @@ def _read_colmap(root: Path, model: Path, options: SceneConfig) -> tuple[PosedIm
 
 
 def _home(root: Path, model: Path) -> Path | None:
-    """The folder that holds the photographs of a COLMAP model. It may be given itself, as scene/sparse/0; they then lie
-    up to two folders above."""
+    """The folder with the photographs of a COLMAP model. If the path is that of the model, such as scene/sparse/0, it
+    is up to two levels above."""
     return next((home for home in _homes(root, model) if (home / "images").is_dir()), None)
 
 
@@ -262,7 +265,7 @@ def _homes(root: Path, model: Path) -> list[Path]:
 def make_views(
     posed: PosedImages, *, max_views: int = 0, image_scale: float = 1.0
 ) -> tuple[Views, Float64[np.ndarray, "3"]]:
-    """Cameras without distortion and lazy pictures, and the origin that was taken off them.
+    """Cameras without distortion and lazy pictures, and the origin that was subtracted from the cameras.
 
     Raises:
         InputError: no picture, a picture or depth of the wrong size, a camera that cannot be undistorted.
@@ -317,7 +320,7 @@ def _any(paths: Sequence[Path | None]) -> bool:
 
 
 def _check_sizes(image: PosedImage, depth_camera: CameraModel, where: str) -> bool:
-    """Compares the sizes in the files' headers; True where the photograph has transparency."""
+    """Checks the sizes in the headers of the files; returns whether the photograph has transparency."""
     camera = image.camera
     size, transparent = picture_info(image.image)
     if size != (camera.width, camera.height):
@@ -337,7 +340,8 @@ def _check_sizes(image: PosedImage, depth_camera: CameraModel, where: str) -> bo
 
 
 def _have_empty_pixels(cameras: list[tuple[Pinhole, CameraModel]], remaps: RemapCache) -> bool:
-    """Whether some pinhole pixel has no content. With a camera for every picture looking costs more than masks do."""
+    """Whether some pixel of a pinhole camera is outside the distorted picture. With many cameras the check would cost
+    more than masks do, and the result is True."""
     distorted = [camera for camera in cameras if not camera[1].is_pinhole]
     if len(distorted) > FEW_CAMERAS:
         return True

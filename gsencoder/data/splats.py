@@ -1,4 +1,4 @@
-"""Splat files: `load_splat` and `save_splat` for everyone, `read_raw` for inspect and repair.
+"""Splat files of all formats: `load_splat` and `save_splat`, and `read_raw` for inspection and repair.
 
 The format is told by the first bytes, and by the suffix where a format has no magic (.splat):
 
@@ -172,7 +172,7 @@ def save_splat(
     keep_order: bool = False,
     further: Mapping[str, Float32[np.ndarray, " N"]] | None = None,
 ) -> None:
-    """Writes a splat; the suffix chooses the format, and the file appears whole or not at all.
+    """Writes a splat; the suffix selects the format, and the file is written atomically.
 
     Args:
         path: .ply (INRIA), .compressed.ply or .spz, in any case of letters.
@@ -180,9 +180,9 @@ def save_splat(
         origin: added to the positions in float64. A .ply then has double x y z; .compressed.ply and .spz cannot
             hold coordinates far from zero and are refused or warn.
         spz_version: 4 (zstd), or 3 (gzip) for older readers.
-        keep_order: a .compressed.ply is otherwise written along a Z-order curve, which is what makes its chunks
-            precise, so row i of the file is not row i of `gaussians`. The other formats always keep the order.
-        further: properties of a .ply beside those that it must have, one value a Gaussian, by name.
+        keep_order: whether row i of a .compressed.ply is Gaussian i; otherwise rows follow a Z-order curve, which makes
+            its chunks precise. The other formats always keep the order.
+        further: additional properties of a .ply, one value for each Gaussian, by name.
 
     Precision of a round trip:
         .ply: means exact, quaternions 1e-6, scales 1e-5 relative, opacities 1e-6 (0 and 1 become logits of ±20).
@@ -192,7 +192,7 @@ def save_splat(
         .spz: see `gsencoder.data.splat_formats.spz.write_spz`.
 
     Raises:
-        InputError: a suffix that cannot be written, no Gaussians, a missing folder, or a system that refuses.
+        InputError: a suffix that cannot be written, no Gaussians, a missing folder, or an error of the system.
 
     Warns:
         SceneWarning: values were clipped to the range of a packed format, or positions lose precision in it.

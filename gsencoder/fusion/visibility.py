@@ -1,4 +1,4 @@
-"""Occlusion tests: is a Gaussian at the depth that a depth map says, or behind what is there?"""
+"""Occlusion tests: whether a Gaussian is at the depth of a depth map, or behind it."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal

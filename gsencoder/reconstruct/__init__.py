@@ -1,4 +1,4 @@
-"""Photographs to Gaussians: start from points, optimize, prune, never grow (SplatDistill, section 3.1)."""
+"""Reconstruction of a splat from photographs, by pruning without densification (SplatDistill, sec. 3.1)."""
 
 from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
 

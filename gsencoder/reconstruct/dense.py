@@ -1,4 +1,4 @@
-"""Dense seeds from photographs: nothing grows later, so every surface must be seeded before the first step.
+"""Dense seeds from photographs: there is no densification, so every surface must be seeded before the first step.
 
 Two sources, both checked against other photographs. Textured pixels get the depth of a plane sweep (stereo.py), if
 two other views find a surface at the same place. Pixels between those are given depths interpolated between their

@@ -1,4 +1,4 @@
-"""The scene that a reconstruction starts from: one with poses, or a folder of photographs that SfM places first."""
+"""The scene that a reconstruction starts from: one with poses, or photographs that SfM registers first."""
 
 import os
 import warnings

@@ -1,4 +1,5 @@
-"""Optimization of a splat against photographs: L1 + D-SSIM, depth where it is measured, pruning, no growing."""
+"""Optimization of a splat against photographs: L1 + D-SSIM, a depth loss where depth was measured, pruning, no
+densification."""
 
 import math
 from collections.abc import Mapping, Sequence

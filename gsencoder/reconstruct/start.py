@@ -1,4 +1,4 @@
-"""Initial Gaussians of a reconstruction: its own splat, or seeds for every surface, since nothing grows later."""
+"""Initial Gaussians of a reconstruction: a given splat, or seeds on every surface, since there is no densification."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

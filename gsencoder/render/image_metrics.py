@@ -1,4 +1,4 @@
-"""How alike two pictures are: PSNR and SSIM, the second differentiable."""
+"""Image metrics: PSNR, and SSIM as a differentiable function."""
 
 import math
 

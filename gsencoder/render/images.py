@@ -1,4 +1,4 @@
-"""Pictures of a splat: colors through SH, composited by the same Blend that everything else uses."""
+"""Rendered images of a splat: colors from SH, composited by a Blend, and depth maps."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Rendering that is differentiable in the geometry: what photometric reconstruction needs, and nothing else does.
+"""The rasterizer that is differentiable in the geometry, for photometric reconstruction.
 
 Projection is plain torch (geometry.project), so autograd differentiates it; compositing has a backward of its own:
 numba kernels on a CPU (raster_cpu.py), gsplat on CUDA, and torch operations in any float type as their twin.

@@ -1,4 +1,4 @@
-"""Where the rays of a blend pierce the image: a regular lattice, grouped into rows of B.
+"""The lattice of rays of a blend, grouped into rows of B.
 
 Pixel rows are the lattice of pixel centers with one ray a row. Patch rows put `side × side` rays into each cell of a
 coarser grid (a teacher's patch grid, seen through its resize and crop), at the centers of equal sub-cells: a fixed

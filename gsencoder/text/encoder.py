@@ -1,4 +1,4 @@
-"""What turns words into vectors of a feature space, and whether two spaces may be compared."""
+"""The interface of text encoders, and the check that words and features have the same space."""
 
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
@@ -12,11 +12,11 @@ from gsencoder.types import FeatureSpace
 
 @runtime_checkable
 class TextEncoder(Protocol):
-    """Turns words into vectors of a feature space.
+    """Encodes words as vectors of a feature space.
 
     Attributes:
-        space: the space, whose `text_encoder` names what encodes.
-        mean: the mean of the text side, which centered cosines remove from words.
+        space: the feature space; its `text_encoder` is the name of this encoder.
+        mean: the mean of text vectors, which centered cosines subtract from words.
     """
 
     @property
@@ -26,19 +26,19 @@ class TextEncoder(Protocol):
     def mean(self) -> Float32[np.ndarray, " D"]: ...
 
     def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
-        """A unit vector for each word; InputError for a word that it does not know."""
+        """A unit vector for each word; InputError for an unknown word."""
         ...
 
 
 def check_space(features: FeatureSpace, text: FeatureSpace) -> None:
-    """Words may be compared with features only if the same text encoder speaks for both.
+    """Checks that words and features have the same text encoder.
 
     Raises:
-        InputError: features that no words lead into, or another encoder or width; both spaces are named.
+        InputError: the features have no text encoder, or another encoder or width; both spaces are named.
     """
     if not features.text_encoder:
         raise InputError(
-            f"features of space ({features.describe()}) cannot be asked with words: no text encoder leads into it; "
+            f"features of space ({features.describe()}) cannot be queried with words: it has no text encoder; "
             "fuse with a teacher that has one"
         )
     if features.text_encoder != text.text_encoder or features.channels != text.channels:

@@ -1,4 +1,4 @@
-"""A closed vocabulary as a table: names, their embeddings, and the files that hold them."""
+"""Text tables: closed vocabularies of names with their embeddings, and their files."""
 
 import difflib
 import json
@@ -18,22 +18,22 @@ from gsencoder.core.files.npz import read_npz
 from gsencoder.types import FeatureSpace
 
 NORM_TOLERANCE = 1e-2
-"""How far from 1 the norm of a stored embedding may be: float16 rounding is about 1e-3."""
+"""Largest difference from 1 of the norm of a stored embedding; float16 rounding is about 1e-3."""
 FORMAT_1 = "gsencoder text table 1"
-LONGEST_SHOWN = 80
-"""Characters of a word that an error repeats."""
-LONGEST_NAME = 1000
-"""Characters of a name: longer than any word or caption, and short enough to compare with each other."""
+MAX_SHOWN = 80
+"""Number of characters of a word that an error repeats."""
+MAX_NAME = 1000
+"""Largest number of characters of a name: longer than any word or caption, and short enough for comparisons."""
 
 
 def normalize(word: str) -> str:
-    """A word as the table compares it: NFKC, lower case, one blank where there were blanks, `_` or `-`, no article."""
+    """The form in which words are compared: NFKC, lower case, single blanks for blanks, `_` and `-`, no article."""
     text = " ".join(re.split(r"[\s_\-]+", unicodedata.normalize("NFKC", word).casefold())).strip()
     return re.sub(r"^(?:a|an|the) (?=.)", "", text)
 
 
-def _other_numbers(key: str) -> list[str]:
-    """Simple English singulars of a word, then its plurals; made-up forms do no harm, as no table has them."""
+def _singulars_and_plurals(key: str) -> list[str]:
+    """Simple English singulars of a word, then its plurals; wrong forms do no harm, since no table has them."""
     forms = []
     for ending, singular in (("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")):
         if key.endswith(ending) and len(key) > len(ending) + 1 and not key.endswith("ss"):
@@ -54,8 +54,8 @@ class TextTable:
 
     Attributes:
         names: the words, unique after `normalize`.
-        embeddings: one unit vector a name.
-        space: what the vectors are; `text_encoder` names the encoder that made them.
+        embeddings: a unit vector for each name.
+        space: of the vectors; its `text_encoder` is the name of the encoder that made them.
         mean: the mean of the embeddings. Text and image features of a joint model have different means, so each side
             is centered by its own.
     """
@@ -68,14 +68,16 @@ class TextTable:
 
     def __post_init__(self) -> None:
         table = self.embeddings
-        long = next((row for row, name in enumerate(self.names) if len(name) > LONGEST_NAME), None)
+        long = next((row for row, name in enumerate(self.names) if len(name) > MAX_NAME), None)
         if long is not None:
             raise InputError(
-                f"TextTable: name {self.names[long][:LONGEST_SHOWN]!r}… in row {long} has {len(self.names[long]):,} "
-                f"characters, expected at most {LONGEST_NAME:,}"
+                f"TextTable: name {self.names[long][:MAX_SHOWN]!r}… in row {long} has {len(self.names[long]):,} "
+                f"characters, expected at most {MAX_NAME:,}"
             )
         if not self.names or table.ndim != 2 or len(table) != len(self.names):
-            raise InputError(f"TextTable: expected one embedding a name, got {len(self.names)} names and {table.shape}")
+            raise InputError(
+                f"TextTable: expected one embedding for each name, got {len(self.names)} names and {table.shape}"
+            )
         if table.shape[1] != self.space.channels or self.mean.shape != (self.space.channels,):
             raise InputError(
                 f"TextTable: expected {self.space.channels} channels ({self.space.name}), got embeddings of "
@@ -86,27 +88,27 @@ class TextTable:
         if bad.size or not np.isfinite(self.mean).all():
             first = "the mean is not finite"
             if bad.size:
-                first = f"{self.names[bad[0]][:LONGEST_SHOWN]!r} has norm {norms[bad[0]]:.4g}"
+                first = f"{self.names[bad[0]][:MAX_SHOWN]!r} has norm {norms[bad[0]]:.4g}"
             raise InputError(f"TextTable: expected finite unit vectors, {first} ({bad.size} bad of {len(norms)} rows)")
         for row, name in enumerate(self.names):
             key = normalize(name)
             if not key or key in self._row_of:
                 wrong = "repeated" if key else "empty"
-                raise InputError(f"TextTable: name {name[:LONGEST_SHOWN]!r} in row {row} is {wrong}")
+                raise InputError(f"TextTable: name {name[:MAX_SHOWN]!r} in row {row} is {wrong}")
             self._row_of[key] = row
 
     def __len__(self) -> int:
         return len(self.names)
 
     def find(self, word: str) -> int | None:
-        """The row that a word means (itself, else its singular or plural), or None."""
+        """The row of a word, else of its singular or plural, or None."""
         key = normalize(word)
-        return next((self._row_of[form] for form in (key, *_other_numbers(key)) if form in self._row_of), None)
+        return next((self._row_of[form] for form in (key, *_singulars_and_plurals(key)) if form in self._row_of), None)
 
     def near(self, word: str, count: int = 6) -> tuple[str, ...]:
-        """Names that a user may have meant: names that share a word with it first, then those spelt alike."""
+        """Suggestions for an unknown word: names that share a word with it, and names that are spelled similarly."""
         row_of, key = self._row_of, normalize(word)
-        tokens = {form for token in key.split() for form in (token, *_other_numbers(token))}
+        tokens = {form for token in key.split() for form in (token, *_singulars_and_plurals(token))}
         sharing = [name for name in row_of if tokens & set(name.split())]
         sharing.sort(key=lambda name: (-difflib.SequenceMatcher(None, key, name).ratio(), name))
         alike = difflib.get_close_matches(key, list(row_of), n=count, cutoff=0.6)
@@ -114,29 +116,29 @@ class TextTable:
         return tuple(self.names[row_of[name]] for name in list(near_names)[:count])
 
     def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
-        """The embeddings of words, forgiving case, blanks, `_`, `-`, a leading article and simple plurals.
+        """The embeddings of words; case, blanks, `_`, `-`, a leading article and simple plurals are ignored.
 
         Raises:
-            InputError: words that the table does not have; the message says which names are near.
+            InputError: words that are not in the table; the message suggests similar names.
         """
         rows = [self.find(word) for word in words]
         unknown = [word for word, row in zip(words, rows, strict=True) if row is None]
         if unknown:
-            parts = [f"{word[:LONGEST_SHOWN]!r}{_did_you_mean(self.near(word[:LONGEST_NAME]))}" for word in unknown[:3]]
+            parts = [f"{word[:MAX_SHOWN]!r}{_did_you_mean(self.near(word[:MAX_NAME]))}" for word in unknown[:3]]
             more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
-            space = self.space.name[:LONGEST_SHOWN]
+            space = self.space.name[:MAX_SHOWN]
             raise InputError(f"not among the {len(self)} words of {space}: {'; '.join(parts)}{more}")
         return self.embeddings[np.array(rows, np.int64)]
 
 
 def _did_you_mean(names: Sequence[str]) -> str:
-    return f" (near: {', '.join(name[:LONGEST_SHOWN] for name in names)})" if names else " (no name is near)"
+    return f" (near: {', '.join(name[:MAX_SHOWN] for name in names)})" if names else " (no name is near)"
 
 
 def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) -> TextTable:
-    """A table from names and their unit vectors of any float type; `encoder` names what made them.
+    """Makes a table from names and their unit vectors of any float type, which the text encoder `encoder` made.
 
-    Rows are normalized in float32, which undoes the rounding of a float16 file.
+    Rows are normalized in float32, which removes the rounding of a float16 file.
 
     Raises:
         InputError: repeated or empty names, rows that are not finite unit vectors, sizes that differ.
@@ -151,7 +153,7 @@ def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) 
 
 
 def unrounded(table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C D"]:
-    """Unit vectors from rounded ones; rows far from unit length stay as they are, for TextTable to complain about."""
+    """Normalizes rounded unit vectors; rows far from unit length are not changed, so that TextTable refuses them."""
     norms = np.linalg.norm(table, axis=1, keepdims=True)
     rounded = np.abs(norms - 1) <= NORM_TOLERANCE
     return np.asarray(np.where(rounded, table / np.where(rounded, norms, 1), table))
@@ -162,11 +164,11 @@ def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
 
     Args:
         path: the file.
-        encoder: what made the embeddings. Left empty, it is what the file says in an entry `encoder`, else the file's
-            name without a trailing "_names".
+        encoder: name of the text encoder. If empty, it is the entry `encoder` of the file, else the name of the file
+            without a trailing "_names".
 
     Raises:
-        InputError: missing, damaged or hostile, or not such a table.
+        InputError: missing, damaged or hostile, or not a text table.
     """
     file = Path(path)
     if not file.is_file():
@@ -187,7 +189,7 @@ def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float
         dtype: of the embeddings; float16 halves the file.
 
     Raises:
-        InputError: the file cannot be written; what was there before stays.
+        InputError: the file cannot be written; an earlier file stays.
     """
     space = {item.name: getattr(table.space, item.name) for item in fields(table.space)}
     arrays = {"embeddings": table.embeddings.astype(dtype), "mean": table.mean}
@@ -207,8 +209,7 @@ def _read_archive(file: Path) -> TextTable:
 
 
 def _is_version_1(file: Path) -> bool:
-    """Whether a safetensors file is a text table as the first version wrote it: with a format of its own, and without
-    checksums."""
+    """Whether a safetensors file is a text table of the first version, which has another format and no checksums."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -255,7 +256,7 @@ def _table(file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray]) ->
 
 def _read_npz(file: Path, encoder: str) -> TextTable:
     wanted = {"names": ("U", 1), "embeddings": ("f", 2)}
-    arrays = read_npz(file, wanted, {"encoder": ("U", 0)}, max_text=LONGEST_NAME)
+    arrays = read_npz(file, wanted, {"encoder": ("U", 0)}, max_text=MAX_NAME)
     made_by = encoder or str(arrays.get("encoder", "")) or file.stem.removesuffix("_names")
     try:
         return make_text_table([str(name) for name in arrays["names"]], arrays["embeddings"], made_by)

@@ -1,4 +1,4 @@
-"""What passes between stages: frozen dataclasses over numpy arrays, checked when they are made.
+"""The types that stages exchange: frozen dataclasses over numpy arrays, validated when they are created.
 
 Axes: N Gaussians, V views, H W pixels, h w feature-map pixels, D channels, R basis rank, K = (sh_degree + 1)²,
 Q queries, C codes. World units are metres where known; camera axes are OpenCV's (x right, y down, z forward);

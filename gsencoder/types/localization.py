@@ -1,4 +1,4 @@
-"""Localizations: relevancy of words on Gaussians, and boxes around what was found."""
+"""Localizations: relevancy of words on Gaussians, and the boxes of each word."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Integer
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Box:
-    """Where a query was found, in world coordinates with the scene's origin added back.
+    """A box of a query, in world coordinates with the origin of the scene added.
 
     Attributes:
         query: the word.

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap_binary import check_binary_model
-from gsencoder.data.readers.posed import FARTHEST, PosedImage, PosedImages, inside, rigid_pose, warn_left_out
+from gsencoder.data.readers.posed import MAX_COORDINATE, PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
 
 QUATERNION_TOLERANCE = 1e-3
@@ -164,7 +164,7 @@ def _points(reconstruction: Any, model: Path) -> tuple[np.ndarray, np.ndarray]:
     points = np.array([point.xyz for point in sfm_points], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in sfm_points], np.uint8).reshape(-1, 3)
     with np.errstate(invalid="ignore"):
-        good = np.abs(points).max(axis=1, initial=0) <= FARTHEST
+        good = np.abs(points).max(axis=1, initial=0) <= MAX_COORDINATE
     if not good.all():
         warnings.warn(
             f"{model}: {int((~good).sum())} of {len(good)} points are not finite and are left out",

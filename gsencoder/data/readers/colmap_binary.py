@@ -1,4 +1,4 @@
-"""Checks that the binary files of a COLMAP model hold what their counts promise.
+"""Validation of the binary files of a COLMAP model: every record that a count announces must be there.
 
 pycolmap does not look for the end of a file: a cameras.bin that was cut short loads with whatever was in memory, and
 a wrong count in points3D.bin asks for all memory before it fails.
@@ -41,7 +41,7 @@ class _Walker:
         (count,) = self.take(_U64, f"the number of {what}")
         if count * smallest > len(self.data) - self.at:
             raise InputError(
-                f"{self.path}: promises {count} {what} (at least {count * smallest} bytes) but "
+                f"{self.path}: announces {count} {what} (at least {count * smallest} bytes) but "
                 f"{len(self.data) - self.at} bytes follow; the file is cut short or damaged"
             )
         return count
@@ -125,7 +125,7 @@ def check_binary_model(folder: Path) -> None:
     """Walks the records of every .bin file of a model.
 
     Raises:
-        InputError: a file is missing, ends inside a record, promises more than it holds, or has bytes left over.
+        InputError: a file is missing, ends inside a record, announces more records than it holds, or has extra bytes.
     """
     for name, walk in _FILES.items():
         path = folder / name

@@ -11,17 +11,17 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.types import SceneObject
 
-LONGEST_NAME = 1000
-"""Characters of a name, as in a table of words."""
+MAX_NAME = 1000
+"""Largest number of characters of a name, as in a text table."""
 
 
 def read_objects(path: Path) -> tuple[SceneObject, ...]:
     """Reads a list of {id, name or null, aabb_min, aabb_max, placed, views, max_pixels}; boxes in world coordinates.
 
-    Ids begin at 1, as 0 stands for no object in an instance map.
+    Ids start at 1, since 0 stands for no object in an instance map.
 
     Raises:
-        InputError: not such a list, a repeated id, a box whose lower corner is not below the upper one.
+        InputError: not such a list, a repeated id, or a box whose lower corner is not below the upper one.
     """
     rows = read_json(path)
     if not isinstance(rows, list):
@@ -34,8 +34,8 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
         name = row.get("name")
         if name is not None and not isinstance(name, str):
             raise InputError(f"{where}: name must be a word or null, got {str(name)[:40]!r}")
-        if name is not None and len(name) > LONGEST_NAME:
-            raise InputError(f"{where}: name has {len(name):,} characters, expected at most {LONGEST_NAME:,}")
+        if name is not None and len(name) > MAX_NAME:
+            raise InputError(f"{where}: name has {len(name):,} characters, expected at most {MAX_NAME:,}")
         lower, upper = _corner(row, "aabb_min", where), _corner(row, "aabb_max", where)
         if (lower > upper).any():
             raise InputError(f"{where}: aabb_min {lower.tolist()} is not below aabb_max {upper.tolist()}")
@@ -44,7 +44,7 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
             raise InputError(f"{where}: placed must be true or false, got {str(placed)[:40]!r}")
         objects.append(
             SceneObject(
-                id=_count(row, "id", where, None, least=1),
+                id=_count(row, "id", where, None, minimum=1),
                 name=name,
                 aabb_min=lower,
                 aabb_max=upper,
@@ -61,10 +61,10 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
     return tuple(objects)
 
 
-def _count(row: dict[str, Any], key: str, where: str, default: int | None, least: int = 0) -> int:
+def _count(row: dict[str, Any], key: str, where: str, default: int | None, minimum: int = 0) -> int:
     value = row.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
-        raise InputError(f"{where}: {key} must be a whole number from {least}, got {str(value)[:40]!r}")
+    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value < 2**31:
+        raise InputError(f"{where}: {key} must be a whole number from {minimum}, got {str(value)[:40]!r}")
     return value
 
 

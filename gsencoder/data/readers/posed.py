@@ -1,4 +1,4 @@
-"""What every reader of posed pictures hands over, and the checks that they share: paths, numbers, poses, the origin."""
+"""Posed images, the result of every reader of views, and checks that readers share: paths, numbers, poses, origin."""
 
 import math
 import warnings
@@ -13,25 +13,25 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.undistort import CameraModel
 
 RIGID_TOLERANCE = 1e-3
-"""How far from 1 a singular value of a pose's rotation may be; the rest is taken for rounding in the file."""
-LONGEST_PATH = 4096
-"""Characters of a path: PATH_MAX of Linux, which other systems do not exceed."""
-FARTHEST = 1e12
-"""Coordinates beyond this are refused: float64 steps by a tenth of a millimetre there."""
+"""Largest difference from 1 of a singular value of a rotation; below it is rounding in the file."""
+MAX_PATH = 4096
+"""Largest number of characters of a path: PATH_MAX of Linux, which other systems do not exceed."""
+MAX_COORDINATE = 1e12
+"""Largest coordinate, where float64 has steps of a tenth of a millimeter."""
 ORIGIN_STEP = 1000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedImage:
-    """One picture of a scene as its files describe it.
+    """One view of a scene as its files describe it.
 
     Attributes:
         name: unique in the scene.
         camera: intrinsics with distortion.
-        cam_from_world: rigid, OpenCV axes, in the file's own world (no origin taken off).
-        image: the photograph, which exists.
+        cam_from_world: rigid, OpenCV axes, in the world of the file (no origin subtracted).
+        image: an existing photograph.
         depth: sensor depth, or None.
-        depth_camera: the camera of the depth picture; None where it is the photograph's.
+        depth_camera: the camera of the depth map; None = that of the photograph.
         depth_scale: world units for each step of the depth file.
         mask: pixels to use, or None.
         instance: instance map, or None.
@@ -50,7 +50,7 @@ class PosedImage:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedImages:
-    """A scene's pictures and what its files say about the world; coordinates are the file's own, in float64."""
+    """The views of a scene and its world; coordinates are those of the files, in float64."""
 
     source: str
     images: tuple[PosedImage, ...]
@@ -63,8 +63,8 @@ class PosedImages:
 def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"]:
     """The mean of `points`, each coordinate rounded to a multiple of 1000 units; zero for none.
 
-    A scene near zero keeps its coordinates. One far away gets a round offset, which is taken off in float64 before
-    positions become float32: moved by any multiple of 1000 it has the same float32 coordinates.
+    A scene near zero keeps its coordinates. One far away gets a round offset, which is subtracted in float64 before
+    positions are rounded to float32; a scene that is moved by a multiple of 1000 has the same float32 coordinates.
     """
     if not len(points):
         return np.zeros(3)
@@ -72,17 +72,19 @@ def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"
 
 
 def rigid_pose(matrix: Float64[np.ndarray, "4 4"], where: str) -> Float64[np.ndarray, "4 4"]:
-    """The pose with its rotation made exact (the nearest one, by SVD; the file holds a few digits only).
+    """The pose with the nearest exact rotation, by SVD, since files hold a few digits only.
 
     Raises:
-        InputError: not finite, singular, scaled, sheared, mirrored, or too far away; `where` begins the message.
+        InputError: not finite, singular, scaled, sheared, mirrored, or too far away; `where` starts the message.
     """
     if not np.isfinite(matrix).all():
         raise InputError(f"{where}: the pose has values that are not finite")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise InputError(f"{where}: the last row of the pose must be 0 0 0 1, got {matrix[3].tolist()}")
-    if np.abs(matrix[:3, 3]).max() > FARTHEST:
-        raise InputError(f"{where}: the camera is {np.abs(matrix[:3, 3]).max():g} units away; at most {FARTHEST:g}")
+    if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
+        raise InputError(
+            f"{where}: the camera is {np.abs(matrix[:3, 3]).max():g} units away; at most {MAX_COORDINATE:g}"
+        )
     if np.abs(matrix[:3, :3]).max() > 1e6:
         raise InputError(
             f"{where}: the pose is not rigid (entries of {np.abs(matrix[:3, :3]).max():g} in its rotation)"
@@ -93,7 +95,7 @@ def rigid_pose(matrix: Float64[np.ndarray, "4 4"], where: str) -> Float64[np.nda
             raise InputError(f"{where}: the pose is singular (singular values {_list(stretch)}), expected a rotation")
         if stretch[0] - stretch[2] <= RIGID_TOLERANCE * stretch[0]:
             raise InputError(
-                f"{where}: the pose carries a uniform scale of {stretch.mean():.6g}; divide its rotation by it "
+                f"{where}: the pose has a uniform scale of {stretch.mean():.6g}; divide its rotation by it "
                 "(poses must be rigid, scene scale belongs in the translations)"
             )
         raise InputError(f"{where}: the pose is not rigid (singular values {_list(stretch)}, expected 1, 1, 1)")
@@ -114,19 +116,19 @@ def inside(folder: Path, relative: str, where: str, *, root: Path | None = None,
 
     Args:
         folder: what the path is relative to.
-        relative: as the scene's files give it.
-        where: begins the message.
+        relative: as written in the files of the scene.
+        where: start of the message.
         root: the scene folder; None = `folder`.
-        allow_outside: let it leave.
+        allow_outside: whether it may leave.
 
     Raises:
-        InputError: it leaves, or is no path at all.
+        InputError: it leaves, or is not a path.
     """
     root = folder if root is None else root
-    # A longer path is no file's, and to look for the links in it takes the square of its length.
-    if len(relative) > LONGEST_PATH:
+    # No file has a longer path, and resolving links takes time quadratic in the length.
+    if len(relative) > MAX_PATH:
         raise InputError(
-            f"{where}: {relative[:80]!r}… is not a path ({len(relative):,} characters, at most {LONGEST_PATH:,})"
+            f"{where}: {relative[:80]!r}… is not a path ({len(relative):,} characters, at most {MAX_PATH:,})"
         )
     try:
         path = folder / relative
@@ -143,10 +145,10 @@ def inside(folder: Path, relative: str, where: str, *, root: Path | None = None,
 
 
 def number(values: Mapping[str, object], key: str, where: str) -> float | None:
-    """A finite number of a JSON object; None where the key is absent.
+    """A finite number of a JSON object; None if the key is missing.
 
     Raises:
-        InputError: anything else than a finite number; `where` begins the message.
+        InputError: not a finite number; `where` starts the message.
     """
     value = values.get(key)
     if value is None:
@@ -163,7 +165,7 @@ def number(values: Mapping[str, object], key: str, where: str) -> float | None:
 
 
 def warn_left_out(missing: Iterable[str], total: int, source: str, what: str, result: str) -> None:
-    """One counted warning for files that are listed but missing; nothing where none is."""
+    """Warns once, with a count, about files that are listed but missing, if there are any."""
     names = list(missing)
     if names:
         warnings.warn(

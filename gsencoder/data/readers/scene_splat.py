@@ -1,4 +1,4 @@
-"""The splat of a scene: the one that a path is or holds, and one that comes without views."""
+"""The splat file of a scene: at a path, in its folder, or without views."""
 
 import warnings
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Lens distortion: which pinhole camera replaces a distorted one, and where each of its pixels lies in the file.
+"""Undistortion: the pinhole camera that replaces a distorted one, and the map from its pixels to those of the file.
 
 The center of every pinhole pixel is turned into a ray and projected through the distorted model by pycolmap, so the
 map is exact; nothing is fitted. A pixel is used only if that ray lies within 85° of the axis, lands inside the
@@ -259,15 +259,15 @@ def build_remap(target: Pinhole, source: CameraModel) -> Remap:
 
 
 class RemapCache:
-    """The remaps of one scene, one a camera and not one a picture, kept up to `budget` bytes; the one unused
-    for longest is dropped first."""
+    """A cache of the remaps of a scene, one for each camera, of at most `budget` bytes; the least recently used is
+    dropped first."""
 
     def __init__(self, budget: int = 256 << 20) -> None:
         self._budget = budget
         self._remaps: dict[tuple[Pinhole, CameraModel], Remap] = {}
 
     def get(self, target: Pinhole, source: CameraModel) -> Remap | None:
-        """The remap, or None where the pictures are the same pixel for pixel."""
+        """The remap, or None if both cameras have the same pixels."""
         if (
             source.is_pinhole
             and (target.width, target.height) == (source.width, source.height)

@@ -1,4 +1,4 @@
-"""RGB-D frames to oriented surface samples: back-projection, normals, rejection of pixels that float at edges.
+"""Oriented surface samples from RGB-D frames: back-projection, normals, rejection of floating pixels at edges.
 
 Everything local is done on inverse depth w = 1/z, because a plane n·x = −c seen through a pinhole is
 w = −n·r / c with the ray r = (u', v', 1): linear in the pixel. Its normal is then read off the gradient,

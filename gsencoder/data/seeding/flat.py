@@ -1,4 +1,4 @@
-"""Oriented points to flat Gaussians: rotation from the normal, size from the spacing of the neighbors."""
+"""Flat Gaussians from oriented points: rotation from the normal, size from the spacing of the neighbors."""
 
 import numpy as np
 from jaxtyping import Float32, Int64

@@ -1,4 +1,4 @@
-"""A mesh, or RGB-D frames fused to one, to flat Gaussians."""
+"""Surface samples of a mesh, or of RGB-D frames that are fused to one (TSDF)."""
 
 from collections.abc import Iterator
 from pathlib import Path

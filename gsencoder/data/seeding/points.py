@@ -1,4 +1,4 @@
-"""Structure-from-motion points to oriented surface samples and flat Gaussians."""
+"""Oriented surface samples and flat Gaussians from structure-from-motion points."""
 
 import warnings
 

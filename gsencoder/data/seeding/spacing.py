@@ -1,4 +1,4 @@
-"""How far Gaussians lie apart, and what that says of a splat whose unit of length is unknown."""
+"""The spacing of Gaussians, and an estimate of the unit of length from it."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Grid subsampling of oriented surface samples that keeps apart the surfaces that meet inside one voxel.
+"""Grid subsampling of oriented surface samples that separates different surfaces inside one voxel.
 
 The mean of all samples in a voxel lies between the surfaces where two of them share it: a spoon's rim sinks towards
 the table, the edge of a box is rounded off. Samples are therefore summed by voxel, by the axis direction that they

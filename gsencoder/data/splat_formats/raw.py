@@ -1,4 +1,4 @@
-"""Splat values as files hold them: logarithms, logits, quaternions of any length, and every defect still in place.
+"""Raw values of splat files: logarithms of scales, logits of opacities, unnormalized quaternions, defects included.
 
 Nothing outside the splat files, `inspect` and `repair` sees these; all others get `Gaussians`.
 """

@@ -1,4 +1,4 @@
-"""What is in a splat file, what is wrong with it, and mending exactly what was asked.
+"""Inspection of splat files, and repair of the defects that are named.
 
 Four kinds of rows cannot become Gaussians and stop loading; three more are odd but valid, and are only reported:
 

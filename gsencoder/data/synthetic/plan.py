@@ -1,4 +1,4 @@
-"""What stands where in a procedural room: furniture, and named objects in named colors that rest on it."""
+"""The plan of a procedural room: furniture, and named objects in named colors on top of it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

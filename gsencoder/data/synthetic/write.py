@@ -1,4 +1,4 @@
-"""A synthetic scene on disk, in the layout of a nerfstudio capture with depth, instance maps and labeled boxes."""
+"""Writing of a synthetic scene as a nerfstudio capture with depth, instance maps and labeled boxes."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Pictures of results: relevancy over views, boxes in views, features as colors, depth, sheets of all of them.
+"""Pictures of results: relevancy over views, boxes in views, features as colors, depth, contact sheets.
 
 Pictures are uint8 [H, W, 3], RGB. What is shown arrives as arrays that were rendered elsewhere.
 """

@@ -1,4 +1,4 @@
-"""Relevancy as pictures: a word's heat over rendered views of the scene, with its boxes drawn."""
+"""Pictures of relevancy: heat maps of a word over rendered views of the scene, with its boxes."""
 
 from collections.abc import Iterator, Sequence
 

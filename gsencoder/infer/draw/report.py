@@ -1,4 +1,4 @@
-"""One HTML file that shows a run: text, tables, pictures. It holds all it needs and loads nothing."""
+"""Self-contained HTML reports of text, tables and pictures."""
 
 import base64
 import io

@@ -1,4 +1,4 @@
-"""Which views to show of what was found: SplatDistill sec. 3.4, "strategically sample multiple viewpoints".
+"""The choice of views that show targets: SplatDistill sec. 3.4, "strategically sample multiple viewpoints".
 
 Candidates are judged by what small renders show of the targets; a greedy choice then takes those that together show
 them best: large and whole, from all sides, with what is around them (`view_worth`).
@@ -150,7 +150,7 @@ def _candidates(
 ) -> _Candidates:
     scene_cameras = scene.views.cameras if scene.views is not None and len(scene.views) else None
     if config.source == "frames" and scene_cameras is None:
-        raise InputError(f"views: scene {scene.name} has no cameras of its own; take choose.source=shells")
+        raise InputError(f"views: scene {scene.name} has no cameras; use choose.source=shells")
     names: list[str] = []
     frames: list[int | None] = []
     parts: list[Cameras] = []
