@@ -21,12 +21,14 @@ class OpenedScene:
 
     Attributes:
         scene: its poses may come from structure from motion.
-        sfm: the result of structure from motion; None where the scene had poses.
+        sfm: the result of structure from motion; None if the scene had poses.
+        photographs: the folder of photographs that structure from motion registered; None if the scene had poses.
         seconds: wall-clock time of structure from motion, under "place".
     """
 
     scene: Scene
     sfm: Placed | None
+    photographs: Path | None
     seconds: dict[str, float]
 
 
@@ -59,7 +61,7 @@ def open_scene(
         scene = load_scene(scenes[0], splat=splat or None, options=data)
         if scene.views is None:
             raise InputError(f"{path}: a splat without photographs; there is nothing to fit it to")
-        return OpenedScene(scene=scene, sfm=None, seconds=clock.seconds)
+        return OpenedScene(scene=scene, sfm=None, photographs=None, seconds=clock.seconds)
     if splat:
         raise InputError(
             f"{path}: splat={splat} lies in a world of its own, and photographs without poses are placed "
@@ -84,4 +86,4 @@ def open_scene(
         )
     with advised(START_AGAIN):
         scene = load_scene(work, options=replace(data, images=str(pictures)))
-    return OpenedScene(scene=scene, sfm=placed, seconds=clock.seconds)
+    return OpenedScene(scene=scene, sfm=placed, photographs=pictures, seconds=clock.seconds)

@@ -23,7 +23,7 @@ from gsencoder.reconstruct.run import Comparison, LogRow, ReconstructConfig, des
 from gsencoder.reconstruct.score import Score
 from gsencoder.reconstruct.sfm import SfmConfig
 
-PLY_FILE, PICTURES_FILE = "splat.ply", "held_out.png"
+PLY_FILE, PICTURES_FILE, MODEL_FOLDER = "splat.ply", "held_out.png", "sparse/0"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +82,10 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
         summary.add_seconds(result.seconds)
         origin = opened.scene.origin
         save_splat(folder / PLY_FILE, result.gaussians, origin=origin if origin.any() else None)
+        if opened.sfm is not None:
+            # Without its poses the splat could not be fused.
+            shutil.copytree(opened.sfm.model, folder / MODEL_FOLDER)
+            summary.results["model"] = MODEL_FOLDER
         shutil.copy(work.path / LOG_FILE, folder / LOG_FILE)
         draw(folder / PICTURES_FILE, result.comparisons)
         last: LogRow = result.log[-1] if result.log else {}
@@ -97,6 +101,11 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
         )
     scores = f"; {describe(last)} on {len(result.held_out)} held-out photographs" if last else ""
     screen.print(f"{out / PLY_FILE}: {len(result.gaussians):,} Gaussians{scores}")
+    if opened.sfm is not None:
+        screen.print(
+            f"{out} holds the poses of the photographs, as a COLMAP scene: gsencoder fuse {out} splat={PLY_FILE} "
+            f"data.images={opened.photographs}"
+        )
 
 
 def draw(path: Path, comparisons: tuple[Comparison, ...]) -> None:

@@ -136,6 +136,10 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(
     assert results["placed"] == 10
     assert results["swept"] > results["filled"] / 10 > 0
     assert len(load_splat(out / "splat.ply")) > 5000
+    fused = tmp_path / "features"
+    scene = [str(out), "splat=splat.ply", f"data.images={folder}", "data.image_scale=0.25", "data.max_views=3"]
+    assert cli.main(["fuse", *scene, "teacher=palette", f"out={fused}", "quiet=true"]) == 0
+    assert summary_of(fused)["results"]["seen"] > 1000
     assert "in another; give a scene with the poses" in refusal(
         capsys, str(folder), f"out={tmp_path / 'refined'}", f"splat={out / 'splat.ply'}"
     )
