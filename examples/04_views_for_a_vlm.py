@@ -22,7 +22,7 @@ def main(folder: str, word: str) -> None:
     targets = targets_of(scene.gaussians, found, 1)
     views = choose_views(scene, targets)
     for number, selected in enumerate(views.chosen):
-        visible = ", ".join(f"{sight.visible:.0%} of {sight.target}" for sight in selected.sights)
+        visible = ", ".join(f"{score.visible:.0%} of {score.target}" for score in selected.target_scores)
         picture = render_image(scene.gaussians, views.cameras, number)
         Image.fromarray(picture).save(f"view_{number:02d}.png")
         print(f"view_{number:02d}.png: {selected.name}, shows {visible}")

@@ -36,8 +36,8 @@ class BlendConfig:
     """
 
     rays_per_patch: int = field(default=64, metadata={"help": "rays averaged into one patch: 1, 4, 9, 16, …"})
-    min_weight: float = field(default=0.0, metadata={"help": "smallest blending weight that is kept"})
-    stop_transmittance: float = field(default=1e-4, metadata={"help": "a ray ends where less than this is left of it"})
+    min_weight: float = field(default=0.0, metadata={"help": "smallest blending weight that is stored"})
+    stop_transmittance: float = field(default=1e-4, metadata={"help": "transmittance at which a ray ends"})
     near: float = field(default=0.01, metadata={"help": "near plane in world units"})
     eps2d: float = field(default=0.3, metadata={"help": "low-pass variance of projected Gaussians in pixels²"})
     backend: Backend = field(default="auto", metadata={"help": "cpu (numba), reference (torch), or auto"})
@@ -118,7 +118,7 @@ class Blend:
 
     @cached_property
     def median_depth(self) -> Float[Tensor, " P"]:
-        """Depth at which a ray has lost half its light, for single rays; 0 where it never does.
+        """Depth at which a ray has lost half its transmittance, for single rays; 0 where it never does.
 
         Raises:
             InputError: the rows pool several rays, which have no common order.

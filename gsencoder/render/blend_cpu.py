@@ -181,23 +181,23 @@ def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, row
                 value = opacity * math.exp(-0.5 * (a * du * du + c * dv * dv) - b * du * dv)
                 ratio = math.exp(-a * (du + 0.5) - b * dv) if u1 > u0 else 0.0
                 low_u, high_u = min(low_u, u0), max(high_u, u1)
-                light = transmittance[j]
+                row_transmittance = transmittance[j]
                 line = sums[cell_of[j]]
                 row = (tile_v + j) * width + tile_u
                 for i in range(u0, u1 + 1):
                     alpha = min(value, ALPHA_MAX)
                     value *= ratio
                     ratio *= q
-                    before = light[i]
+                    before = row_transmittance[i]
                     # A negative transmittance marks a ray that has stopped.
                     if alpha < ALPHA_MIN or before < 0:
                         continue
                     after = before * (1.0 - alpha)
                     if after <= stop:
-                        light[i] = -1.0
+                        row_transmittance[i] = -1.0
                         open_rays -= 1
                         continue
-                    light[i] = after
+                    row_transmittance[i] = after
                     if side > 1:
                         line[cell_of[i]] += alpha * before
                     elif alpha * before >= keep:

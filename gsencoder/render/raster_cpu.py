@@ -1,7 +1,7 @@
 """Compositing that is differentiable in the geometry, on a CPU: numba kernels; the plain twin is in reference.py.
 
 Unlike a Blend, nothing is stored a pixel: the backward pass walks the same tiles front to back again. With
-v_i = Σ_c ∂L/∂out_c · value_ic and S = Σ_i w_i v_i over a ray, the light that comes from behind Gaussian i is
+v_i = Σ_c ∂L/∂out_c · value_ic and S = Σ_i w_i v_i over a ray, the color that comes from behind Gaussian i is
 S − Σ_{j≤i} w_j v_j, and
 
     ∂L/∂α_i = T_i v_i − (S − Σ_{j≤i} w_j v_j) / (1 − α_i).

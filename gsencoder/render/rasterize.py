@@ -26,7 +26,7 @@ class RasterConfig:
     """Accuracy knobs of differentiable rendering; as those of a Blend, with no smallest weight."""
 
     stop_transmittance: float = field(
-        default=1e-4, metadata={"help": "a ray ends when less light is left of it; always 1e-4 with gsplat"}
+        default=1e-4, metadata={"help": "transmittance at which a ray ends; always 1e-4 with gsplat"}
     )
     near: float = field(default=0.01, metadata={"help": "near plane in world units"})
     eps2d: float = field(default=0.3, metadata={"help": "low-pass variance of projected Gaussians in pixels²"})

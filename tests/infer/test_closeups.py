@@ -121,7 +121,7 @@ def test_close_ups_are_chosen_where_there_are_photographs_and_nowhere_else(sourc
     bare = choose_views(replace(scene, views=replace(scene.views, images=None)), [target], config)
     assert not any("near" in each.name for each in bare.chosen)
     if source == "frames":
-        shares = [max(each.sights[0].share for each in chosen.chosen) for chosen in (views, bare)]
+        shares = [max(each.target_scores[0].share for each in chosen.chosen) for chosen in (views, bare)]
         assert shares[0] > 2 * shares[1]
 
 

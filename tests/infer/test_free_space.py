@@ -36,7 +36,7 @@ def test_nobody_knows_what_is_empty_without_cameras() -> None:
     scene, _ = room()
     assert scene.gaussians is not None
     blind = FreeSpace(scene.gaussians)
-    assert blind.watchers is None
+    assert blind.observers is None
     assert not blind.seen_empty(np.zeros((3, 3))).any()
 
 

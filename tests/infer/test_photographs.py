@@ -159,10 +159,10 @@ def test_a_photograph_counts_as_sharp_and_solid_however_rough_the_splat_is(tmp_p
     config = ViewsConfig(source="frames", count=4, candidates=12)
     renders = choose_views(rough, [target], config)
     photographs = choose_views(with_photographs(rough, taken), [target], config)
-    told = {each.frame: each.sights[0] for each in renders.chosen}
+    told = {each.frame: each.target_scores[0] for each in renders.chosen}
     assert set(told) & {each.frame for each in photographs.chosen}
     for each in photographs.chosen:
-        (sight,) = each.sights
+        (sight,) = each.target_scores
         assert (sight.alpha, sight.blur) == (1, 0)
         if each.frame in told:
             before = told[each.frame]
@@ -172,6 +172,6 @@ def test_a_photograph_counts_as_sharp_and_solid_however_rough_the_splat_is(tmp_p
             assert (sight.visible, sight.share, sight.inside) == (before.visible, before.share, before.inside)
     # Cameras around the target show renders still.
     both = choose_views(with_photographs(rough, taken), [target], ViewsConfig(count=8, candidates=24))
-    placed = [each.sights[0] for each in both.chosen if each.frame is None]
+    placed = [each.target_scores[0] for each in both.chosen if each.frame is None]
     assert placed
     assert all(sight.blur > 0 for sight in placed)

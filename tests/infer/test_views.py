@@ -137,9 +137,9 @@ def test_views_are_chosen_from_the_side_that_a_wall_leaves_open() -> None:
     chosen = choose_views(scene, [target], SHELLS)
     assert len(chosen) == 6
     assert (chosen.cameras.centers[:, 0] > 0.05).sum() >= 5
-    assert all(each.sights[0].visible > 0.9 for each in chosen.chosen)
-    assert all(0.05 <= each.sights[0].share <= 0.6 for each in chosen.chosen)
-    assert all(each.sights[0].alpha > 0.9 for each in chosen.chosen)
+    assert all(each.target_scores[0].visible > 0.9 for each in chosen.chosen)
+    assert all(0.05 <= each.target_scores[0].share <= 0.6 for each in chosen.chosen)
+    assert all(each.target_scores[0].alpha > 0.9 for each in chosen.chosen)
 
 
 def test_the_same_views_are_chosen_however_the_gaussians_are_ordered_and_wherever_the_room_is(
@@ -167,10 +167,10 @@ def test_gains_never_grow_and_the_choice_is_near_the_best_of_all() -> None:
     order, gains = values.greedy(10)
     assert (np.diff(gains) <= 1e-12).all()
     assert sorted(order.tolist()) == list(range(10))
-    best = max(values.of(each) for each in itertools.combinations(range(10), 3))
-    assert values.of(order[:3]) == pytest.approx(gains[:3].sum())
-    assert values.of(order[:3]) >= (1 - 1 / np.e) * best
-    assert values.of(order[:3]) >= 0.95 * best
+    best = max(values.value_of(each) for each in itertools.combinations(range(10), 3))
+    assert values.value_of(order[:3]) == pytest.approx(gains[:3].sum())
+    assert values.value_of(order[:3]) >= (1 - 1 / np.e) * best
+    assert values.value_of(order[:3]) >= 0.95 * best
 
 
 def test_what_a_view_is_worth_grows_with_what_it_shows() -> None:
@@ -250,9 +250,9 @@ def test_a_set_is_worth_its_views_and_what_they_cover_of_targets_context_and_dir
             total += own[views].sum() / 3
             total += sum(weight * part[views].max(axis=0).mean() for weight, part in parts.items() if part.size)
             covered += coverage(each.target)[views].max(axis=0).mean()
-        assert values.of(views) == pytest.approx(total / 2, rel=1e-5)
+        assert values.value_of(views) == pytest.approx(total / 2, rel=1e-5)
         assert values.covered(np.array(views)) == pytest.approx(covered / 2, rel=1e-5)
-    assert values.greedy(6)[1].sum() == pytest.approx(values.of(values.greedy(6)[0]))
+    assert values.greedy(6)[1].sum() == pytest.approx(values.value_of(values.greedy(6)[0]))
 
 
 @pytest.mark.parametrize("best", [1.0, 0.1, 0.01])
@@ -311,7 +311,7 @@ def test_frames_that_look_at_a_wall_are_taken_last_however_near_the_target_is_be
     both = replace(scene, views=replace(scene.views, cameras=cameras, names=names))
     for source in ("frames", "both"):
         chosen = choose_views(both, [target], replace(SHELLS, source=source))  # type: ignore[arg-type]
-        assert all(each.sights[0].visible > 0.5 for each in chosen.chosen)
+        assert all(each.target_scores[0].visible > 0.5 for each in chosen.chosen)
 
 
 def test_frames_of_a_film_are_taken_from_all_along_it() -> None:
@@ -374,7 +374,7 @@ def test_the_same_views_are_chosen_in_scenes_of_any_unit(unit: float) -> None:
     there = choose_views(other, [target_of("cube", other.gaussians, target.rows)], SHELLS)
     np.testing.assert_allclose(there.cameras.centers, here.cameras.centers * unit, rtol=1e-3, atol=1e-3 * unit)
     for a, b in zip(here.chosen, there.chosen, strict=True):
-        assert b.sights[0].visible == pytest.approx(a.sights[0].visible, abs=0.01)
+        assert b.target_scores[0].visible == pytest.approx(a.target_scores[0].visible, abs=0.01)
     pictures, _ = view_pictures(other, there)
     same, _ = view_pictures(scene, here)
     assert np.abs(np.stack(pictures).astype(int) - np.stack(same)).mean() < 2
@@ -417,7 +417,7 @@ def test_uniform_frames_are_evenly_spread_and_need_no_target() -> None:
     blank, judged = choose_views(scene, [], config), choose_views(scene, [target], config)
     assert [each.frame for each in blank.chosen] == [0, 4, 7, 11]
     assert [each.frame for each in judged.chosen] == [0, 4, 7, 11]
-    assert all(each.sights == () and each.covered is None and each.gain is None for each in blank.chosen)
+    assert all(each.target_scores == () and each.covered is None and each.gain is None for each in blank.chosen)
     assert judged.chosen[-1].covered is not None
     # All that any of them sees, as well as any sees it: but for the cube's lower face.
     assert judged.chosen[-1].covered > 0.8

@@ -66,7 +66,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
     else:
         order, gains = values.greedy(config.count)
     _warn_about(scene, targets, scores, order, config)
-    sights = [
+    target_scores = [
         tuple(
             TargetScore(
                 target=target.name,
@@ -87,7 +87,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
                 clearance=float(room[position]),
                 gain=None if gains is None else float(gains[position]),
                 covered=values.covered(order[: position + 1]),
-                sights=sights[position],
+                target_scores=target_scores[position],
             )
             for position, view in enumerate(order)
         ),
@@ -171,10 +171,10 @@ def _candidates(
         frames += photograph_at.tolist()
     if config.source != "frames":
         if scene_cameras is not None:
-            watchers = frames_on(
+            observers = frames_on(
                 scene_cameras, gaussians, targets, max(CONSTANTS.free_space_cameras, len(targets)), spaces
             )
-            free = free.seen_by(scene_cameras.select(watchers), judged)
+            free = free.seen_by(scene_cameras.select(observers), judged)
         for target, room in zip(targets, _split_evenly(config.candidates - len(frames), len(targets)), strict=True):
             around = shell_cameras(
                 gaussians,

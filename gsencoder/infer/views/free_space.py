@@ -21,7 +21,7 @@ class FreeSpace:
 
     Attributes:
         cell: edge of the cells in which rays are followed, world units.
-        watchers: the cameras that tell what is empty; None where there are none.
+        observers: the cameras that tell what is empty; None where there are none.
     """
 
     def __init__(self, gaussians: Gaussians) -> None:
@@ -45,7 +45,7 @@ class FreeSpace:
         self._low = np.floor(np.median(means, axis=0) / self.cell) - CONSTANTS.grid_cells // 2
         self._met, self._cell_of = solid[self._patches.rows], self._codes(self._patches.centers)
         self._occupied = np.unique(self._cell_of[self._cell_of >= 0])
-        self.watchers: Cameras | None = None
+        self.observers: Cameras | None = None
         self._depths: list[Float32[np.ndarray, "h w"]] = []
 
     def seen_by(self, cameras: Cameras, config: BlendConfig = BlendConfig()) -> "FreeSpace":
@@ -58,7 +58,7 @@ class FreeSpace:
         if not len(cameras):
             return self
         other = copy(self)
-        small = other.watchers = cameras.resized(CONSTANTS.free_space_side)
+        small = other.observers = cameras.resized(CONSTANTS.free_space_side)
 
         def depth_map(view: int) -> Float32[np.ndarray, "h w"]:
             b = blend(self._gaussians, small, view, config=config)
@@ -130,9 +130,9 @@ class FreeSpace:
         """Whether some watcher looked through each point, at a surface at least a cell behind it."""
         free = np.zeros(len(points), bool)
         for view, depth in enumerate(self._depths):
-            assert self.watchers is not None
-            pixels, z = self.watchers.project(points, view)
-            shown = self.watchers.in_image(pixels, z, view)
+            assert self.observers is not None
+            pixels, z = self.observers.project(points, view)
+            shown = self.observers.in_image(pixels, z, view)
             column, row = (np.where(shown, part, 0).astype(np.int64) for part in pixels.T)
             free |= shown & (depth[row, column] >= z + self.cell)
         return free

@@ -85,11 +85,11 @@ def view_sheet(
 
 
 def describe_view(chosen: SelectedView) -> str:
-    """A view in a line."""
-    shown = [sight for sight in chosen.sights if sight.share >= MIN_DESCRIBED_SHARE]
-    sights = "; ".join(
+    """Describes a view in one line."""
+    shown = [sight for sight in chosen.target_scores if sight.share >= MIN_DESCRIBED_SHARE]
+    description = "; ".join(
         f"{sight.target} fills {sight.share:{'.0%' if sight.share >= 0.01 else '.1%'}}, "
         f"{sight.visible * sight.inside:.0%} of it seen"
         for sight in shown
     )
-    return f"{chosen.name}: {sights or 'nothing of what was found'}" if chosen.sights else chosen.name
+    return f"{chosen.name}: {description or 'nothing of what was found'}" if chosen.target_scores else chosen.name

@@ -61,23 +61,23 @@ def score_views(
     if not targets:
         return ()
     small = cameras.resized(side)
-    watched = [_TargetProbe(gaussians, target) for target in targets]
+    probes = [_TargetProbe(gaussians, target) for target in targets]
 
     def one(view: int) -> list[_TargetInView]:
         b = blend(gaussians, small, view, config=config)
         # Pixels that each Gaussian fills.
         weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians))
-        return [each.seen(b, weights, small, view, config) for each in watched]
+        return [each.seen(b, weights, small, view, config) for each in probes]
 
-    # Whole views share the threads out better than parts of small ones.
+    # Small views are rendered faster with one thread for each view than with all threads for one.
     per_view = parallel(one, range(len(cameras)))
     return tuple(_stack_scores([each[index] for each in per_view]) for index in range(len(targets)))
 
 
-def replace_with_photographs(looks: ViewScores, photograph_at: Bool[np.ndarray, " V"]) -> ViewScores:
-    """Looks where some cameras are shown as photographs: sharp and solid, however rough the splat is."""
+def replace_with_photographs(scores: ViewScores, photograph_at: Bool[np.ndarray, " V"]) -> ViewScores:
+    """Scores of cameras of which some are shown as photographs, which count as sharp and solid."""
     return replace(
-        looks, alpha=np.where(photograph_at, 1.0, looks.alpha), blur=np.where(photograph_at, 0.0, looks.blur)
+        scores, alpha=np.where(photograph_at, 1.0, scores.alpha), blur=np.where(photograph_at, 0.0, scores.blur)
     )
 
 
@@ -101,7 +101,7 @@ def _stack_scores(seen: Sequence[_TargetInView]) -> ViewScores:
 
 
 class _TargetProbe:
-    """A target, and what is needed again for every camera that looks at it."""
+    """A target, with the arrays that scoring needs for every camera."""
 
     def __init__(self, gaussians: Gaussians, target: Target) -> None:
         self._rows = target.rows

@@ -104,7 +104,7 @@ class SelectedView:
         gain: what it added to the choice; None for uniform frames.
         covered: how well this view and those before it show the targets' Gaussians, by `coverage`: 1 = each as well
             as the candidate that shows it best; None where there are no targets.
-        sights: one for each target.
+        target_scores: one for each target.
     """
 
     name: str
@@ -112,7 +112,7 @@ class SelectedView:
     clearance: float
     gain: float | None
     covered: float | None
-    sights: tuple[TargetScore, ...]
+    target_scores: tuple[TargetScore, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -58,14 +58,14 @@ def shell_cameras(
     distance = np.minimum(wanted, open_until / (1 + clearance))
     centers = target.center + distance[:, None] * outward
     good = (distance >= least) & (free.clearance(centers) >= clearance * np.minimum(distance, target.radius))
-    if free.watchers is not None:
+    if free.observers is not None:
         good &= free.seen_empty(centers)
     tried = np.flatnonzero(good)
     if not len(tried):
         return looking_cameras(centers[tried], -outward[tried], vertical, focal, width, height)
-    backed = _background_fraction(target, centers[tried], vertical, free)
-    enough = np.sort(backed)[::-1][min(count, len(backed)) - 1]
-    chosen = tried[backed >= enough]
+    background = _background_fraction(target, centers[tried], vertical, free)
+    enough = np.sort(background)[::-1][min(count, len(background)) - 1]
+    chosen = tried[background >= enough]
     chosen = chosen[even_indices(len(chosen), count)]
     return looking_cameras(centers[chosen], -outward[chosen], vertical, focal, width, height)
 

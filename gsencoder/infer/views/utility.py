@@ -17,7 +17,7 @@ from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras
 
 
-def view_utility(looks: ViewScores, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
+def view_utility(scores: ViewScores, config: ViewsConfig) -> Float64[np.ndarray, " V"]:
     """Utility of each view for one target by itself, 0 to 1.
 
     Half comes from filling at least `least_share` of the picture, in proportion below it, half from filling up to half
@@ -25,40 +25,40 @@ def view_utility(looks: ViewScores, config: ViewsConfig) -> Float64[np.ndarray, 
     target is in the picture and not hidden, by the opacity around it, and by its sharpness: Gaussians of
     `ViewConstants.half_blur` halve it.
     """
-    share = looks.share
+    share = scores.share
     size = np.minimum(share / config.least_share, 1) * (0.5 + 0.5 * np.minimum(share / (config.most_share / 2), 1))
     size *= np.clip((1 - share) / (1 - config.most_share), 0, 1)
-    alpha = np.clip(looks.alpha / CONSTANTS.full_alpha, 0, 1)
-    sharp = 1 / (1 + (looks.blur / CONSTANTS.half_blur) ** 2)
-    return np.asarray(size * sharp * looks.visible * (0.5 + 0.5 * looks.inside) * alpha**2)
+    alpha = np.clip(scores.alpha / CONSTANTS.full_alpha, 0, 1)
+    sharp = 1 / (1 + (scores.blur / CONSTANTS.half_blur) ** 2)
+    return np.asarray(size * sharp * scores.visible * (0.5 + 0.5 * scores.inside) * alpha**2)
 
 
 class CoverageObjective:
     """The utility of sets of candidates, and its greedy maximization."""
 
     def __init__(
-        self, cameras: Cameras, targets: Sequence[Target], looks: Sequence[ViewScores], config: ViewsConfig
+        self, cameras: Cameras, targets: Sequence[Target], scores: Sequence[ViewScores], config: ViewsConfig
     ) -> None:
-        self.utilities = [view_utility(each, config) for each in looks]
+        self.utilities = [view_utility(each, config) for each in scores]
         self._count = config.count
         self._weights = (config.cover_weight, config.context_weight, config.spread_weight)
         self._terms = []
-        for target, each, value in zip(targets, looks, self.utilities, strict=True):
+        for target, each, value in zip(targets, scores, self.utilities, strict=True):
             # How well a view sees something counts as far as it is a good view.
             good = (value / max(float(value.max(initial=0)), CONSTANTS.min_best_utility))[:, None]
             away = directions(cameras, target)
             towards = np.clip(away @ away.T, 0, 1)
             self._terms.append((coverage(each.target) * good, coverage(each.context) * good, towards * good))
-        self._raw = [coverage(each.target) for each in looks]
+        self._coverages = [coverage(each.target) for each in scores]
 
     def covered(self, views: Int64[np.ndarray, " n"]) -> float | None:
         """How well views show the targets' Gaussians together; see `SelectedView`."""
-        if not self._raw:
+        if not self._coverages:
             return None
-        return float(np.mean([raw[views].max(axis=0).mean() for raw in self._raw]))
+        return float(np.mean([values[views].max(axis=0).mean() for values in self._coverages]))
 
-    def of(self, views: Sequence[int] | Int64[np.ndarray, " n"]) -> float:
-        """What a set is worth: the sum that `greedy` makes large."""
+    def value_of(self, views: Sequence[int] | Int64[np.ndarray, " n"]) -> float:
+        """The utility of a set of views, which `greedy` maximizes."""
         chosen = list(views)
         value = float(np.mean([view_utility[chosen].sum() for view_utility in self.utilities]) / self._count)
         for parts in self._terms:
@@ -68,8 +68,8 @@ class CoverageObjective:
         return value
 
     def greedy(self, count: int) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-        """Views in the order of their gains, and these; of equal ones the first. Those that add nothing are left out,
-        but for the first."""
+        """Views in the order in which they are chosen, and their gains; ties go to the first candidate. Views that add
+        nothing are left out, except the first."""
         modular = np.mean(self.utilities, axis=0) / self._count
         best = [[np.zeros(part.shape[1]) for part in parts] for parts in self._terms]
         order: list[int] = []

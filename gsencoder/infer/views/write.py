@@ -30,8 +30,8 @@ def score_to_json(score: TargetScore) -> dict[str, Any]:
 
 
 def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
-    """What was chosen and why, best first: names and pictures, sights, gains, and cameras in world coordinates with the
-    origin added back (cam_from_world and K as OpenCV has them)."""
+    """What was chosen and why, best first: names and pictures, target_scores, gains, and cameras in world coordinates
+    with the origin added back (cam_from_world and K as OpenCV has them)."""
     rows = []
     for number, (each, kind) in enumerate(zip(views.chosen, picture_kinds(scene, views), strict=True)):
         pose = move_origin(views.cameras.cam_from_world[number].astype(np.float64), -scene.origin)
@@ -44,7 +44,7 @@ def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
                 "clearance": each.clearance,
                 "gain": each.gain,
                 "covered": each.covered,
-                "sights": [score_to_json(score) for score in each.sights],
+                "sights": [score_to_json(score) for score in each.target_scores],
                 "cam_from_world": pose.tolist(),
                 "K": views.cameras.Ks[number].tolist(),
                 "width": int(views.cameras.widths[number]),
