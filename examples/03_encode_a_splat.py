@@ -21,9 +21,9 @@ def main(folder: str, words: str) -> None:
 
     # It knows the names that it was trained on; the words lie beside the weights.
     scene = replace(scene, features={features.space.name: features})
-    found = localize(scene, words.split(","), encoder.words)
-    for word, threshold in zip(found.queries, found.thresholds, strict=True):
-        scores = [f"{box.score:.2f}" for box in found.boxes if box.query == word]
+    localization = localize(scene, words.split(","), encoder.words)
+    for word, threshold in zip(localization.queries, localization.thresholds, strict=True):
+        scores = [f"{box.score:.2f}" for box in localization.boxes if box.query == word]
         print(f"{word}: {len(scores)} boxes above {threshold:.2f} ({', '.join(scores) or 'none'})")
 
     # A folder of features is what `gsencoder localize`, `views`, `ask` and `pack` take.

@@ -14,12 +14,12 @@ from gsencoder import PaletteConfig, choose_views, load_features, localize, rend
 
 def main(folder: str, word: str) -> None:
     scene = load_features(folder)
-    found = localize(scene, [word], text_table_of(PaletteConfig()))
-    if not found.boxes:
+    localization = localize(scene, [word], text_table_of(PaletteConfig()))
+    if not localization.boxes:
         sys.exit(f"nothing is {word} in this scene")
 
     # Targets are the Gaussians of the best box; views are scored by how much of them small renders show.
-    targets = targets_of(scene.gaussians, found, 1)
+    targets = targets_of(scene.gaussians, localization, 1)
     views = choose_views(scene, targets)
     for number, selected in enumerate(views.chosen):
         visible = ", ".join(f"{score.visible:.0%} of {score.target}" for score in selected.target_scores)

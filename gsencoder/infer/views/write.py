@@ -30,8 +30,8 @@ def score_to_json(score: TargetScore) -> dict[str, Any]:
 
 
 def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
-    """What was chosen and why, best first: names and pictures, target_scores, gains, and cameras in world coordinates
-    with the origin added back (cam_from_world and K as OpenCV has them)."""
+    """The chosen views as JSON values, best first: names, pictures, scores, gains, and cameras in world coordinates
+    with the origin added (cam_from_world and K in OpenCV's conventions)."""
     rows = []
     for number, (each, kind) in enumerate(zip(views.chosen, picture_kinds(scene, views), strict=True)):
         pose = move_origin(views.cameras.cam_from_world[number].astype(np.float64), -scene.origin)
