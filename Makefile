@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Processes that tests run in, each on one thread.
 PROCESSES ?= 2
+# Files with tests that run alone; the others need not be collected a second time.
+ALONE = $(shell grep -rl --include='*.py' 'mark\.alone' tests)
 
 .PHONY: help setup demo test test-fast lint check clean
 help:            ## what can be made
@@ -28,7 +30,7 @@ lint: setup      ## ruff and mypy
 
 test: setup      ## all tests; those that need real data look for it in GSENCODER_SHARED (default ../shared)
 	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone"
-	$(BIN)/python -m pytest -q -m alone
+	$(BIN)/python -m pytest -q -m alone $(ALONE)
 
 test-fast: setup ## the tests that take a second at most
 	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone and not slow"
