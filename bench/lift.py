@@ -33,7 +33,7 @@ from synthetic_teacher import SyntheticTeacher
 from gsencoder.core.runtime.peak_memory import memory_growth
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.fusion.basis import Moments, encode, fit_basis
+from gsencoder.fusion.basis import Moments, fit_basis, to_coordinates
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.lift import center_matrix
 from gsencoder.fusion.visibility import VisibilityConfig
@@ -116,7 +116,7 @@ def lift_matrix(problem: Problem, matrices: list[Blend], basis: FeatureBasis | N
     weights = np.zeros((len(problem.gaussians), 1), np.float32)
     for b, one in zip(matrices, problem.maps, strict=True):
         maps = rows_of(one)
-        maps = encode(basis, maps) if basis is not None else maps
+        maps = to_coordinates(basis, maps) if basis is not None else maps
         b.lift_into(torch.from_numpy(maps), torch.from_numpy(sums))
         b.lift_into(torch.ones(len(maps), 1), torch.from_numpy(weights))
     np.divide(sums, weights, out=sums, where=weights > 0)

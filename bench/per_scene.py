@@ -26,7 +26,7 @@ from gsencoder.evaluate.boxes import Hit, accuracy
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries
 from gsencoder.evaluate.protocols.naming import NamingCounts, compare_names, naming_scores
 from gsencoder.evaluate.sources import encoder_source
-from gsencoder.fusion.basis import encode
+from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.infer.encode.encode import TorchEncoder
@@ -42,7 +42,7 @@ def rows_of(
     """B of each view's pixels, and alpha times the teacher's coordinates there."""
     assert scene.gaussians is not None
     assert scene.views is not None
-    table = teacher.vectors if fused.basis is None else encode(fused.basis, teacher.vectors)
+    table = teacher.vectors if fused.basis is None else to_coordinates(fused.basis, teacher.vectors)
     for view in range(len(scene.views)):
         codes = teacher.feature_map(scene.views, view).codes
         assert codes is not None

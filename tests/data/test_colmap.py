@@ -62,7 +62,7 @@ def test_distorted_models_are_undistorted_once_a_camera(tmp_path: Path) -> None:
     assert views.masks is None
     assert 30 < views.cameras.Ks[0, 0, 0] < 30 * 1.3
     assert not (views.images[0] == photograph(1)).all()
-    assert len(views.images._remaps._kept) == 1  # type: ignore[attr-defined]
+    assert len(views.images._remaps._remaps) == 1  # type: ignore[attr-defined]
 
 
 def test_a_model_that_is_no_pinhole_is_a_named_error(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_huge_claimed_count_is_refused_before_memory_is_asked_for(tmp_path: Pa
     sparse = write_colmap(tmp_path)
     data = (sparse / name).read_bytes()
     (sparse / name).write_bytes(struct.pack("<Q", count) + data[8:])
-    with pytest.raises(InputError, match=f"{name}: promises {count}"):
+    with pytest.raises(InputError, match=f"{name}: announces {count}"):
         load_scene(tmp_path)
 
 

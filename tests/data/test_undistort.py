@@ -158,7 +158,7 @@ def test_the_cache_stays_inside_its_budget_and_gives_the_same_map() -> None:
     for camera in cameras * 2:
         remap = cache.get(pinhole_for(camera, "test"), camera)
         assert remap is not None
-        assert len(cache._kept) <= 2
+        assert len(cache._remaps) <= 2
         again = cache.get(pinhole_for(camera, "test"), camera)
         assert again is remap
 

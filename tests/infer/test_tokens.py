@@ -85,7 +85,7 @@ def test_tokens_of_other_splats_and_grids_are_refused() -> None:
         feature_tokens([*blends, *token_blends(gaussians, cameras, (4, 5))], features)
     with pytest.raises(InputError, match="expected blends on one grid"):
         feature_tokens([], features)
-    with pytest.raises(InputError, match="expected lines and columns of 1 or more"):
+    with pytest.raises(InputError, match="expected rows and columns of 1 or more"):
         token_blends(gaussians, cameras, (0, 4))
 
 

@@ -461,7 +461,7 @@ def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match="has no Gaussians to look at"):
         target_of("nothing", scene.gaussians, np.zeros(0, np.int64))
     bare = replace(scene, views=None)
-    with pytest.raises(InputError, match="no cameras of its own; take choose.source=shells"):
+    with pytest.raises(InputError, match="has no cameras; use choose.source=shells"):
         choose_views(bare, [target], replace(SHELLS, source="frames"))
     with pytest.raises(InputError, match="scene room has no Gaussians"):
         choose_views(replace(scene, gaussians=None), [target], SHELLS)

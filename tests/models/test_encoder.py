@@ -1,5 +1,6 @@
 """The encoder's laws: order, batch mates and reruns change nothing; gradients are right; extremes stay finite."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -193,14 +194,26 @@ def test_in_bfloat16_features_stay_close_and_come_as_float32() -> None:
 # torch's own compiler instantiates an autograd function, and warns that one should not.
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 @pytest.mark.slow
-def test_compiled_it_gives_the_same(no_jaxtyping: None) -> None:
-    network, one = encoder(), splat(64)
-    attributes, opacities, cloud = encoder_inputs(one, CONFIG, 0.1)
-    plan = network.join([cloud])
-    with torch.no_grad():
-        exact = network(attributes, opacities, plan)
-        compiled = torch.compile(network, backend="aot_eager", dynamic=True)(attributes, opacities, plan)
-    torch.testing.assert_close(compiled, exact, rtol=1e-5, atol=1e-5)
+def test_compiled_it_gives_the_same_and_is_not_compiled_for_every_number_of_cells(no_jaxtyping: None) -> None:
+    graphs = []
+
+    def count(graph: torch.fx.GraphModule, example: list[torch.Tensor]) -> Callable[..., object]:
+        graphs.append(graph)
+        return graph.forward
+
+    network = encoder()
+    compiled = torch.compile(network, backend=count, dynamic=True)
+    graphs_after = []
+    for size in (64, 100, 150):
+        attributes, opacities, cloud = encoder_inputs(splat(size), CONFIG, 0.1)
+        plan = network.join([cloud])
+        with torch.no_grad():
+            torch.testing.assert_close(
+                compiled(attributes, opacities, plan), network(attributes, opacities, plan), rtol=1e-5, atol=1e-5
+            )
+        graphs_after.append(len(graphs))
+    # The first size is compiled for itself, because two of its dimensions are equal by chance.
+    assert graphs_after[1] == graphs_after[2]
 
 
 def test_merging_gives_the_weighted_mean_of_a_cells_gaussians() -> None:

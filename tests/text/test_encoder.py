@@ -24,5 +24,5 @@ def test_words_of_another_space_are_an_error_that_names_both(text: FeatureSpace)
 
 
 def test_features_that_no_words_lead_into_cannot_be_asked() -> None:
-    with pytest.raises(InputError, match="no text encoder leads into it"):
+    with pytest.raises(InputError, match="it has no text encoder"):
         check_space(space(""), space(""))

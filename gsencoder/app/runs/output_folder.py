@@ -45,8 +45,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         target.parent.mkdir(parents=True, exist_ok=True)
         partial, lock = _begin(target)
     except BlockingIOError:
-        message = f"{path}: another run is writing this folder now; wait for it or give another out="
-        raise InputError(message) from None
+        raise InputError(f"{path}: another run is writing this folder now; wait for it or give another out=") from None
     except FileExistsError as error:
         raise InputError(f"{path}: {error.filename} is a file, so no folder can be made in it") from error
     except OSError as error:

@@ -232,4 +232,4 @@ def _words(annotation: Any) -> tuple[Any, ...]:
             words += get_args(member)
         elif get_origin(member) is tuple:
             words += tuple(word for item in get_args(member) if item is not Ellipsis for word in _words(item))
-    return found
+    return words

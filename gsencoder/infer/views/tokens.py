@@ -26,7 +26,7 @@ def tower_grid(width: int, height: int, grid: tuple[int, int], fit: Fit = "stret
     Args:
         width: of the picture, pixels.
         height: of the picture, pixels.
-        grid: lines and columns of patches.
+        grid: rows and columns of patches.
         fit: stretch = the whole picture is resized to the tower's, whatever its shape; crop = it is resized until it
             covers the tower's, and the middle is cut out. Square pictures need neither, nor the padding of towers that
             make a square by it.
@@ -36,7 +36,7 @@ def tower_grid(width: int, height: int, grid: tuple[int, int], fit: Fit = "stret
     """
     lines, columns = grid
     if not (lines >= 1 and columns >= 1 and lines * columns <= MOST_CELLS):
-        raise InputError(f"grid: expected lines and columns of 1 or more, at most {MOST_CELLS:,} cells, got {grid}")
+        raise InputError(f"grid: expected rows and columns of 1 or more, at most {MOST_CELLS:,} cells, got {grid}")
     scale = np.array([columns / width, lines / height])
     if fit == "crop":
         scale[:] = scale.max()
@@ -57,7 +57,7 @@ def token_blends(
     Args:
         gaussians: the splat.
         cameras: in the same world.
-        grid: lines and columns of the tower's patches.
+        grid: rows and columns of the tower's patches.
         fit: see `tower_grid`.
         config: accuracy knobs.
 

@@ -80,12 +80,10 @@ class NeighborConv(nn.Module):
     def forward(self, x: Float[Tensor, "N C"], neighbors: Integer[Tensor, "N 27"]) -> Float[Tensor, "N D"]:
         weight: Tensor = self.weight
         bias: Tensor = self.bias
-        if torch.compiler.is_exporting():
-            return convolve(x, neighbors, weight) + bias
         if torch.is_autocast_enabled(x.device.type):
             dtype = torch.get_autocast_dtype(x.device.type)
             x, weight, bias = x.to(dtype), weight.to(dtype), bias.to(dtype)
-        return _Convolve.apply(x, neighbors, weight) + bias
+        return convolve(x, neighbors, weight) + bias
 
 
 def convolve_reference(
@@ -96,10 +94,16 @@ def convolve_reference(
     return padded[neighbors.long()].flatten(1) @ weight.flatten(0, 1)
 
 
+# Operators of their own, because a compiler that traced the loop over blocks of rows would compile it anew for every
+# number of cells, and because `gsencoder.infer.onnx.operators` translates them to standard ONNX operators.
 @torch.library.custom_op("gsencoder::convolve", mutates_args=())
 def convolve(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
-    """The convolution as one operator, which `gsencoder.infer.onnx.operators` translates to standard ONNX operators."""
-    return _gather_matmul(x, neighbors, weight.flatten(0, 1))
+    """`convolve_reference`, computed in blocks of rows."""
+    padded, matrix = _append_zero_row(x), weight.flatten(0, 1)
+    out = x.new_empty(len(x), matrix.shape[1])
+    for rows in _row_blocks(len(x), x.device):
+        torch.mm(_gather_neighborhoods(padded, neighbors[rows]), matrix, out=out[rows])
+    return out
 
 
 @convolve.register_fake
@@ -107,27 +111,39 @@ def _(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
     return x.new_empty(neighbors.shape[0], weight.shape[2])
 
 
-class _Convolve(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
-        ctx.save_for_backward(x, neighbors, weight)
-        return _gather_matmul(x, neighbors, weight.flatten(0, 1))
+@torch.library.custom_op("gsencoder::convolve_weight_gradient", mutates_args=())
+def convolve_weight_gradient(x: Tensor, neighbors: Tensor, grad: Tensor) -> Tensor:
+    """The gradient of `convolve` with respect to its weight, (27, C, D), from that with respect to its result.
 
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None]:
-        x, neighbors, weight = ctx.saved_tensors
-        grad = grad.contiguous()
-        grad_x = grad_weight = None
-        if ctx.needs_input_grad[0]:
-            # Cell j is neighbor o of i exactly where i is neighbor 26 − o of j.
-            grad_x = _gather_matmul(grad, neighbors, weight.flip(0).transpose(1, 2).flatten(0, 1))
-        if ctx.needs_input_grad[2]:
-            padded = _append_zero_row(x)
-            total = weight.new_zeros(weight.shape, dtype=torch.promote_types(weight.dtype, torch.float32)).flatten(0, 1)
-            for rows in _row_blocks(len(x), x.device):
-                total += _gather_neighborhoods(padded, neighbors[rows]).T @ grad[rows]
-            grad_weight = total.view(weight.shape).to(weight.dtype)
-        return grad_x, None, grad_weight
+    It is summed in float32 at least.
+    """
+    padded = _append_zero_row(x)
+    shape = (neighbors.shape[1], x.shape[1], grad.shape[1])
+    total = x.new_zeros(shape, dtype=torch.promote_types(x.dtype, torch.float32)).flatten(0, 1)
+    for rows in _row_blocks(len(x), x.device):
+        total += _gather_neighborhoods(padded, neighbors[rows]).T @ grad[rows]
+    return total.view(shape).to(x.dtype)
+
+
+@convolve_weight_gradient.register_fake
+def _(x: Tensor, neighbors: Tensor, grad: Tensor) -> Tensor:
+    return x.new_empty(neighbors.shape[1], x.shape[1], grad.shape[1])
+
+
+def _save_inputs(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs)
+
+
+def _gradients(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None]:
+    x, neighbors, weight = ctx.saved_tensors
+    grad = grad.contiguous()
+    # Cell j is neighbor o of i exactly where i is neighbor 26 − o of j.
+    grad_x = convolve(grad, neighbors, weight.flip(0).transpose(1, 2)) if ctx.needs_input_grad[0] else None
+    grad_weight = convolve_weight_gradient(x, neighbors, grad) if ctx.needs_input_grad[2] else None
+    return grad_x, None, grad_weight
+
+
+convolve.register_autograd(_gradients, setup_context=_save_inputs)
 
 
 def _append_zero_row(x: Tensor) -> Tensor:
@@ -141,11 +157,3 @@ def _gather_neighborhoods(padded: Tensor, neighbors: Tensor) -> Tensor:
 def _row_blocks(n: int, device: torch.device) -> list[slice]:
     size = CPU_BLOCK_ROWS if device.type == "cpu" else max(n, 1)
     return [slice(start, start + size) for start in range(0, n, size)]
-
-
-def _gather_matmul(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
-    padded = _append_zero_row(x)
-    out = x.new_empty(len(x), weight.shape[1])
-    for rows in _row_blocks(len(x), x.device):
-        torch.mm(_gather_neighborhoods(padded, neighbors[rows]), weight, out=out[rows])
-    return out

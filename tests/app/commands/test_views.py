@@ -72,8 +72,8 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
     [
         ((), "query= is missing"),
         (("query=cube", "boxes=0"), "boxes: expected 1 or more"),
-        (("query=cube", "grid=[3]"), "grid: expected lines and columns"),
-        (("query=cube", "grid=[0,3]"), "grid: expected lines and columns of 1 or more"),
+        (("query=cube", "grid=[3]"), "grid: expected rows and columns"),
+        (("query=cube", "grid=[0,3]"), "grid: expected rows and columns of 1 or more"),
         (("query=zebra",), "not among the 4 words"),
         (("query=pen holder",), "none of pen holder was found"),
         (("query=cube", "choose.count=99"), "count: expected 1 to candidates"),
