@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.signals import defer_signals
+from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.parameters import (
     Parameters,
@@ -20,7 +21,6 @@ from gsencoder.reconstruct.parameters import (
     rows_in_view,
     seen_colors,
 )
-from gsencoder.reconstruct.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render.image_metrics import WINDOW as SSIM_WINDOW

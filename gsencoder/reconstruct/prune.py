@@ -8,8 +8,8 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.photographs import ScaledPhotograph
 from gsencoder.reconstruct.parameters import Parameters, camera_of, rows_in_view
-from gsencoder.reconstruct.photographs import ScaledPhotograph
 from gsencoder.render.rasterize import RasterConfig, rasterize
 from gsencoder.types import Cameras
 

@@ -22,13 +22,13 @@ from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.dense import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.anchor import anchor_at
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
-from gsencoder.reconstruct.dense import DenseConfig
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, covisible_pixels, drop_masked_views, score, split

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.stereo import confirms, sample_depth, world_points
 from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.photographs import Photographs
-from gsencoder.reconstruct.stereo import confirms, sample_depth, world_points
 from gsencoder.render.image_metrics import inner, psnr, ssim
 
 MIN_PHOTOGRAPHS = 2

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.dense import DenseConfig, DenseSeeds, densify
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.reconstruct.dense import DenseConfig, DenseSeeds, densify
-from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.types import Gaussians, Scene, Views
 
 MEASURED_SOURCES = ("depth", "mesh", "tsdf")

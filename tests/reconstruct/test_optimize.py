@@ -13,11 +13,11 @@ from splats import front_camera, random_gaussians
 from walls import wall_views
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import camera_of, gaussians_of, parameters_from, rows_in_view
-from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import score

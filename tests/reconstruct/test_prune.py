@@ -8,8 +8,8 @@ import torch
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.photographs import ScaledPhotograph
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.photographs import ScaledPhotograph
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.render import blend
 from gsencoder.render.rasterize import RasterConfig

@@ -7,10 +7,10 @@ import pytest
 import torch
 from walls import wall_views
 
+from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.photographs import Photographs
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import covisible_pixels, score

@@ -45,7 +45,8 @@ class Cloud(NamedTuple):
 
 
 def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
-    """The encoder as an ONNX graph whose convolutions are still operators of ours; see `gsencoder.infer.onnx.operators`.
+    """The encoder as an ONNX graph whose convolutions are still operators of ours; see
+    `gsencoder.infer.onnx.operators`.
 
     Args:
         encoder: to be exported.

@@ -6,7 +6,8 @@ import torch
 from walls import DEPTH, TILT, cameras, seen, wall_points, wall_views
 
 from gsencoder.core.errors import InputError
-from gsencoder.reconstruct.dense import (
+from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.dense import (
     DenseConfig,
     average_by_voxel,
     carve,
@@ -15,8 +16,7 @@ from gsencoder.reconstruct.dense import (
     interpolate,
     splat_depths,
 )
-from gsencoder.reconstruct.photographs import Photographs
-from gsencoder.reconstruct.stereo import DepthMap, count_agreeing, source_views, sweep, world_points
+from gsencoder.data.seeding.stereo import DepthMap, count_agreeing, source_views, sweep, world_points
 
 SMALL = DenseConfig(spacing=3.0, size=96, sources=3, samples=1)
 

@@ -53,7 +53,7 @@ class Photographs:
             InputError: no photographs, or a file that cannot be read.
         """
         if views.images is None:
-            raise InputError("reconstruct: the scene has cameras but no photographs, which is what is fitted")
+            raise InputError("the scene has cameras but no photographs")
         self.cameras: Cameras = views.cameras
         self.names = views.names
         self._images, self._masks, self._depths = [], [], []

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
+from gsencoder.data.photographs import ScaledPhotograph
 from gsencoder.geometry import invert_rigid, project_points, transform, unproject_points
-from gsencoder.reconstruct.photographs import ScaledPhotograph
 from gsencoder.types import Cameras
 from gsencoder.types.cameras import pixel_centers
 

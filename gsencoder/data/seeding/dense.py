@@ -16,9 +16,8 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.geometry import transform
-from gsencoder.reconstruct.photographs import Photographs, ScaledPhotograph
-from gsencoder.reconstruct.stereo import (
+from gsencoder.data.photographs import Photographs, ScaledPhotograph
+from gsencoder.data.seeding.stereo import (
     DepthMap,
     confirms,
     count_agreeing,
@@ -31,6 +30,7 @@ from gsencoder.reconstruct.stereo import (
     window_mean,
     world_points,
 )
+from gsencoder.geometry import transform
 from gsencoder.types import Cameras
 
 FILLED_SPACING = 2.0
