@@ -130,7 +130,7 @@ def _(x: Tensor, neighbors: Tensor, grad: Tensor) -> Tensor:
     return x.new_empty(neighbors.shape[1], x.shape[1], grad.shape[1])
 
 
-def _save_inputs(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+def _save_inputs(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:  # noqa: ARG001
     ctx.save_for_backward(*inputs)
 
 
