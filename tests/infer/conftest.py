@@ -19,10 +19,10 @@ from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 SHAPE = TransformerConfig(
-    encoder_depths=(1, 2, 1),
-    encoder_channels=(16, 16, 32),
-    decoder_depths=(1, 1),
-    decoder_channels=(16, 16),
+    encoder_depths=(2, 1),
+    encoder_channels=(16, 32),
+    decoder_depths=(1,),
+    decoder_channels=(16,),
     head_channels=8,
     patch=24,
 )

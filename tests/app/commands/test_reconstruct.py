@@ -101,6 +101,7 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(
 ) -> None:
     folder, out = shutil.copytree(ten, tmp_path / "photographs"), tmp_path / "out"
     words = [str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25", "dense.spacing=3"]
+    words += ["sfm.size=400", "sfm.features=2000"]
     with monkeypatch.context() as patched:
         patched.setattr(reconstruct.Optimizer, "advance", interrupt)
         assert cli.main(["reconstruct", *words]) == 130
