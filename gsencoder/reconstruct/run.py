@@ -203,6 +203,9 @@ def initial_state(
     if start.dense is not None:
         dense = start.dense
         seeding |= {"swept": dense.swept, "filled": dense.filled, "coverage": list(dense.coverage)}
+        if start.triangulated is not None:
+            seeding["triangulated"] = start.triangulated
+            report(f"the scene has no points; {start.triangulated:,} were triangulated from matches, poses held")
         report(
             f"points reach {dense.coverage[0]:.0%} of the pictures' cells: {dense.swept:,} were added from plane "
             f"sweeps and {dense.filled:,} between them, which reach {dense.coverage[1]:.0%}"
@@ -210,7 +213,7 @@ def initial_state(
         if not dense.swept:
             warnings.warn(
                 f"plane sweeps found no surface, and points reach {dense.coverage[0]:.0%} of the pictures alone; what "
-                "they leave bare stays empty: smaller dense.spacing, dense.samples or dense.alike may find more",
+                "they leave bare stays empty: a smaller dense.spacing or dense.samples may find more",
                 SceneWarning,
                 stacklevel=3,
             )

@@ -7,14 +7,13 @@ from typing import Any
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import DenseConfig, DenseSeeds, densify
+from gsencoder.data.seeding.from_photographs import MAX_DENSE_SPACING, seeds_of_photographs
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
-from gsencoder.data.seeding.seed import SeedConfig, seed
+from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
 from gsencoder.types import Gaussians, Scene, Views
 
 MEASURED_SOURCES = ("depth", "mesh", "tsdf")
 """Sources of seeds that were measured on surfaces; points of photographs are estimates, and a splat was optimized."""
-MAX_DENSE_SPACING = 4.0
-"""Spacing of dense seeds is clipped to this many medians: outliers must not become large blobs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,13 +22,15 @@ class Start:
 
     Attributes:
         gaussians: to be optimized.
-        source: splat, depth, points, mesh or tsdf.
-        dense: what was added to structure-from-motion points; None where nothing was.
+        source: splat, depth, points, photographs, mesh or tsdf.
+        dense: what was added to structure-from-motion or triangulated points; None where nothing was.
+        triangulated: number of points that were triangulated, for the source photographs.
     """
 
     gaussians: Gaussians
     source: str
     dense: DenseSeeds | None = None
+    triangulated: int | None = None
 
     @property
     def measured(self) -> bool:
@@ -85,16 +86,19 @@ def initial_gaussians(
         return Start(gaussians=scene.gaussians, source="splat")
     assert scene.views is not None
     views = select_views(scene.views, list(training))
-    source = seeds.source
-    if source == "auto":
-        source = "depth" if views.depths is not None else "points"
     seen = replace(scene, views=views)
-    points = scene.sfm_points
-    if source != "points" or points is None or dense.enough == 0:
-        return Start(gaussians=seed(seen, replace(seeds, source=source)), source=source)
-    colors = colors_or_grey(points, scene.sfm_colors)
-    added = densify(photographs, training, points, colors, dense, track=track)
+    source = choose_source(seen, seeds)
+    if source == "photographs":
+        from_photographs = seeds_of_photographs(photographs, views, dense, training=training, track=track)
+        added: DenseSeeds | None = from_photographs.dense
+        triangulated = len(from_photographs.triangulation.points)
+    elif source == "points" and scene.sfm_points is not None and dense.enough > 0:
+        colors = colors_or_grey(scene.sfm_points, scene.sfm_colors)
+        added = densify(photographs, training, scene.sfm_points, colors, dense, track=track)
+        seen, triangulated = replace(seen, sfm_colors=colors), None
+    else:
+        added = triangulated = None
     if added is None:
-        return Start(gaussians=seed(replace(seen, sfm_colors=colors), replace(seeds, source="points")), source="points")
+        return Start(gaussians=seed(seen, replace(seeds, source=source), track=track), source=source)
     gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=MAX_DENSE_SPACING)
-    return Start(gaussians=gaussians, source="points", dense=added)
+    return Start(gaussians=gaussians, source=source, dense=added, triangulated=triangulated)

@@ -52,7 +52,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
             scene = load_scene(path, splat=config.splat or None, options=config.data)
         if scene.gaussians is None:
             with one.step("seeds"):
-                scene = with_gaussians(scene, config.seeds)
+                scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
         out = config.out or Path("outputs") / scene.name / "features"
         if len(paths) > 1:
             out = out / scene.name

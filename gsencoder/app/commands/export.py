@@ -148,7 +148,7 @@ def _scenes(config: ExportConfig, voxel: float) -> list[Cloud]:
     for path in find_scenes(config.paths) if config.paths else ():
         scene = load_scene(path, splat=config.splat or None, options=config.data)
         if scene.gaussians is None:
-            scene = with_gaussians(scene, config.seeds)
+            scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
         assert scene.gaussians is not None
         clouds.append(Cloud(scene.name, scene.gaussians, unit_of(scene, voxel)))
     return clouds

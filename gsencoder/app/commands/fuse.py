@@ -72,7 +72,7 @@ def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Sce
         scene = load_scene(path, splat=config.splat or None, options=config.data)
     if scene.gaussians is None:
         with summary.step("seeds"):
-            scene = with_gaussians(scene, config.seeds)
+            scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
     return with_views(scene, config.orbits, config.fusion.blend)
 
 

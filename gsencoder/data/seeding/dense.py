@@ -18,6 +18,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.data.seeding.stereo import (
+    MAX_PLANES,
     DepthMap,
     confirms,
     count_agreeing,
@@ -113,6 +114,7 @@ def densify(
     colors: UInt8[np.ndarray, "P 3"],
     config: DenseConfig = DenseConfig(),
     *,
+    guide: Float32[np.ndarray, "G 3"] | None = None,
     track: Track = untracked,
 ) -> DenseSeeds | None:
     """Points for every surface that the training photographs show; None where the given ones cover enough.
@@ -123,30 +125,25 @@ def densify(
         points: from structure from motion.
         colors: beside them.
         config: see there.
+        guide: points that tell which views to compare and at which depths, and are no seeds; None = `points`.
         track: progress.
     """
     cameras = photographs.cameras
+    guide = points if guide is None else guide
     before = covered_share(cameras, training, points)
     if before >= config.enough:
         return None
-    neighbors = source_views(cameras, points, training, config.sources)
-    photos, poses = {}, {}
-    for view in training:
-        longest = max(int(cameras.widths[view]), int(cameras.heights[view]))
-        photos[view] = photographs.at_scale(view, max(1, round(longest / config.size)))
-        poses[view] = torch.from_numpy(cameras.cam_from_world[view].copy())
+    neighbors = source_views(cameras, guide, training, config.sources)
+    photos, poses = scaled_photographs(photographs, training, config.size)
     maps: dict[int, DepthMap] = {}
     for view in track(training, "sweeping planes"):
-        limits, others = depth_range(cameras, view, points), neighbors[view]
+        limits, others = depth_range(cameras, view, guide), neighbors[view]
         if limits is not None and len(others) >= 2:
-            swept_map = sweep(
-                photos[view], poses[view], [photos[o] for o in others], [poses[o] for o in others], *limits
-            )
-            maps[view] = swept_map._replace(depth=torch.where(swept_map.score >= MIN_CORRELATION, swept_map.depth, 0))
-    consistent = _consistent_depths(maps, photos, poses, neighbors)
-    swept = _back_project(consistent, photos, poses)
-    seen = _fill_depths(consistent, photos, poses, points)
-    filled = _back_project(_supported_depths(seen, consistent, photos, poses, neighbors), photos, poses)
+            maps[view] = sweep_neighbors(view, others, photos, poses, *limits)
+    consistent = consistent_depths(maps, photos, poses, neighbors)
+    swept = back_project(consistent, photos, poses)
+    seen = _fill_depths(consistent, photos, poses, guide)
+    filled = back_project(_supported_depths(seen, consistent, photos, poses, neighbors), photos, poses)
     voxel = config.spacing * _pixel_size(cameras, consistent)
     swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses, DEPTH_TOLERANCE)
     filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
@@ -156,6 +153,42 @@ def densify(
     return DenseSeeds(
         points=positions, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after)
     )
+
+
+def scaled_photographs(
+    photographs: Photographs, views: Sequence[int], size: int
+) -> tuple[dict[int, ScaledPhotograph], dict[int, Tensor]]:
+    """Photographs shrunk by a whole number to a longer side of about `size` pixels, and their cam_from_world."""
+    cameras = photographs.cameras
+    photos, poses = {}, {}
+    for view in views:
+        longest = max(int(cameras.widths[view]), int(cameras.heights[view]))
+        photos[view] = photographs.at_scale(view, max(1, round(longest / size)))
+        poses[view] = torch.from_numpy(cameras.cam_from_world[view].copy())
+    return photos, poses
+
+
+def sweep_neighbors(
+    view: int,
+    others: Sequence[int],
+    photos: Mapping[int, ScaledPhotograph],
+    poses: Mapping[int, Tensor],
+    near: float,
+    far: float,
+    *,
+    max_planes: int = MAX_PLANES,
+) -> DepthMap:
+    """The plane sweep of a view against others; its depth is 0 where their windows do not correlate."""
+    depth_map = sweep(
+        photos[view],
+        poses[view],
+        [photos[o] for o in others],
+        [poses[o] for o in others],
+        near,
+        far,
+        max_planes=max_planes,
+    )
+    return depth_map._replace(depth=torch.where(depth_map.score >= MIN_CORRELATION, depth_map.depth, 0))
 
 
 def _pixel_size(cameras: Cameras, depths: Mapping[int, Float[Tensor, "h w"]]) -> float:
@@ -215,22 +248,23 @@ def average_by_voxel(
     return means[:, :3].astype(np.float32), np.round(means[:, 3:]).astype(np.uint8)
 
 
-def _consistent_depths(
+def consistent_depths(
     maps: Mapping[int, DepthMap],
     photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
     neighbors: Mapping[int, Sequence[int]],
+    tolerance: float = DEPTH_TOLERANCE,
 ) -> dict[int, Float[Tensor, "h w"]]:
     """Depths that two other views confirm; 0 elsewhere."""
     consistent = {}
     for view, depth_map in maps.items():
         others = [(maps[other], photos[other], poses[other]) for other in neighbors[view] if other in maps]
-        votes = count_agreeing(depth_map.depth, photos[view], poses[view], others, DEPTH_TOLERANCE)
+        votes = count_agreeing(depth_map.depth, photos[view], poses[view], others, tolerance)
         consistent[view] = torch.where(votes >= 2, depth_map.depth, 0)
     return consistent
 
 
-def _back_project(
+def back_project(
     depths: Mapping[int, Float[Tensor, "h w"]], photos: Mapping[int, ScaledPhotograph], poses: Mapping[int, Tensor]
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     arrays: list[tuple[np.ndarray, np.ndarray]] = [(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))]
@@ -249,7 +283,7 @@ def _fill_depths(
     points: Float32[np.ndarray, "P 3"],
 ) -> dict[int, Float[Tensor, "h w"]]:
     """Depth at every pixel of every view: its own, else that of other views' points, else between its neighbors'."""
-    cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(_back_project(consistent, photos, poses)[0])))
+    cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(back_project(consistent, photos, poses)[0])))
     return {
         view: interpolate(torch.where(depth > 0, depth, splat_depths(cloud, photos[view], poses[view])))
         for view, depth in consistent.items()

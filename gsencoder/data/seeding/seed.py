@@ -15,6 +15,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.even_indices import even_indices
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.readers.scene_splat import file_of_scene
 from gsencoder.data.seeding.depth import depth_samples, read_rgbd
 from gsencoder.data.seeding.flat import flat_gaussians
@@ -43,11 +44,12 @@ SMALLEST_VOXEL, LARGEST_VOXEL = 1e-12, 1e12
 class SeedConfig:
     """How Gaussians are made from what a scene holds."""
 
-    source: Literal["auto", "depth", "points", "mesh", "tsdf"] = field(
+    source: Literal["auto", "depth", "points", "photographs", "mesh", "tsdf"] = field(
         default="auto",
         metadata={
-            "help": "depth = RGB-D frames; points = structure-from-motion points; mesh = a file; tsdf = RGB-D frames "
-            "fused to a mesh first; auto = depth if the views have it, else points"
+            "help": "depth = RGB-D frames; points = structure-from-motion points; photographs = matched features and "
+            "plane sweeps; mesh = a file; tsdf = RGB-D frames fused to a mesh first; auto = depth if the views have "
+            "it, else points if the scene has them, else photographs"
         },
     )
     voxel: float = field(default=0.02, metadata={"help": "edge of the grid in metres"})
@@ -66,8 +68,8 @@ class SeedConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.source not in ("auto", "depth", "points", "mesh", "tsdf"):
-            raise InputError(f"source must be auto, depth, points, mesh or tsdf, got {self.source!r}")
+        if self.source not in ("auto", "depth", "points", "photographs", "mesh", "tsdf"):
+            raise InputError(f"source must be auto, depth, points, photographs, mesh or tsdf, got {self.source!r}")
         for name in ("voxel", "voxel_units", "max_depth"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -78,24 +80,43 @@ class SeedConfig:
             raise InputError("source=mesh needs the mesh's file (mesh=PATH)")
 
 
-def seed(scene: Scene, config: SeedConfig = SeedConfig()) -> Gaussians:
+def choose_source(scene: Scene, config: SeedConfig = SeedConfig()) -> str:
+    """The source of seeds that `config` names or, for "auto", the first of depth, points and photographs there is.
+
+    Raises:
+        InputError: the source is "auto", and the scene has no photographs.
+    """
+    if config.source != "auto":
+        return config.source
+    if scene.views is not None and scene.views.depths is not None:
+        return "depth"
+    if scene.sfm_points is not None:
+        return "points"
+    if scene.views is not None and scene.views.images is not None:
+        return "photographs"
+    raise InputError(
+        f"seeds: scene {scene.name!r} has neither photographs nor structure-from-motion points; "
+        "give a mesh (source=mesh mesh=PATH) or a splat"
+    )
+
+
+def seed(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untracked) -> Gaussians:
     """Initial Gaussians of a scene, relative to its origin; the scene's own Gaussians are not looked at.
 
     The voxel is `config.voxel` metres. Where the scene's unit is unknown it is, with a warning, for depth images one
     hundredth of the median depth, for points their median nearest-neighbor distance, for a mesh one hundredth of the
-    median distance from the cameras to its middle, or one 300th of its diagonal.
+    median distance from the cameras to its middle, or one 300th of its diagonal. Seeds of photographs are as far apart
+    as a few pixels (`gsencoder.data.seeding.dense`).
+
+    Args:
+        scene: to seed.
+        config: the source, and how large the grid is.
+        track: progress, where the source is photographs.
 
     Raises:
         InputError: the scene does not hold what the source needs, or it cannot be used.
     """
-    source, views = config.source, scene.views
-    if source == "auto":
-        source = "depth" if views is not None and views.depths is not None else "points"
-        if source == "points" and scene.sfm_points is None:
-            raise InputError(
-                f"seeds: scene {scene.name!r} has neither depth images nor structure-from-motion points; "
-                "give a mesh (source=mesh mesh=PATH) or a splat"
-            )
+    source, views = choose_source(scene, config), scene.views
     if source == "points":
         points = scene.sfm_points
         if points is None:
@@ -109,7 +130,13 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig()) -> Gaussians:
         )
         return seed_from_mesh(mesh, voxel=voxel, origin=scene.origin)
     if views is None:
-        raise InputError(f"seeds: scene {scene.name!r} has no views; source={source} needs posed RGB-D frames")
+        needed = "photographs" if source == "photographs" else "RGB-D frames"
+        raise InputError(f"seeds: scene {scene.name!r} has no views; source={source} needs posed {needed}")
+    if source == "photographs":
+        # Sweeps need torch, which seeding from depth does without.
+        from gsencoder.data.seeding.from_photographs import seed_from_photographs
+
+        return seed_from_photographs(views, track=track)
     voxel = _voxel(scene, config, lambda: _depth_voxel(views), "one hundredth of the median depth")
     unit = scene.metres_per_unit or 1.0
     max_depth = None if config.max_depth is None else config.max_depth / unit
@@ -202,10 +229,10 @@ def _mesh_voxel(scene: Scene, path: str | Path) -> float:
     return float(np.linalg.norm(upper - lower)) / EXTENT_IN_VOXELS
 
 
-def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig()) -> Scene:
-    """The scene, with seeds where it has no splat.
+def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untracked) -> Scene:
+    """The scene, with seeds where it has no splat; the arguments are those of `seed`.
 
     Raises:
         InputError: there is nothing to seed from.
     """
-    return scene if scene.gaussians is not None else replace(scene, gaussians=seed(scene, config))
+    return scene if scene.gaussians is not None else replace(scene, gaussians=seed(scene, config, track=track))

@@ -88,7 +88,12 @@ def _points_at(depth: Float[Tensor, "h w"], photo: ScaledPhotograph) -> Float[Te
 
 
 def _planes(
-    rays: Tensor, relative: Sequence[Tensor], sources: Sequence[ScaledPhotograph], near: float, far: float
+    rays: Tensor,
+    relative: Sequence[Tensor],
+    sources: Sequence[ScaledPhotograph],
+    near: float,
+    far: float,
+    max_planes: int,
 ) -> Float[Tensor, " D"]:
     """Depths from near to far, evenly spaced in 1/depth, as close as pixels ask."""
     corners = rays[:: max(1, rays.shape[0] - 1), :: max(1, rays.shape[1] - 1)].reshape(-1, 3)
@@ -100,7 +105,7 @@ def _planes(
         ]
         moved = (ends[0] - ends[1]).norm(dim=-1)
         longest = max(longest, float(moved.median()))
-    count = int(np.clip(np.ceil(longest / PLANE_STEP), 16, MAX_PLANES))
+    count = int(np.clip(np.ceil(longest / PLANE_STEP), 16, max_planes))
     return 1 / torch.linspace(1 / near, 1 / far, count)
 
 
@@ -111,6 +116,8 @@ def sweep(
     source_poses: Sequence[Float[Tensor, "4 4"]],
     near: float,
     far: float,
+    *,
+    max_planes: int = MAX_PLANES,
 ) -> DepthMap:
     """Depths of a view by comparing it with others.
 
@@ -121,10 +128,11 @@ def sweep(
         source_poses: their cam_from_world.
         near: smallest depth, world units.
         far: largest depth.
+        max_planes: largest number of planes; a wide range of depths needs more.
     """
     rays = _points_at(torch.ones(reference.height, reference.width), reference)
     relative = [other @ invert_rigid(pose) for other in source_poses]
-    depths = _planes(rays, relative, sources, near, far)
+    depths = _planes(rays, relative, sources, near, far, max_planes)
     windows = _Windows(reference.image.mean(dim=-1)[None, None])
     scores = torch.stack(
         [
