@@ -1,9 +1,9 @@
-"""Loading of scenes in any supported layout: transforms.json, COLMAP, ScanNet, or a splat alone."""
+"""Loading of scenes in any supported layout, or of a splat alone."""
 
 import math
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,10 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.even_indices import even_indices
-from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
+from gsencoder.data.readers.frames import pinhole_of
 from gsencoder.data.readers.images import (
     DepthFiles,
+    DepthSensor,
     ImageFiles,
     InstanceFiles,
     MaskFiles,
@@ -21,9 +22,9 @@ from gsencoder.data.readers.images import (
     picture_info,
     picture_size,
 )
+from gsencoder.data.readers.layouts import ReadOptions, describe_layouts, layout_of, read_transforms_file
 from gsencoder.data.readers.objects_json import read_objects
-from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin
-from gsencoder.data.readers.scannet import is_scannet_export, read_scannet
+from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin, rigid_pose
 from gsencoder.data.readers.scene_splat import (
     SPLAT_SUFFIXES,
     file_of_scene,
@@ -31,13 +32,12 @@ from gsencoder.data.readers.scene_splat import (
     read_bare_splat,
     warn_of_unused_splat,
 )
-from gsencoder.data.readers.transforms_json import TRANSFORMS, read_transforms
+from gsencoder.data.readers.transforms_json import TRANSFORMS
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.data.splats import load_splat
 from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.poses import invert_rigid, move_origin
 
-COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 FEW_CAMERAS = 8
 
 
@@ -60,6 +60,21 @@ class SceneConfig:
     images: str = field(
         default="", metadata={"help": "folder of the photographs of a COLMAP model; empty = images/ beside the model"}
     )
+    intrinsics: tuple[float, float, float, float] | None = field(
+        default=None,
+        metadata={"help": "fx, fy, cx, cy of the photographs, pixels, no distortion; empty = those of the files"},
+    )
+    depth_intrinsics: tuple[float, float, float, float] | None = field(
+        default=None, metadata={"help": "fx, fy, cx, cy of the depth images; empty = those of the files"}
+    )
+    depth_from_color: tuple[float, ...] | None = field(
+        default=None,
+        metadata={
+            "help": "where the depth sensor stands: 12 or 16 numbers of the rigid transform from the photograph's "
+            "camera "
+            "axes to its own, row by row, world units; empty = that of the files"
+        },
+    )
 
     def __post_init__(self) -> None:
         if self.max_views < 0:
@@ -70,14 +85,15 @@ class SceneConfig:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name}: expected a positive number, got {value}")
+        if self.depth_from_color is not None and len(self.depth_from_color) not in (12, 16):
+            raise InputError(f"depth_from_color: expected 12 or 16 numbers, got {len(self.depth_from_color)}")
 
 
 def load_scene(path: str | Path, *, splat: str | Path | None = None, options: SceneConfig = SceneConfig()) -> Scene:
     """Reads a scene; of pictures the size is read now, and they are decoded on access.
 
-    Recognized, in this order: a transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender), a COLMAP
-    model (sparse/0, sparse, or its files themselves, with images/ beside), a ScanNet export (color/, pose/, …), a
-    splat file, or a folder with one splat file or an unpacked .sog.
+    Recognized, in this order: the layouts of `gsencoder.data.readers.layouts` (transforms.json, COLMAP, ScanNet++,
+    ScanNet, 7-Scenes, TUM RGB-D, Replica), a splat file, or a folder with one splat file or an unpacked .sog.
 
     Cameras and Gaussians are relative to `Scene.origin`: the mean of the camera centers (for a bare splat the median
     of its means), each coordinate rounded to a multiple of 1000 units. It is subtracted in float64.
@@ -185,8 +201,7 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
             raise InputError(f"{str(given)[:200]!r} cannot be read ({type(error).__name__})") from error
         if not inside:
             raise InputError(
-                f"{given}: neither a scene nor a folder of scenes; a scene holds {' or '.join(TRANSFORMS)}, a COLMAP "
-                "model, a ScanNet export or a splat"
+                f"{given}: neither a scene nor a folder of scenes; a scene holds one of: {describe_layouts()}; a splat"
             )
         for path in inside:
             scenes.setdefault(path.resolve(), path)
@@ -198,9 +213,8 @@ def is_scene(path: Path) -> bool:
     if path.is_file():
         return True
     return (
-        any((path / file).is_file() for file in (*TRANSFORMS, "meta.json"))
-        or any(is_colmap_model(path / folder) for folder in COLMAP_FOLDERS)
-        or is_scannet_export(path)
+        (path / "meta.json").is_file()
+        or layout_of(path) is not None
         or any(entry.suffix.lower() in SPLAT_SUFFIXES and entry.is_file() for entry in path.iterdir())
     )
 
@@ -211,55 +225,37 @@ def _is_listed(entry: Path) -> bool:
 
 def _read_views(root: Path, options: SceneConfig) -> tuple[PosedImages | None, Path]:
     """The posed images, None for a bare splat, and the folder of the scene."""
-    outside, scale = options.allow_outside, options.depth_scale
+    read = ReadOptions(
+        allow_outside=options.allow_outside,
+        depth_scale=options.depth_scale,
+        images=options.images,
+        intrinsics=options.intrinsics,
+    )
     if root.is_file():
-        if _is_transforms(root):
-            return read_transforms(root, allow_outside=outside, depth_scale=scale), root.parent
-        return None, root.parent
-    transforms = next((root / file for file in TRANSFORMS if (root / file).is_file()), None)
-    model = next((root / file for file in COLMAP_FOLDERS if is_colmap_model(root / file)), None)
-    if transforms is not None:
-        if model is not None and not str(model.relative_to(root)).startswith("colmap"):
-            _warn(
-                f"{root}: holds {transforms.name} and a COLMAP model; {transforms.name} is used (give {model} instead)"
-            )
-        return read_transforms(transforms, allow_outside=outside, depth_scale=scale), root
-    if model is not None:
-        return _read_colmap(root, model, options)
-    if is_scannet_export(root):
-        return read_scannet(root, allow_outside=outside, depth_scale=scale), root
-    return None, root
+        if not _is_transforms(root):
+            return None, root.parent
+        posed, folder = read_transforms_file(root, read)
+    else:
+        layout = layout_of(root)
+        if layout is None:
+            return None, root
+        posed, folder = layout.read(root, read)
+    images = tuple(_with_stated_sensors(image, options) for image in posed.images)
+    return replace(posed, images=images), folder
 
 
-def _read_colmap(root: Path, model: Path, options: SceneConfig) -> tuple[PosedImages, Path]:
-    if model.name == "0" and model != root:
-        others = sorted(path.name for path in model.parent.iterdir() if path != model and is_colmap_model(path))
-        if others:
-            _warn(
-                f"{model.parent}: holds {1 + len(others)} models; 0 is used (or give the folder of {', '.join(others)})"
-            )
-    if options.images:
-        images = Path(options.images)
-        images = images if images.is_absolute() or images.is_dir() else root / images
-        if not images.is_dir():
-            raise InputError(f"images={options.images}: no such folder (looked from here and in {root})")
-        # A folder that the user names may be read.
-        return read_colmap(model, images, images, allow_outside=options.allow_outside), root
-    home = _home(root, model)
-    if home is None:
-        looked = ", ".join(str(home / "images") for home in _homes(root, model))
-        raise InputError(f"{model}: a COLMAP model without photographs; looked for {looked}; say images=FOLDER")
-    return read_colmap(model, home / "images", home, allow_outside=options.allow_outside), home
-
-
-def _home(root: Path, model: Path) -> Path | None:
-    """The folder with the photographs of a COLMAP model. If the path is that of the model, such as scene/sparse/0, it
-    is up to two levels above."""
-    return next((home for home in _homes(root, model) if (home / "images").is_dir()), None)
-
-
-def _homes(root: Path, model: Path) -> list[Path]:
-    return [root, root.parent, root.parent.parent] if model == root else [root]
+def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
+    """A view with the intrinsics and the depth sensor that the user states."""
+    if options.intrinsics is not None:
+        fx, fy, cx, cy = options.intrinsics
+        image = replace(image, camera=pinhole_of(fx, fy, cx, cy, image.image, "data.intrinsics"))
+    if image.depth is not None and options.depth_intrinsics is not None:
+        fx, fy, cx, cy = options.depth_intrinsics
+        image = replace(image, depth_camera=pinhole_of(fx, fy, cx, cy, image.depth, "data.depth_intrinsics"))
+    if options.depth_from_color is not None:
+        rows = np.vstack((np.array(options.depth_from_color).reshape(-1, 4)[:3], (0, 0, 0, 1)))
+        image = replace(image, depth_from_color=rigid_pose(rows, "data.depth_from_color"))
+    return image
 
 
 def make_views(
@@ -306,13 +302,22 @@ def make_views(
         cameras=cameras,
         names=tuple(image.name for image in chosen),
         images=ImageFiles([image.image for image in chosen], grids, remaps),
-        depths=DepthFiles(depths, depth_grids, remaps, [image.depth_scale for image in chosen])
+        depths=DepthFiles(depths, depth_grids, remaps, [_depth_sensor(image) for image in chosen])
         if _any(depths)
         else None,
         masks=MaskFiles(masks, grids, remaps, transparent) if _any(masks) or _any(transparent) or partial else None,
         instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
     )
     return views, origin
+
+
+def _depth_sensor(image: PosedImage) -> DepthSensor:
+    transform = image.depth_from_color
+    return DepthSensor(
+        scale=image.depth_scale,
+        no_depth=image.no_depth,
+        color_from_depth=None if transform is None else invert_rigid(transform),
+    )
 
 
 def _any(paths: Sequence[Path | None]) -> bool:

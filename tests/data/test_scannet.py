@@ -52,7 +52,7 @@ def test_lost_and_unposed_frames_are_counted(tmp_path: Path) -> None:
         assert len(load_scene(tmp_path).views or ()) == 4
     np.savetxt(tmp_path / "pose/1.txt", np.eye(4))
     (tmp_path / "pose/2.txt").unlink()
-    with pytest.warns(SceneWarning, match=r"1 of 5 pose files are missing \(first: 'pose/2.txt'\)"):
+    with pytest.warns(SceneWarning, match=r"1 of 5 frames have no pose file and are left out \(first: '2'\)"):
         assert len(load_scene(tmp_path).views or ()) == 4
     np.savetxt(tmp_path / "pose/2.txt", np.eye(4))
     (tmp_path / "depth/4.png").unlink()

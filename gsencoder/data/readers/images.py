@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache
+from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -224,6 +224,21 @@ class _Files(Sequence[Array]):
         return values
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthSensor:
+    """How the numbers of a depth file become depth of the photograph.
+
+    Attributes:
+        scale: world units for each step of the file.
+        no_depth: a step that means none, besides 0.
+        color_from_depth: where the sensor stands beside the photograph's camera, world units; None = in one place.
+    """
+
+    scale: float = 1.0
+    no_depth: int | None = None
+    color_from_depth: Float64[np.ndarray, "4 4"] | None = None
+
+
 class ImageFiles(_Files[UInt8[np.ndarray, "H W 3"]]):
     """Photographs as uint8 [H, W, 3] RGB, undistorted and scaled."""
 
@@ -247,7 +262,7 @@ class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
     """Sensor depth as float32 [H, W], z in world units, 0 = none; a view without a file is all zero.
 
     PNG holds integers and .npy any number type; both are multiplied by the view's scale. In .npy, NaN and infinity
-    also mean none.
+    also mean none. Depth of a sensor that stands beside the photograph's camera is carried over (registration.py).
     """
 
     def __init__(
@@ -255,13 +270,13 @@ class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
         paths: Sequence[Path | None],
         grids: Sequence[PixelGrid],
         remaps: RemapCache,
-        scales: Sequence[float],
+        sensors: Sequence[DepthSensor],
     ) -> None:
         super().__init__(paths, grids, remaps)
-        self._scales = tuple(scales)
+        self._sensors = tuple(sensors)
 
     def _slice(self, rows: slice) -> "DepthFiles":
-        return DepthFiles(self._paths[rows], self._grids[rows], self._remaps, self._scales[rows])
+        return DepthFiles(self._paths[rows], self._grids[rows], self._remaps, self._sensors[rows])
 
     def _load(self, view: int) -> Float32[np.ndarray, "H W"]:
         path, grid = self._paths[view], self._grids[view]
@@ -275,10 +290,39 @@ class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
                 raise InputError(f"{path}: depth has negative values")
         else:
             values = read_integers(path, "depth", wide=True).astype(np.float64)
-        depth = self._nearest(view, values) * self._scales[view]
+        sensor = self._sensors[view]
+        if sensor.no_depth is not None:
+            values[values == sensor.no_depth] = 0
+        if sensor.color_from_depth is None:
+            depth = self._nearest(view, values) * sensor.scale
+        else:
+            depth = self._registered(view, values * sensor.scale, sensor.color_from_depth)
         if depth.size and depth.max() > np.finfo(np.float32).max:
             raise InputError(f"{path}: depth of {depth.max():g} world units; check the depth scale")
         return depth.astype(np.float32)
+
+    def _registered(
+        self, view: int, depth: np.ndarray, color_from_depth: Float64[np.ndarray, "4 4"]
+    ) -> Float32[np.ndarray, "H W"]:
+        """The depth of a sensor that stands elsewhere, as the photograph's camera sees it."""
+        # The kernel needs numba and torch, which scenes without such sensors do without.
+        from gsencoder.data.readers.registration import register_depth
+
+        grid = self._grids[view]
+        self._checked(view, depth.shape)
+        source = grid.source
+        sensor = pinhole_for(source, str(self._paths[view]))
+        remap = self._remaps.get(sensor, source)
+        if remap is not None:
+            depth = remap.nearest(depth)
+        return register_depth(
+            depth.astype(np.float32),
+            sensor.matrix(sensor.width, sensor.height),
+            color_from_depth,
+            grid.pinhole.matrix(grid.width, grid.height),
+            grid.width,
+            grid.height,
+        )
 
 
 class InstanceFiles(_Files[Int32[np.ndarray, "H W"]]):

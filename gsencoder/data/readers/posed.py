@@ -32,7 +32,10 @@ class PosedImage:
         image: an existing photograph.
         depth: sensor depth, or None.
         depth_camera: the camera of the depth map; None = that of the photograph.
+        depth_from_color: where the depth camera stands, rigid, from the axes of the photograph's camera to its own, in
+            world units; None = both look from one place.
         depth_scale: world units for each step of the depth file.
+        no_depth: a step of the depth file that means none, besides 0.
         mask: pixels to use, or None.
         instance: instance map, or None.
     """
@@ -43,7 +46,9 @@ class PosedImage:
     image: Path
     depth: Path | None = None
     depth_camera: CameraModel | None = None
+    depth_from_color: Float64[np.ndarray, "4 4"] | None = None
     depth_scale: float = 1.0
+    no_depth: int | None = None
     mask: Path | None = None
     instance: Path | None = None
 

@@ -6,7 +6,8 @@ or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `applied_trans
 `aabb_scale` are not used: the world is that of the matrices.
 
 Beside the keys of those programs these are read: `instance_file_path` (integers, 0 = none) for a frame, and
-`metres_per_unit` and `up` for the file.
+`metres_per_unit` and `up` for the file; for both, `depth_camera` (an object with fl_x, fl_y, cx and cy, for the depth
+file's pixels) and `depth_from_color` (4×4, OpenCV axes, world units), where depth is not registered to color.
 """
 
 import json
@@ -53,13 +54,22 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: not a readable JSON file ({' '.join(str(error).split())[:160]})") from error
 
 
-def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: float | None = None) -> PosedImages:
+def read_transforms(
+    path: Path,
+    *,
+    allow_outside: bool = False,
+    depth_scale: float | None = None,
+    pictures: Path | None = None,
+    masks: Path | None = None,
+) -> PosedImages:
     """Reads a transforms.json.
 
     Args:
         path: the JSON file; its folder is the scene folder, which paths in it may not leave.
         allow_outside: let them.
         depth_scale: world units for each step of a depth file; None = what the file says, else millimetres.
+        pictures: the folder that `file_path` is relative to; None = that of the file.
+        masks: the folder that `mask_path` is relative to; None = that of the file.
 
     Returns:
         Posed pictures in OpenCV axes. The unit is the metre and up is +z where the file says so, or where it has
@@ -85,7 +95,7 @@ def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: flo
         if name in names:
             raise InputError(f"{where}: this file_path is repeated; every frame needs its own")
         names.add(name)
-        image = _find_image(root, name, where, allow_outside=allow_outside)
+        image = _find_image(pictures or root, name, where, allow_outside=allow_outside)
         if image is None:
             missing["image"].append(name)
             continue
@@ -101,7 +111,8 @@ def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: flo
                 continue
             if not isinstance(listed, str):
                 raise InputError(f"{where}: {keys[0]} must be a path, got {str(listed)[:40]!r}")
-            file = inside(root, listed, where, allow_outside=allow_outside)
+            home = masks if kind == "mask" and masks is not None else root
+            file = inside(home, listed, where, allow_outside=allow_outside)
             if file.is_file():
                 beside[kind] = file
             else:
@@ -115,7 +126,8 @@ def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: flo
         scale = next(value for value in (depth_scale, stated, NERFSTUDIO_DEPTH_SCALE) if value is not None)
         if not 0 < scale < math.inf:
             raise InputError(f"{where}: the depth scale must be positive, got {scale}")
-        pose = rigid_pose(_matrix(frame.get("transform_matrix"), where), where)
+        pose = rigid_pose(_matrix(frame, "transform_matrix", where), where)
+        depth_camera, depth_from_color = _depth_sensor(data | frame, beside["depth"], where)
         images.append(
             PosedImage(
                 name=name,
@@ -123,6 +135,8 @@ def read_transforms(path: Path, *, allow_outside: bool = False, depth_scale: flo
                 cam_from_world=invert_rigid(pose @ OPENCV_FROM_OPENGL),
                 image=image,
                 depth=beside["depth"],
+                depth_camera=depth_camera,
+                depth_from_color=depth_from_color,
                 depth_scale=scale,
                 mask=beside["mask"],
                 instance=beside["instance"],
@@ -157,17 +171,34 @@ def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Pa
     return None
 
 
-def _matrix(value: object, where: str) -> Float64[np.ndarray, "4 4"]:
+def _depth_sensor(
+    values: dict[str, Any], depth: Path | None, where: str
+) -> tuple[CameraModel | None, Float64[np.ndarray, "4 4"] | None]:
+    """The camera of the depth map and where it stands, from `depth_camera` and `depth_from_color`; None = as the
+    photograph's."""
+    camera = None
+    stated = values.get("depth_camera")
+    if stated is not None and depth is not None:
+        if not isinstance(stated, dict):
+            raise InputError(f"{where}: depth_camera must be an object with fl_x, fl_y, cx and cy")
+        camera = _camera({}, stated, depth, f"{where}: depth_camera")
+    if values.get("depth_from_color") is None:
+        return camera, None
+    return camera, rigid_pose(_matrix(values, "depth_from_color", where), f"{where}: depth_from_color")
+
+
+def _matrix(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:
+    value = values.get(key)
     rows = value if isinstance(value, list) else []
     good = len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)
     if not good:
-        raise InputError(f"{where}: transform_matrix must have 4 rows (or the upper 3) of 4 numbers")
+        raise InputError(f"{where}: {key} must have 4 rows (or the upper 3) of 4 numbers")
     matrix = np.eye(4)
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):
-            element = number({"transform_matrix": entry}, "transform_matrix", where)
+            element = number({key: entry}, key, where)
             if element is None:
-                raise InputError(f"{where}: transform_matrix has an empty entry in row {i}")
+                raise InputError(f"{where}: {key} has an empty entry in row {i}")
             matrix[i, j] = element
     return matrix
 
