@@ -124,7 +124,8 @@ def test_a_trajectory_of_nan_leaves_no_view(room: Scene, tmp_path: Path) -> None
         load_scene(folder)
 
 
-def test_a_photograph_in_depths_stead_is_refused(room: Scene, tmp_path: Path) -> None:
+# The checks of shapes read a depth image as soon as there are views.
+def test_a_photograph_in_depths_stead_is_refused(room: Scene, tmp_path: Path, no_jaxtyping: None) -> None:
     folder = tmp_path / "room"
     write_replica(room, folder)
     (folder / "results" / "depth000002.png").write_bytes((folder / "results" / "frame000002.png").read_bytes())
