@@ -59,7 +59,8 @@ def read_replica(root: Path, *, allow_outside: bool = False, depth_scale: float 
             continue
         if key not in depths:
             without_depth.append(color.name)
-        camera = pinhole_of(*(parameters[name] for name in ("fx", "fy", "cx", "cy")), color, str(root / PARAMETERS))
+        fx, fy, cx, cy = (parameters[name] for name in ("fx", "fy", "cx", "cy"))
+        camera = pinhole_of(fx, fy, cx, cy, color, str(root / PARAMETERS))
         images.append(
             PosedImage(
                 name=f"{PICTURES}/{color.name}",

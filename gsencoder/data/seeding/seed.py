@@ -40,11 +40,14 @@ SMALLEST_VOXEL, LARGEST_VOXEL = 1e-12, 1e12
 """In units of the scene."""
 
 
+Source = Literal["depth", "points", "photographs", "mesh", "tsdf"]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeedConfig:
     """How Gaussians are made from what a scene holds."""
 
-    source: Literal["auto", "depth", "points", "photographs", "mesh", "tsdf"] = field(
+    source: Literal["auto"] | Source = field(
         default="auto",
         metadata={
             "help": "depth = RGB-D frames; points = structure-from-motion points; photographs = matched features and "
@@ -80,7 +83,7 @@ class SeedConfig:
             raise InputError("source=mesh needs the mesh's file (mesh=PATH)")
 
 
-def choose_source(scene: Scene, config: SeedConfig = SeedConfig()) -> str:
+def choose_source(scene: Scene, config: SeedConfig = SeedConfig()) -> Source:
     """The source of seeds that `config` names or, for "auto", the first of depth, points and photographs there is.
 
     Raises:
