@@ -210,7 +210,7 @@ def initial_state(
         if not dense.swept:
             warnings.warn(
                 f"plane sweeps found no surface, and points reach {dense.coverage[0]:.0%} of the pictures alone; what "
-                "they leave bare stays empty: smaller dense.spacing, dense.samples or dense.alike may find more",
+                "they leave bare stays empty: a smaller dense.spacing or dense.samples may find more",
                 SceneWarning,
                 stacklevel=3,
             )
