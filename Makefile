@@ -7,6 +7,9 @@ PROCESSES ?= 2
 # Files with tests that run alone; the others need not be collected a second time.
 ALONE = $(shell grep -rl --include='*.py' 'mark\.alone' tests)
 
+# Compiling the tests and the package takes ten seconds in each process; the results are cached.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: help setup demo test test-fast lint check clean
 help:            ## what can be made
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
