@@ -4,8 +4,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Processes that tests run in, each on one thread.
 PROCESSES ?= 2
-# Files with tests that run alone; the others need not be collected a second time.
+# Files with tests that run alone, which are all that the second run collects, and files with slow tests only.
 ALONE = $(shell grep -rl --include='*.py' 'mark\.alone' tests)
+SLOW = $(shell grep -rl --include='*.py' '^pytestmark = pytest.mark.slow' tests)
+
+# Compiling the tests and the package takes ten seconds in each process; the results are cached.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help setup demo test test-fast lint check clean
 help:            ## what can be made
@@ -33,7 +37,7 @@ test: setup      ## all tests; those that need real data look for it in GSENCODE
 	$(BIN)/python -m pytest -q -m alone $(ALONE)
 
 test-fast: setup ## the tests that take a second at most
-	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone and not slow"
+	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone and not slow" $(SLOW:%=--ignore=%)
 
 check: lint test ## what continuous integration runs
 

@@ -80,6 +80,7 @@ def test_projecting_what_was_unprojected_gives_the_pixels_and_depths_again(seed:
     np.testing.assert_allclose(again, pixels, rtol=0, atol=2e4 * np.finfo(kind).eps)
 
 
+@pytest.mark.slow
 def test_projection_is_that_of_colmap() -> None:
     """COLMAP's pixel centers lie at .5, too, so that nothing is added or taken off."""
     cameras, points = random_cameras(), some_points(200)

@@ -28,10 +28,11 @@ def test_they_take_less_than_ten_megabytes_and_say_how_they_were_made() -> None:
     assert not any(Path(path).is_absolute() for path in made_by["settings"]["paths"])
 
 
-def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path) -> None:
+@pytest.mark.parametrize("number", [40, 45])
+def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, number: int) -> None:
     encoder = TorchEncoder("house_cpu")
     words = load_text_table(FOLDER / WORDS_FILE)
-    scene = with_gaussians(load_scene(shared / "scenes" / "house" / "train_040"))
+    scene = with_gaussians(load_scene(shared / "scenes" / "house" / f"train_{number:03d}"))
     assert scene.gaussians is not None
     accuracies, features = [], []
     for chunk in (0, 80_000):

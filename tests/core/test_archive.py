@@ -72,6 +72,7 @@ def test_what_the_types_refuse_is_told_with_the_file(tmp_path: Path) -> None:
         raise InputError("scales > 0")
 
 
+@pytest.mark.slow
 def test_every_single_bit_flip_is_refused_or_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "x"
     write_archive(path, ARRAYS, {"name": "é", "nested": {"deep": [1, 2.5]}})

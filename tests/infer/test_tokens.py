@@ -103,6 +103,7 @@ def plates(grid: int, focal: float, pixels: float) -> Gaussians:
     )
 
 
+@pytest.mark.slow
 def test_a_model_answers_from_rendered_tokens_as_from_its_own_tower(tmp_path: Path) -> None:
     transformers = pytest.importorskip("transformers")
     save_tiny_vlm(tmp_path)
