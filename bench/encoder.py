@@ -31,6 +31,7 @@ from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
+from gsencoder.models.grid.neighbors import _append_zero_row, _gather_neighborhoods, _row_blocks
 from gsencoder.models.grid.plan import plan_cloud
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.train import samples
@@ -97,6 +98,11 @@ class Recorded(TorchDispatchMode):
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = function.overloadpacket.__name__
+        if name == "convolve":
+            x, neighbors, weight = args
+            padded, matrix = _append_zero_row(x), weight.flatten(0, 1)
+            for rows in _row_blocks(len(x), x.device):
+                self.products.append((torch.mm, (_gather_neighborhoods(padded, neighbors[rows]), matrix), {}))
         if name in PRODUCTS:
 
             def copy(value: Any) -> Any:
