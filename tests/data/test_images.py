@@ -11,6 +11,7 @@ from scene_files import photograph, save
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.images import (
     DepthFiles,
+    DepthSensor,
     ImageFiles,
     InstanceFiles,
     MaskFiles,
@@ -111,7 +112,12 @@ def test_depth_comes_from_png_and_npy_in_world_units(tmp_path: Path) -> None:
     metres = values * 1e-3
     metres[0, :4] = [np.nan, np.inf, -np.inf, 0]
     np.save(tmp_path / "d.npy", metres)
-    files = DepthFiles([png, tmp_path / "d.npy", None], [grid()] * 3, RemapCache(), [1e-3, 1.0, 1.0])
+    files = DepthFiles(
+        [png, tmp_path / "d.npy", None],
+        [grid()] * 3,
+        RemapCache(),
+        [DepthSensor(scale=scale) for scale in (1e-3, 1.0, 1.0)],
+    )
     assert (files[0] == (values * 1e-3).astype(np.float32)).all()
     assert not files[1][0, :4].any()
     assert (files[1][1:] == files[0][1:]).all()
@@ -126,7 +132,7 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path: Path) -> None:
     }
     for name, values in cases.items():
         with pytest.raises(InputError, match=f"{name}: depth must be a 16-bit"):
-            DepthFiles([save(tmp_path / name, values)], [grid()], RemapCache(), [1.0])[0]
+            DepthFiles([save(tmp_path / name, values)], [grid()], RemapCache(), [DepthSensor()])[0]
     np.save(tmp_path / "negative.npy", np.full((24, 32), -1.0))
     np.save(tmp_path / "cube.npy", np.zeros((24, 32, 2)))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object), allow_pickle=True)
@@ -138,7 +144,7 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path: Path) -> None:
         ("huge", "depth scale"),
     ):
         with pytest.raises(InputError, match=f"{name}.npy.*{said}"):
-            DepthFiles([tmp_path / f"{name}.npy"], [grid()], RemapCache(), [1.0])[0]
+            DepthFiles([tmp_path / f"{name}.npy"], [grid()], RemapCache(), [DepthSensor()])[0]
     # A header that promises more than the file holds.
     data = (tmp_path / "negative.npy").read_bytes()
     (tmp_path / "cut.npy").write_bytes(data[:-8])
@@ -165,7 +171,9 @@ def test_sequences_index_like_lists(tmp_path: Path) -> None:
     assert (files[-1] == photograph(3)).all()
     assert (files[np.int64(2)] == photograph(2)).all()
     assert [(a == photograph(i)).all() for i, a in zip((3, 2, 1, 0), files[::-1], strict=True)] == [True] * 4
-    depths = DepthFiles([None] * 4, [grid()] * 4, RemapCache(), [1.0, 2.0, 3.0, 4.0])[1:3]
+    depths = DepthFiles(
+        [None] * 4, [grid()] * 4, RemapCache(), [DepthSensor(scale=scale) for scale in (1.0, 2.0, 3.0, 4.0)]
+    )[1:3]
     assert len(depths) == 2
     for bad in (4, -5):
         with pytest.raises(IndexError):

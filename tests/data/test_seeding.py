@@ -525,7 +525,8 @@ class TestSeed:
     def test_sources_that_the_scene_does_not_have_are_errors(self):
         scene = Scene(name="bare")
         for source, message in (
-            ("auto", "neither depth"),
+            ("auto", "neither photographs"),
+            ("photographs", "no views"),
             ("points", "no structure"),
             ("depth", "no views"),
             ("tsdf", "no views"),

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scene_files import save
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.images import DepthFiles, ImageFiles, MaskFiles, PixelGrid
+from gsencoder.data.readers.images import DepthFiles, DepthSensor, ImageFiles, MaskFiles, PixelGrid
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, build_remap, check_camera, pinhole_for
 
 MODELS = {
@@ -101,7 +101,7 @@ def test_pixels_without_content_are_black_and_masked(tmp_path: Path) -> None:
     assert (image[mask] == 255).all()
     assert not image[~mask].any()
     depth = save(tmp_path / "depth.png", np.full((540, 720), 7, np.uint16))
-    assert ((DepthFiles([depth], [g], cache, [1.0])[0] == 7) == mask).all()
+    assert ((DepthFiles([depth], [g], cache, [DepthSensor()])[0] == 7) == mask).all()
     half = PixelGrid(source=camera, pinhole=g.pinhole, width=360, height=270)
     small = MaskFiles([None], [half], cache, [None])[0]
     assert (small == mask.reshape(270, 2, 360, 2).all(axis=(1, 3))).all()
