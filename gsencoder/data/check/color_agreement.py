@@ -1,0 +1,86 @@
+"""Whether the photographs of a scene show the same colors at the same places, where depth says that places are the
+same."""
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from gsencoder.data.check.depth_agreement import TOLERANCE, DepthViews, world_samples
+from gsencoder.types import Views
+from gsencoder.types.cameras import project_points
+from gsencoder.types.poses import transform
+
+MIN_SAMPLES = 30
+"""Pairs of views that share fewer samples say nothing."""
+
+
+def grey_pictures(
+    views: Views, chosen: Int64[np.ndarray, " V"], shape: tuple[int, int]
+) -> Float32[np.ndarray, "V h w"]:
+    """Photographs in grey, 0 to 1, at the size of the small depth images."""
+    from PIL import Image
+
+    assert views.images is not None
+    pictures = []
+    for view in chosen:
+        grey = Image.fromarray(views.images[int(view)]).convert("L").resize(shape[::-1], Image.Resampling.BOX)
+        pictures.append(np.asarray(grey, np.float32) / 255)
+    return np.stack(pictures)
+
+
+def color_correlations(
+    views: DepthViews, grey: Float32[np.ndarray, "V h w"], Ks: Float64[np.ndarray, "V 3 3"]
+) -> Float64[np.ndarray, "V V"]:
+    """Correlation of the intensities of one place in view i and view j; NaN where they share too few places.
+
+    A place is shared where the depth of both agrees within `TOLERANCE`.
+
+    Args:
+        views: depth under the reading that fits best.
+        grey: photographs at the size of the depth images.
+        Ks: intrinsics of these photographs.
+    """
+    points = world_samples(views)
+    count, height, width = views.depths.shape
+    result = np.full((count, count), np.nan)
+    for view in range(count):
+        known = np.flatnonzero(views.values[view] > 0)
+        here, seen = _intensities(grey[view], Ks[view], transform(views.cam_from_world[view], points[view][known]))
+        for other in range(count):
+            if other == view:
+                continue
+            local = transform(views.cam_from_world[other], points[view][known])
+            pixels = project_points(local, views.Ks[other])
+            inside = (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+            columns, rows = np.floor(pixels[inside]).astype(np.int64).T
+            measured = views.depths[other][rows, columns] * views.scale
+            given = local[inside, 2] if views.measure == "z" else np.linalg.norm(local[inside], axis=1)
+            same = (measured > 0) & (np.abs(given - measured) <= TOLERANCE * measured)
+            if same.sum() < MIN_SAMPLES:
+                continue
+            there, seen_there = _intensities(grey[other], Ks[other], local[inside][same])
+            both = seen[inside][same] & seen_there
+            pair = here[inside][same][both], there[both]
+            if both.sum() >= MIN_SAMPLES and min(values.std() for values in pair) > 1e-3:
+                result[view, other] = np.corrcoef(*pair)[0, 1]
+    return result
+
+
+def _intensities(
+    grey: Float32[np.ndarray, "h w"], K: Float64[np.ndarray, "3 3"], local: Float64[np.ndarray, "n 3"]
+) -> tuple[Float32[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """The intensity where points in camera axes project, and whether that is in the picture."""
+    height, width = grey.shape
+    pixels = project_points(local, K)
+    seen = (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+    columns, rows = np.floor(np.where(seen[:, None], pixels, 0)).astype(np.int64).T
+    return grey[rows, columns], seen
+
+
+def view_correlations(correlations: Float64[np.ndarray, "V V"]) -> Float64[np.ndarray, " V"]:
+    """The median correlation of each view with the others, in both directions; NaN for a view that shares nothing."""
+    both = np.concatenate((correlations, correlations.T), axis=1)
+    result = np.full(len(both), np.nan)
+    for view, row in enumerate(both):
+        if np.isfinite(row).any():
+            result[view] = np.nanmedian(row)
+    return result

@@ -1,0 +1,191 @@
+"""How well the depth images of posed views agree: each carried into the others, under the poses and intrinsics given.
+
+A view's depth pixels are points in the world. Where such a point projects into another view with depth z, and that
+view's own depth image says d there, r = z / d − 1 is zero up to noise and the size of a pixel, unless something hides
+the point there. Wrong axes, poses, scales and intrinsics spread r.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from gsencoder.core.even_indices import even_indices
+from gsencoder.types import Views
+from gsencoder.types.cameras import project_points
+from gsencoder.types.poses import invert_rigid, transform
+
+MAX_SIDE = 320
+"""Longer side in pixels of the depth images that are compared; larger ones are sampled."""
+SAMPLES = 400
+"""Pixels of each view that are carried into the others."""
+TOLERANCE = 0.02
+"""Depths agree within this share."""
+CLIP = 0.05
+"""Residuals beyond this share count as this much, since what is hidden there is further away by any amount."""
+EDGE = 0.05
+"""Pixels beside a step of the depth by more than this share are not carried over: a pixel's size decides there."""
+
+Measure = Literal["z", "ray"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthViews:
+    """Depth images of posed views, small, and what their numbers are taken to mean.
+
+    Attributes:
+        depths: as the files say, 0 = none.
+        pixels: samples of each view at pixel centers, (u, v) in its small image.
+        values: the depth there; 0 where a view has fewer samples.
+        cam_from_world: poses of the depth cameras.
+        Ks: intrinsics of the small images.
+        scale: world units for each unit of `depths`.
+        measure: whether a depth is the coordinate z or the length of the ray.
+    """
+
+    depths: Float32[np.ndarray, "V h w"]
+    pixels: Float64[np.ndarray, "V n 2"]
+    values: Float64[np.ndarray, "V n"]
+    cam_from_world: Float64[np.ndarray, "V 4 4"]
+    Ks: Float64[np.ndarray, "V 3 3"]
+    scale: float = 1.0
+    measure: Measure = "z"
+
+    def __len__(self) -> int:
+        return len(self.depths)
+
+    def with_focal_times(self, factor: float) -> "DepthViews":
+        """The same images by a sensor of another focal length."""
+        Ks = self.Ks.copy()
+        Ks[:, :2, :2] *= factor
+        return replace(self, Ks=Ks)
+
+
+def depth_views(views: Views, chosen: Int64[np.ndarray, " V"], *, seed: int = 0) -> DepthViews:
+    """Small depth images of some views and samples on their surfaces.
+
+    Args:
+        views: with depth.
+        chosen: their row numbers.
+        seed: of the choice of samples.
+    """
+    assert views.depths is not None
+    made = np.random.default_rng(seed)
+    cameras = views.cameras.select(chosen)
+    shrink = min(1.0, MAX_SIDE / int(max(cameras.widths[0], cameras.heights[0])))
+    width, height = (max(3, round(shrink * int(size[0]))) for size in (cameras.widths, cameras.heights))
+    maps, pixels, values = [], [], []
+    for view in chosen:
+        full = views.depths[int(view)]
+        rows, columns = (
+            ((np.arange(n) + 0.5) * size / n).astype(np.int64)
+            for n, size in zip((height, width), full.shape, strict=True)
+        )
+        depth = full[rows][:, columns]
+        maps.append(depth)
+        rows, columns = np.nonzero(on_surface(depth))
+        picked = made.permutation(len(rows))[:SAMPLES]
+        at, value = np.zeros((SAMPLES, 2)), np.zeros(SAMPLES)
+        at[: len(picked)] = np.stack((columns[picked], rows[picked]), axis=1) + 0.5
+        value[: len(picked)] = depth[rows[picked], columns[picked]]
+        pixels.append(at)
+        values.append(value)
+    small = cameras.resized_to(np.full(len(chosen), width, np.int32), np.full(len(chosen), height, np.int32))
+    return DepthViews(
+        depths=np.stack(maps),
+        pixels=np.stack(pixels),
+        values=np.stack(values),
+        cam_from_world=cameras.cam_from_world.astype(np.float64),
+        Ks=small.Ks.astype(np.float64),
+    )
+
+
+def on_surface(depth: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels with depth whose eight neighbors have nearly the same; none at the border."""
+    use = np.zeros(depth.shape, bool)
+    middle = depth[1:-1, 1:-1]
+    height, width = middle.shape
+    close = middle > 0
+    for down in range(3):
+        for right in range(3):
+            other = depth[down : down + height, right : right + width]
+            close &= (other > 0) & (np.abs(other - middle) <= EDGE * middle)
+    use[1:-1, 1:-1] = close
+    return use
+
+
+def residuals(views: DepthViews) -> Float64[np.ndarray, "V V n"]:
+    """r of the samples of view i (first axis) in view j (second axis); NaN where nothing can be compared, and on the
+    diagonal."""
+    points = world_samples(views)
+    count, height, width = views.depths.shape
+    result = np.full((count, count, points.shape[1]), np.nan)
+    flat = points.reshape(-1, 3)
+    known = (views.values > 0).reshape(-1)
+    for other in range(count):
+        local = transform(views.cam_from_world[other], flat)
+        pixels = project_points(local, views.Ks[other])
+        z = local[:, 2]
+        with np.errstate(invalid="ignore"):
+            inside = known & (z > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+        columns, rows = np.floor(pixels[inside]).astype(np.int64).T
+        measured = views.depths[other][rows, columns].astype(np.float64) * views.scale
+        given = z[inside] if views.measure == "z" else np.linalg.norm(local[inside], axis=1)
+        ratio = np.full(len(measured), np.nan)
+        np.divide(given, measured, out=ratio, where=measured > 0)
+        row = np.full(len(flat), np.nan)
+        row[inside] = ratio - 1
+        result[:, other] = row.reshape(count, -1)
+    result[np.arange(count), np.arange(count)] = np.nan
+    return result
+
+
+def world_samples(views: DepthViews) -> Float64[np.ndarray, "V n 3"]:
+    """Where the samples lie in the world, under what their numbers are taken to mean."""
+    K = views.Ks
+    rays = np.ones((*views.pixels.shape[:2], 3))
+    for axis in range(2):
+        rays[..., axis] = (views.pixels[..., axis] - K[:, axis, 2, None]) / K[:, axis, axis, None]
+    if views.measure == "ray":
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    local = rays * (views.scale * views.values)[..., None]
+    world_from_cam = invert_rigid(views.cam_from_world)
+    return np.einsum("vij,vnj->vni", world_from_cam[:, :3, :3], local) + world_from_cam[:, None, :3, 3]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agreement:
+    """What residuals say.
+
+    Attributes:
+        share: of the samples that another view's depth can be compared with, those that agree within `TOLERANCE`.
+        spread: mean of |r|, clipped at `CLIP`.
+        offset: median of r among those within `CLIP`.
+        compared: number of comparisons.
+    """
+
+    share: float
+    spread: float
+    offset: float
+    compared: int
+
+
+def agreement(residual: Float64[np.ndarray, "*n"]) -> Agreement:
+    """Summary of residuals; NaN where nothing was compared."""
+    known = residual[np.isfinite(residual)]
+    if not len(known):
+        return Agreement(share=float("nan"), spread=float("nan"), offset=float("nan"), compared=0)
+    size = np.abs(known)
+    near = known[size <= CLIP]
+    return Agreement(
+        share=float((size <= TOLERANCE).mean()),
+        spread=float(np.minimum(size, CLIP).mean()),
+        offset=float(np.median(near)) if len(near) else float("nan"),
+        compared=len(known),
+    )
+
+
+def chosen_views(count: int, limit: int = 32) -> Int64[np.ndarray, " n"]:
+    """The views that are compared: all, or evenly spaced ones of many."""
+    return even_indices(count, limit)

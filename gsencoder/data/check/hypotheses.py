@@ -1,0 +1,77 @@
+"""Other readings of a scene's poses and depth, tried to find out why its depth images do not agree."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsencoder.data.check.depth_agreement import Agreement, DepthViews, agreement, residuals
+from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
+
+SCALES = (1e-3, 1e-2, 0.1, 0.2, 0.25, 0.5, 2.0, 4.0, 5.0, 10.0, 1e2, 1e3)
+"""Depth scales that files are mistaken by: other units, and steps of other sensors."""
+NEAR_FACTORS = tuple(np.round(np.geomspace(0.8, 1.25, 25), 4))
+"""Factors of the depth scale and of the focal length that are tried first; the best is refined."""
+REFINEMENTS = 6
+MIN_COMPARED = 0.02
+"""A reading under which fewer samples than this share of all pairs can be compared says nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reading:
+    """One way to take the numbers of a scene.
+
+    Attributes:
+        cause: what would be wrong with the files if this reading is right; empty for the files' own.
+        factor: of the depth scale or of the focal length, where the cause has one.
+        views: the depth images under this reading.
+        agreement: of them.
+    """
+
+    cause: str
+    views: DepthViews
+    agreement: Agreement
+    factor: float | None = None
+
+
+def as_given(views: DepthViews) -> Reading:
+    """The files' own reading."""
+    return Reading(cause="", views=views, agreement=agreement(residuals(views)))
+
+
+def other_readings(views: DepthViews) -> list[Reading]:
+    """Every other reading, those with a factor at the factor where depths agree best."""
+    flip = OPENCV_FROM_OPENGL
+    inverse = invert_rigid(views.cam_from_world)
+    fixed = {
+        "axes": replace(views, cam_from_world=flip @ views.cam_from_world),
+        "inverse": replace(views, cam_from_world=inverse),
+        "inverse and axes": replace(views, cam_from_world=flip @ inverse),
+        "ray length": replace(views, measure="ray"),
+    }
+    readings = [
+        Reading(cause=cause, views=other, agreement=agreement(residuals(other))) for cause, other in fixed.items()
+    ]
+    readings.append(_best_factor("depth scale", lambda factor: replace(views, scale=factor), (*SCALES, *NEAR_FACTORS)))
+    readings.append(_best_factor("depth focal length", views.with_focal_times, NEAR_FACTORS))
+    return readings
+
+
+def _best_factor(cause: str, apply: Callable[[float], DepthViews], factors: Sequence[float]) -> Reading:
+    """The reading of the factor with the smallest spread, refined by golden sections between its neighbors."""
+
+    def spread(factor: float) -> float:
+        measured = agreement(residuals(apply(factor)))
+        return measured.spread if measured.compared >= needed else np.inf
+
+    needed = MIN_COMPARED * len(apply(1.0)) * (len(apply(1.0)) - 1) * apply(1.0).values.shape[1]
+    tried = {factor: spread(factor) for factor in sorted(factors)}
+    best = min(tried, key=lambda factor: tried[factor])
+    step = 1.02
+    for _ in range(REFINEMENTS):
+        for factor in (best / step, best * step):
+            tried.setdefault(factor, spread(factor))
+        best = min(tried, key=lambda factor: tried[factor])
+        step = step**0.5
+    chosen = apply(best)
+    return Reading(cause=cause, views=chosen, agreement=agreement(residuals(chosen)), factor=best)
