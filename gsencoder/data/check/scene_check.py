@@ -6,7 +6,7 @@ import numpy as np
 
 from gsencoder.data.check.color_agreement import color_correlations, grey_pictures, view_correlations
 from gsencoder.data.check.depth_agreement import Agreement, DepthViews, chosen_views, depth_views, residuals
-from gsencoder.data.check.hypotheses import Reading, as_given, other_readings
+from gsencoder.data.check.readings import Reading, as_given, other_readings
 from gsencoder.data.check.stray_views import fit_pose, surface_normals, view_spreads
 from gsencoder.types import Views
 

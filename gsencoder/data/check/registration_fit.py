@@ -1,0 +1,175 @@
+"""Whether depth and photographs belong to one camera: the focal length and place of a color camera under which the
+photographs show the same details at the same places.
+
+Pixels whose depth two views agree on are one place. A color camera beside the depth camera sees it at
+f (X + t) / Z + c; with the right f and t both photographs have the same details there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from gsencoder.data.check.depth_agreement import TOLERANCE, DepthViews, world_samples
+from gsencoder.types import Views
+from gsencoder.types.cameras import project_points
+from gsencoder.types.poses import transform
+
+PICTURE_SIZE = 640
+"""Longer side in pixels of the photographs that are compared; smaller ones keep theirs."""
+FINE, COARSE = 1.0, 12.0
+"""Details are the difference of two Gaussian blurs of these widths in pixels."""
+MIN_SHARED = 60
+"""Pairs of views that share fewer samples say nothing."""
+MAX_PAIRS = 60
+FOCAL_FACTORS = tuple(np.round(np.geomspace(0.8, 1.25, 13), 4))
+SHIFTS = (-0.02, -0.01, 0.0, 0.01, 0.02)
+"""Shifts that are tried first, as shares of the median depth."""
+REFINEMENTS = 5
+BETTER = 0.1
+"""A registration is named if it raises the correlation of details by this much, and to `LEAST` or more."""
+LEAST = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RegistrationFit:
+    """The color camera that fits best.
+
+    Attributes:
+        focal_factor: its focal length, as a multiple of the stated one.
+        shift: what is added to x and y in the depth camera's axes to have them in its own, world units.
+        given: mean correlation of details of pairs of views with the stated camera.
+        best: the same with the best one.
+        pairs: pairs of views that were compared.
+    """
+
+    focal_factor: float
+    shift: Float64[np.ndarray, "2"]
+    given: float
+    best: float
+    pairs: int
+
+    @property
+    def differs(self) -> bool:
+        """Whether the stated camera is wrong."""
+        return self.pairs > 0 and self.best >= LEAST and self.best >= self.given + BETTER
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Pair:
+    """Places that two views share, in the axes of both depth cameras."""
+
+    views: tuple[int, int]
+    points: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
+
+
+def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: DepthViews) -> RegistrationFit:
+    """The color camera under which photographs show the same details where their depth agrees.
+
+    Args:
+        views: with photographs and depth.
+        chosen: the rows of the views that are compared.
+        depth: their depth images, under the reading that fits best.
+    """
+    pairs = _shared_places(depth)
+    nothing = RegistrationFit(
+        focal_factor=1.0, shift=np.zeros(2), given=float("nan"), best=float("nan"), pairs=len(pairs)
+    )
+    if not pairs:
+        return nothing
+    used = sorted({view for pair in pairs for view in pair.views})
+    details, Ks = {}, {}
+    small = views.cameras.resized(PICTURE_SIZE, enlarge=False)
+    for view in used:
+        row = int(chosen[view])
+        details[view] = _details(views, row, int(small.widths[row]), int(small.heights[row]))
+        Ks[view] = small.Ks[row].astype(np.float64)
+
+    def score(factor: float, shift: Float64[np.ndarray, "2"]) -> float:
+        key = (round(factor, 6), *np.round(shift / typical, 6))
+        if key not in known:
+            known[key] = _correlation(pairs, details, Ks, factor, shift)
+        return known[key]
+
+    typical = float(np.median(np.concatenate([pair.points[0][:, 2] for pair in pairs])))
+    known: dict[tuple[float, ...], float] = {}
+    given = score(1.0, np.zeros(2))
+    if not np.isfinite(given):
+        return nothing
+    best = max(
+        ((factor, np.array((shift * typical, 0.0))) for factor in FOCAL_FACTORS for shift in SHIFTS),
+        key=lambda candidate: score(*candidate),
+    )
+    steps = 1.02, 0.006 * typical
+    for _ in range(REFINEMENTS):
+        for _ in range(2):
+            factor, shift = best
+            around = [(factor * steps[0] ** sign, shift) for sign in (-1, 1)]
+            around += [(factor, shift + sign * steps[1] * axis) for axis in np.eye(2) for sign in (-1, 1)]
+            best = max([best, *around], key=lambda candidate: score(*candidate))
+        steps = steps[0] ** 0.5, steps[1] / 2
+    return RegistrationFit(focal_factor=best[0], shift=best[1], given=given, best=score(*best), pairs=len(pairs))
+
+
+def _shared_places(depth: DepthViews) -> list[_Pair]:
+    """The pairs of views with the most samples on which their depth agrees."""
+    points = world_samples(depth)
+    count, height, width = depth.depths.shape
+    pairs = []
+    for view in range(count):
+        known = depth.values[view] > 0
+        here = transform(depth.cam_from_world[view], points[view][known])
+        for other in range(count):
+            if other == view:
+                continue
+            there = transform(depth.cam_from_world[other], points[view][known])
+            pixels = project_points(there, depth.Ks[other])
+            inside = (there[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+            columns, rows = np.floor(pixels[inside]).astype(np.int64).T
+            measured = depth.depths[other][rows, columns] * depth.scale
+            given = there[inside, 2] if depth.measure == "z" else np.linalg.norm(there[inside], axis=1)
+            same = (measured > 0) & (np.abs(given - measured) <= TOLERANCE * measured)
+            if same.sum() >= MIN_SHARED:
+                pairs.append(_Pair(views=(view, other), points=(here[inside][same], there[inside][same])))
+    return sorted(pairs, key=lambda pair: -len(pair.points[0]))[:MAX_PAIRS]
+
+
+def _details(views: Views, row: int, width: int, height: int) -> Float64[np.ndarray, "h w"]:
+    from PIL import Image
+    from scipy.ndimage import gaussian_filter
+
+    assert views.images is not None
+    grey = Image.fromarray(views.images[row]).convert("L").resize((width, height), Image.Resampling.BOX)
+    values = np.asarray(grey, np.float64) / 255
+    return gaussian_filter(values, FINE) - gaussian_filter(values, COARSE)
+
+
+def _correlation(
+    pairs: list[_Pair],
+    details: dict[int, Float64[np.ndarray, "h w"]],
+    Ks: dict[int, Float64[np.ndarray, "3 3"]],
+    factor: float,
+    shift: Float64[np.ndarray, "2"],
+) -> float:
+    """Mean correlation of the details of pairs of views with a color camera."""
+    from scipy.ndimage import map_coordinates
+
+    correlations = []
+    for pair in pairs:
+        both = []
+        for view, points in zip(pair.views, pair.points, strict=True):
+            K = Ks[view].copy()
+            K[0, 0] *= factor
+            K[1, 1] *= factor
+            moved = points.copy()
+            moved[:, :2] += shift
+            columns, rows = project_points(moved, K).T - 0.5
+            height, width = details[view].shape
+            outside = (columns < 0) | (rows < 0) | (columns > width - 1) | (rows > height - 1)
+            values = map_coordinates(details[view], (rows, columns), order=1, mode="nearest")
+            values[outside] = np.nan
+            both.append(values)
+        use = np.isfinite(both[0]) & np.isfinite(both[1])
+        if use.sum() >= MIN_SHARED // 2 and min(values[use].std() for values in both) > 1e-4:
+            correlations.append(np.corrcoef(both[0][use], both[1][use])[0, 1])
+    return float(np.mean(correlations)) if len(correlations) >= max(1, len(pairs) // 2) else float("nan")
