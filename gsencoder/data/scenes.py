@@ -14,6 +14,7 @@ from gsencoder.core.even_indices import even_indices
 from gsencoder.data.readers.frames import pinhole_of
 from gsencoder.data.readers.images import (
     DepthFiles,
+    DepthMeasure,
     DepthSensor,
     ImageFiles,
     InstanceFiles,
@@ -49,6 +50,10 @@ class SceneConfig:
     max_views: int = field(default=0, metadata={"help": "largest number of views, evenly spaced; 0 = all"})
     depth_scale: float | None = field(
         default=None, metadata={"help": "world units for one step of a depth file; empty = that of the format"}
+    )
+    depth_measure: DepthMeasure | None = field(
+        default=None,
+        metadata={"help": "what depth files hold: z, or ray, the distance from the camera; empty = that of the files"},
     )
     image_scale: float = field(
         default=1.0,
@@ -119,7 +124,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         raise InputError(f"{str(given)[:200]!r} is not a path ({type(error).__name__})") from error
     if not exists:
         raise InputError(f"{given}: no such file or folder")
-    posed, folder = _read_views(root, options)
+    posed, folder, _ = read_posed(root, options)
     if posed is None:
         if splat is not None:
             raise InputError(f"{given}: splat= is for scenes with views, and here there are none; give one splat only")
@@ -223,8 +228,13 @@ def _is_listed(entry: Path) -> bool:
     return entry.is_dir() and not entry.name.startswith(".") and is_scene(entry)
 
 
-def _read_views(root: Path, options: SceneConfig) -> tuple[PosedImages | None, Path]:
-    """The posed images, None for a bare splat, and the folder of the scene."""
+def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedImages | None, Path, str]:
+    """The posed images of an existing folder or file as its files describe them, the folder of the scene, and the name
+    of the layout; None and "splat" where there are no views.
+
+    Raises:
+        InputError: a file is wrong.
+    """
     read = ReadOptions(
         allow_outside=options.allow_outside,
         depth_scale=options.depth_scale,
@@ -233,15 +243,22 @@ def _read_views(root: Path, options: SceneConfig) -> tuple[PosedImages | None, P
     )
     if root.is_file():
         if not _is_transforms(root):
-            return None, root.parent
+            return None, root.parent, "splat"
+        name = "transforms.json"
         posed, folder = read_transforms_file(root, read)
     else:
         layout = layout_of(root)
         if layout is None:
-            return None, root
+            return None, root, "splat"
+        name = layout.name
         posed, folder = layout.read(root, read)
     images = tuple(_with_stated_sensors(image, options) for image in posed.images)
-    return replace(posed, images=images), folder
+    return replace(posed, images=images), folder, name
+
+
+def has_views(path: Path) -> bool:
+    """Whether a path is a scene with posed views, as opposed to a splat, judged by names of files alone."""
+    return _is_transforms(path) if path.is_file() else layout_of(path) is not None
 
 
 def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
@@ -252,6 +269,8 @@ def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
     if image.depth is not None and options.depth_intrinsics is not None:
         fx, fy, cx, cy = options.depth_intrinsics
         image = replace(image, depth_camera=pinhole_of(fx, fy, cx, cy, image.depth, "data.depth_intrinsics"))
+    if options.depth_measure is not None:
+        image = replace(image, depth_measure=options.depth_measure)
     if options.depth_from_color is not None:
         rows = np.vstack((np.array(options.depth_from_color).reshape(-1, 4)[:3], (0, 0, 0, 1)))
         image = replace(image, depth_from_color=rigid_pose(rows, "data.depth_from_color"))
@@ -316,6 +335,7 @@ def _depth_sensor(image: PosedImage) -> DepthSensor:
     return DepthSensor(
         scale=image.depth_scale,
         no_depth=image.no_depth,
+        measure=image.depth_measure,
         color_from_depth=None if transform is None else invert_rigid(transform),
     )
 

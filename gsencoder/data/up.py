@@ -8,12 +8,17 @@ at an end of the scene is seen, since things stand on floors.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.types import Cameras, Gaussians
+from gsencoder.data.check.depth_agreement import SAMPLES, chosen_views, depth_views
+from gsencoder.data.seeding.depth import surface_pixels
+from gsencoder.types import Cameras, Gaussians, Scene, Views
+from gsencoder.types.cameras import unproject_points
+from gsencoder.types.poses import invert_rigid, transform
 
 MAX_SAMPLES = 20_000
 """So many Gaussians are looked at."""
@@ -39,12 +44,14 @@ class Up:
     Attributes:
         direction: unit vector in the world.
         confidence: from 0 to 1: the share of the surfaces that lie or stand under it, above what a random direction
-            would have, times the agreement of the cameras where there are any.
+            would have; of cameras alone, how level they stand.
+        source: stated, cameras, surfaces, or cameras and surfaces.
         from_cameras: angle in radians between it and what the cameras say; None without cameras.
     """
 
     direction: Float64[np.ndarray, "3"]
     confidence: float
+    source: str
     from_cameras: float | None
 
 
@@ -63,10 +70,27 @@ def up_of_cameras(cameras: Cameras) -> Float64[np.ndarray, "3"]:
     return axis if axis @ mean_up >= 0 else -axis
 
 
-def surface_normals(
-    gaussians: Gaussians, *, seed: int = 0
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Positions, normals and areas (times opacity) of a random choice of the flat Gaussians."""
+class Surfaces(NamedTuple):
+    """Oriented pieces of surfaces.
+
+    Attributes:
+        means: positions in the world.
+        normals: unit; either side.
+        areas: in any unit.
+    """
+
+    means: Float64[np.ndarray, "n 3"]
+    normals: Float64[np.ndarray, "n 3"]
+    areas: Float64[np.ndarray, " n"]
+
+
+def surfaces_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
+    """A random choice of the flat Gaussians; areas are times opacity.
+
+    Args:
+        gaussians: a splat or seeds.
+        seed: of the choice.
+    """
     from scipy.spatial.transform import Rotation
 
     rows = np.random.default_rng(seed).permutation(len(gaussians))[: 4 * MAX_SAMPLES]
@@ -74,33 +98,76 @@ def surface_normals(
     order = np.argsort(scales, axis=1)
     ordered = np.take_along_axis(scales, order, axis=1)
     flat = ordered[:, 0] <= FLAT * ordered[:, 1]
-    rows, order, ordered = (array[flat][:MAX_SAMPLES] for array in (rows, order, ordered))
-    quats = gaussians.quats[rows].astype(np.float64)
-    matrices = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix() if len(rows) else np.empty((0, 3, 3))
+    rows, order, ordered = rows[flat][:MAX_SAMPLES], order[flat][:MAX_SAMPLES], ordered[flat][:MAX_SAMPLES]
+    if not len(rows):
+        return Surfaces(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    matrices = Rotation.from_quat(gaussians.quats[rows].astype(np.float64), scalar_first=True).as_matrix()
     normals = np.take_along_axis(matrices, order[:, None, :1], axis=2)[..., 0]
     areas = ordered[:, 1] * ordered[:, 2] * gaussians.opacities[rows].astype(np.float64)
-    # A few huge Gaussians, such as a sky's, must not outvote the scene.
-    areas = np.minimum(areas, np.quantile(areas, 0.95)) if len(areas) else areas
-    return gaussians.means[rows].astype(np.float64), normals, areas
+    return Surfaces(gaussians.means[rows].astype(np.float64), normals, areas)
 
 
-def estimate_up(gaussians: Gaussians, cameras: Cameras | None = None, *, seed: int = 0) -> Up:
-    """Up of a scene from its surfaces and, where there are any, its cameras.
+def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfaces:
+    """Samples of the surfaces that depth images show.
 
     Args:
-        gaussians: a splat or seeds, with normals where surfaces are flat.
-        cameras: of the photographs; None for a bare splat.
-        seed: of the choice of Gaussians.
+        views: with depth.
+        limit: largest number of views to look at, evenly spaced.
+        seed: of the choice of samples.
+    """
+    depth = depth_views(views, chosen_views(len(views), limit), seed=seed)
+    made = np.random.default_rng(seed)
+    world_from_cam = invert_rigid(depth.cam_from_world)
+    parts = []
+    for view in range(len(depth)):
+        pixels = surface_pixels(depth.depths[view], depth.Ks[view].astype(np.float32))
+        rows, columns = np.nonzero(pixels.use)
+        picked = made.permutation(len(rows))[:SAMPLES]
+        rows, columns = rows[picked], columns[picked]
+        z, normals = pixels.depth[rows, columns].astype(np.float64), pixels.normals[rows, columns].astype(np.float64)
+        local = unproject_points(np.stack((columns, rows), axis=1) + 0.5, z, depth.Ks[view])
+        facing = np.abs(np.einsum("ni,ni->n", local, normals)) / np.linalg.norm(local, axis=1)
+        areas = np.square(z) / np.prod(depth.Ks[view].diagonal()[:2]) / np.maximum(facing, 0.1)
+        parts.append(
+            Surfaces(transform(world_from_cam[view], local), normals @ depth.cam_from_world[view, :3, :3], areas)
+        )
+    return Surfaces(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def up_of_scene(scene: Scene) -> Up | None:
+    """Up of a scene, as its files state it or estimated from what it holds; None where nothing says.
+
+    Surfaces are those of the Gaussians, else of the depth images.
+    """
+    if scene.up is not None:
+        return Up(direction=scene.up, confidence=1.0, source="stated", from_cameras=None)
+    cameras = scene.views.cameras if scene.views is not None else None
+    surfaces = None
+    if scene.gaussians is not None:
+        surfaces = surfaces_of_gaussians(scene.gaussians)
+    elif scene.views is not None and scene.views.depths is not None:
+        surfaces = surfaces_of_depth(scene.views)
+    if surfaces is None or not len(surfaces.areas):
+        surfaces = None
+    if surfaces is None and cameras is None:
+        return None
+    return estimate_up(surfaces, cameras)
+
+
+def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:
+    """Up from surfaces, from cameras, or from both.
 
     Raises:
-        InputError: neither cameras nor flat Gaussians.
+        InputError: neither.
     """
-    means, normals, areas = surface_normals(gaussians, seed=seed)
     prior = None if cameras is None or not len(cameras) else up_of_cameras(cameras)
-    if areas.sum() <= 0:
+    if surfaces is None or not surfaces.areas.sum() > 0:
         if prior is None:
-            raise InputError("up: the splat has no flat Gaussians, and there are no cameras; give up=")
-        return Up(direction=prior, confidence=0.0, from_cameras=0.0)
+            raise InputError("up: there are neither cameras nor flat surfaces to estimate it from; give up=")
+        return Up(direction=prior, confidence=_level(cameras, prior), source="cameras", from_cameras=0.0)
+    means, normals, areas = surfaces
+    # A few huge Gaussians, such as a sky's, must not outvote the scene.
+    areas = np.minimum(areas, np.quantile(areas, 0.95))
     areas = areas / areas.sum()
     candidates = _sphere(DIRECTIONS)
     if prior is not None:
@@ -116,8 +183,17 @@ def estimate_up(gaussians: Gaussians, cameras: Cameras | None = None, *, seed: i
     typical = float(np.median(_support(_sphere(200), normals, areas)))
     support = float(_support(best[None], normals, areas)[0])
     confidence = float(np.clip((support - typical) / (1 - typical), 0, 1))
-    angle = None if prior is None else float(np.arccos(np.clip(best @ prior, -1, 1)))
-    return Up(direction=best, confidence=confidence, from_cameras=angle)
+    if prior is None:
+        return Up(direction=best, confidence=confidence, source="surfaces", from_cameras=None)
+    angle = float(np.arccos(np.clip(best @ prior, -1, 1)))
+    return Up(direction=best, confidence=confidence, source="cameras and surfaces", from_cameras=angle)
+
+
+def _level(cameras: Cameras | None, up: Float64[np.ndarray, "3"]) -> float:
+    """How level cameras stand under `up`: 1 if all right axes are horizontal, 0 if they have any direction."""
+    assert cameras is not None
+    right = cameras.cam_from_world[:, 0, :3].astype(np.float64)
+    return float(np.clip(1 - 3 * np.square(right @ up).mean(), 0, 1)) if len(cameras) > 2 else 0.0
 
 
 def _sphere(count: int) -> Float64[np.ndarray, "n 3"]:

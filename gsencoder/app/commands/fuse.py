@@ -10,6 +10,7 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats import READABLE
@@ -70,6 +71,8 @@ def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Sce
     """Loads a scene with Gaussians and views: seeds if it has no splat, orbit cameras if it has no views."""
     with summary.step("load"):
         scene = load_scene(path, splat=config.splat or None, options=config.data)
+    with summary.step("check"):
+        warn_of_faults(scene)
     if scene.gaussians is None:
         with summary.step("seeds"):
             scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))

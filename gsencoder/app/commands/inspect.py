@@ -1,7 +1,8 @@
-"""`gsencoder inspect SPLAT…`: counts, extent and every defect of splat files, without changing them."""
+"""`gsencoder inspect PATH…`: what splats and scenes hold, and what is wrong with them, without changing them."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
@@ -9,6 +10,9 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.data.readers.scene_splat import find_splat
+from gsencoder.data.scenes import SceneConfig, find_scenes, has_views, load_scene, read_posed, scene_name
 from gsencoder.data.splat_formats.repair import SplatReport, inspect_splat
 from gsencoder.data.splats import READABLE, read_raw
 
@@ -18,28 +22,104 @@ class InspectConfig(CommonConfig):
     """Settings of `inspect`."""
 
     paths: tuple[str, ...] = field(
-        default=(), metadata={"help": f"splat files: {READABLE}", "metavar": "SPLAT", "required": True}
+        default=(),
+        metadata={"help": f"scenes with posed views, or splats: {READABLE}", "metavar": "PATH", "required": True},
     )
     out: Path | None = field(
-        default=None, metadata={"help": "folder for a summary.json with the same facts", "metavar": "FOLDER"}
+        default=None,
+        metadata={
+            "help": "folder for a summary.json with the same facts, and a picture of each scene's check",
+            "metavar": "FOLDER",
+        },
     )
+    check: bool = field(
+        default=True, metadata={"help": "hold the views of a scene against each other, which takes seconds"}
+    )
+    views: int = field(
+        default=0, metadata={"help": "largest number of views to hold against each other; 0 = 32 with depth, else 24"}
+    )
+    data: SceneConfig = field(default_factory=SceneConfig)
+
+    def __post_init__(self) -> None:
+        if self.views < 0 or self.views == 1:
+            raise InputError(f"views: expected 0 or at least 2, got {self.views}")
 
 
 def run(config: InspectConfig, summary: Summary) -> None:
-    """Reads each file, prints one table, and writes the summary if asked to."""
-    reports = {}
-    for path in Progress(quiet=config.quiet)(config.paths, "reading"):
-        with summary.step("read"):
-            raw = read_raw(path)
-        with summary.step("inspect"):
-            reports[path] = inspect_splat(raw)
-    summary.results["splats"] = [{"path": path, **report.to_dict()} for path, report in reports.items()]
-    if config.out is not None:
-        with output_folder(config.out, overwrite=config.overwrite, summary=summary):
-            pass
+    """Reads each splat or scene, prints one table for each, and writes the summary if asked to."""
     screen = console(config.quiet)
-    for path, report in reports.items():
-        screen.print(report_table(path, report))
+    if config.out is None:
+        for path in _paths(config.paths):
+            _inspect(path, config, summary, None, screen)
+        return
+    with output_folder(config.out, overwrite=config.overwrite, summary=summary) as folder:
+        for path in _paths(config.paths):
+            _inspect(path, config, summary, folder, screen)
+
+
+def _paths(given: tuple[str, ...]) -> list[Path]:
+    """Splat files and scenes; a folder of scenes stands for all of them."""
+    paths: list[Path] = []
+    for path in map(Path, given):
+        paths += find_scenes([path]) if path.is_dir() and not (path / "meta.json").is_file() else [path]
+    return paths
+
+
+def _inspect(path: Path, config: InspectConfig, summary: Summary, folder: Path | None, screen: Any) -> None:
+    if path.exists() and has_views(path):
+        _inspect_scene(path, config, summary, folder, screen)
+        return
+    source = find_splat(path) if path.is_dir() else path
+    with summary.step("read"):
+        raw = read_raw(source)
+    with summary.step("inspect"):
+        report = inspect_splat(raw)
+    summary.results.setdefault("splats", []).append({"path": str(path), **report.to_dict()})
+    screen.print(report_table(str(path), report))
+
+
+def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: Path | None, screen: Any) -> None:
+    # Only scenes need Pillow and, for some depth sensors, torch.
+    from gsencoder.app.commands.inspect_scene import (
+        check_lines,
+        check_results,
+        finding_line,
+        findings_of,
+        save_check_picture,
+        scene_table,
+    )
+    from gsencoder.data.check.facts import scene_facts
+    from gsencoder.data.check.scene_check import check_scene
+
+    with summary.step("read"):
+        scene = load_scene(path, options=config.data)
+        posed, _, layout = read_posed(path.absolute(), config.data)
+        assert scene.views is not None
+        assert posed is not None
+    with summary.step("facts"):
+        facts = scene_facts(scene, posed, layout)
+    screen.print(scene_table(str(path), facts))
+    results: dict[str, Any] = {"path": str(path), **facts.to_dict()}
+    if config.check:
+        with summary.step("check"):
+            depth, matches = check_scene(scene.views, limit=config.views, track=Progress(quiet=config.quiet))
+        findings = findings_of(depth, matches)
+        for line in check_lines(facts, depth, matches):
+            screen.print(line, highlight=False)
+        for finding in findings:
+            screen.print(f"wrong: {finding_line(finding)}", highlight=False)
+        if not findings:
+            screen.print("nothing wrong was seen")
+        results["check"] = check_results(depth, matches)
+        results["findings"] = [
+            {"cause": each.cause, "view": each.view, "factor": each.factor, "message": each.message}
+            for each in findings
+        ]
+        if folder is not None:
+            picture = f"{scene_name(path)}.png"
+            if save_check_picture(folder / picture, scene.views, depth, matches):
+                results["picture"] = picture
+    summary.results.setdefault("scenes", []).append(results)
 
 
 def report_table(path: str, report: SplatReport) -> Table:

@@ -15,6 +15,7 @@ from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats import READABLE, save_splat
 from gsencoder.infer.draw.pictures import contact_sheet
@@ -65,6 +66,8 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
         work.take(anew=not config.resume)
         opened = open_scene(path, work.path, splat=config.splat, data=config.data, sfm=config.sfm)
         summary.add_seconds(opened.seconds)
+        with summary.step("check"):
+            warn_of_faults(opened.scene)
         if opened.sfm is not None:
             sfm = opened.sfm
             summary.results.update(placed=len(sfm.placed), missing=list(sfm.missing), sfm_error=sfm.error)

@@ -1,20 +1,25 @@
-"""`gsencoder repair SPLAT out=FILE fix=…`: repairs defects of a splat file and reports the changes."""
+"""`gsencoder repair PATH out=FILE`: repairs defects of a splat file, or wrong poses and depth of a scene, and reports
+the changes."""
 
+import secrets
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.app.runs.output_folder import refuse_existing
-from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
+from gsencoder.data.scenes import SceneConfig, has_views, load_scene, read_posed
 from gsencoder.data.splat_formats.repair import repair_splat
 from gsencoder.data.splats import READABLE, WRITABLE, RawSplat, gaussians_from_raw, read_raw, save_splat
+from gsencoder.types import Scene
 
 Fix = Literal["nonfinite", "quats", "scales", "opacities", "huge", "duplicates", "floaters", "all"]
 
@@ -24,32 +29,49 @@ class RepairConfig(CommonConfig):
     """Settings of `repair`."""
 
     paths: tuple[str, ...] = field(
-        default=(), metadata={"help": f"one splat file: {READABLE}", "metavar": "SPLAT", "required": True}
+        default=(),
+        metadata={"help": f"a scene with posed views, or one splat: {READABLE}", "metavar": "PATH", "required": True},
     )
     out: Path | None = field(
         default=None,
         metadata={
-            "help": f"the file to write: {WRITABLE}; FILE.summary.json beside it holds the changes",
+            "help": f"the file to write: of a scene .json (nerfstudio), of a splat {WRITABLE}; FILE.summary.json "
+            "beside "
+            "it holds the changes",
             "metavar": "FILE",
             "required": True,
         },
     )
     fix: tuple[Fix, ...] = field(
         default=("nonfinite", "quats", "scales", "opacities"),
-        metadata={"help": "defects to repair: the four that prevent loading, and huge, duplicates, floaters, or all"},
+        metadata={
+            "help": "defects of a splat to repair: the four that prevent loading, and huge, duplicates, floaters, "
+            "or all"
+        },
     )
+    views: int = field(
+        default=0,
+        metadata={"help": "largest number of a scene's views to hold against each other; 0 = 32 with depth, else 24"},
+    )
+    data: SceneConfig = field(default_factory=SceneConfig)
 
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
-            raise InputError(f"paths: expected one splat file, got {len(self.paths)}")
+            raise InputError(f"paths: expected one splat file or scene, got {len(self.paths)}")
+        if self.views < 0 or self.views == 1:
+            raise InputError(f"views: expected 0 or at least 2, got {self.views}")
         if not self.fix:
             raise InputError("fix: expected the name of a defect, got none (gsencoder inspect lists them)")
 
 
 def run(config: RepairConfig, summary: Summary) -> None:
-    """Reads, repairs and writes a splat, and prints each change with its count."""
+    """Reads, repairs and writes a splat or the poses of a scene, and prints each change."""
     assert config.out is not None
     refuse_existing(config.out, config.overwrite)
+    path = Path(config.paths[0])
+    if path.exists() and has_views(path):
+        _repair_scene(path, config, summary)
+        return
     with summary.step("read"):
         raw = read_raw(config.paths[0])
     with summary.step("repair"):
@@ -66,6 +88,67 @@ def run(config: RepairConfig, summary: Summary) -> None:
     for change in report.changes:
         screen.print(f"{change.fix}: {change.count:,} rows {change.action}")
     screen.print(f"{config.out}: {report.rows_after:,} of {report.rows_before:,} Gaussians")
+
+
+def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
+    """Writes a transforms.json whose poses, depth and cameras fit, and checks that they do."""
+    # Only scenes need Pillow and, for some depth sensors, torch.
+    from gsencoder.data.check.repair_scene import repair_posed
+    from gsencoder.data.check.scene_check import check_scene, fit_of
+    from gsencoder.data.readers.write_transforms import transforms_of
+
+    assert config.out is not None
+    if config.out.suffix.lower() != ".json":
+        raise InputError(f"out={config.out}: the repaired poses of a scene are a nerfstudio file; give a name in .json")
+    track, screen = Progress(quiet=config.quiet), console(config.quiet)
+    with summary.step("read"):
+        scene = load_scene(path, options=config.data)
+        posed, _, _ = read_posed(path.absolute(), config.data)
+        assert scene.views is not None
+        assert posed is not None
+    with summary.step("check"):
+        depth, matches = check_scene(scene.views, limit=config.views, track=track)
+    findings = [finding for check in (depth, matches) if check is not None for finding in check.findings]
+    repair = repair_posed(posed, findings, depth.registration if depth is not None else None)
+    content = transforms_of(repair.posed, config.out.parent)
+    with summary.step("check"):
+        again = _load_back(content, config.out)
+        assert again.views is not None
+        checked = check_scene(again.views, limit=config.views, track=track)
+        left = [finding for check in checked if check is not None for finding in check.findings if finding.view is None]
+        if left:
+            raise InputError(f"{path}: still wrong once repaired: {left[0].message}; nothing was written")
+    with summary.step("write"):
+        write_json(config.out, content)
+    before, after = fit_of(depth, matches), fit_of(*checked)
+    summary.results.update(
+        path=str(config.out), changes=list(repair.changes), agreement_before=before, agreement_after=after
+    )
+    write_json(f"{config.out}.summary.json", summary.to_dict())
+    for change in repair.changes:
+        screen.print(change, highlight=False)
+    outside = (
+        "" if config.out.resolve().parent == path.resolve() else "; its files lie elsewhere: data.allow_outside=true"
+    )
+    screen.print(
+        f"{config.out}: {len(again.views):,} of {len(posed.images):,} views; {before:.0%} of what views share agreed, "
+        f"{after:.0%} do{outside}",
+        highlight=False,
+    )
+
+
+def _load_back(content: dict[str, Any], out: Path) -> Scene:
+    """The scene of a transforms.json that is to stand at `out`; a hidden file beside it holds it meanwhile."""
+    partial = out.with_name(f".{out.stem}.partial-{secrets.token_hex(6)}.json")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(partial, content)
+        return load_scene(partial, options=SceneConfig(allow_outside=True))
+    except OSError as error:
+        raise InputError(f"{out}: cannot write here: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            partial.unlink()
 
 
 def float64_origin(raw: RawSplat) -> Float64[np.ndarray, "3"] | None:

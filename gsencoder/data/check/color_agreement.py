@@ -4,13 +4,10 @@ same."""
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from gsencoder.data.check.depth_agreement import TOLERANCE, DepthViews, world_samples
+from gsencoder.data.check.depth_agreement import MIN_SAMPLES, TOLERANCE, DepthViews, world_samples
 from gsencoder.types import Views
 from gsencoder.types.cameras import project_points
 from gsencoder.types.poses import transform
-
-MIN_SAMPLES = 30
-"""Pairs of views that share fewer samples say nothing."""
 
 
 def grey_pictures(
@@ -71,7 +68,7 @@ def _intensities(
     """The intensity where points in camera axes project, and whether that is in the picture."""
     height, width = grey.shape
     pixels = project_points(local, K)
-    seen = (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+    seen = np.asarray((pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1))
     columns, rows = np.floor(np.where(seen[:, None], pixels, 0)).astype(np.int64).T
     return grey[rows, columns], seen
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from gsencoder.core.even_indices import even_indices
 from gsencoder.types import Views
-from gsencoder.types.cameras import project_points
+from gsencoder.types.cameras import pixel_centers, project_points
 from gsencoder.types.poses import invert_rigid, transform
 
 MAX_SIDE = 320
@@ -24,6 +24,8 @@ TOLERANCE = 0.02
 """Depths agree within this share."""
 CLIP = 0.05
 """Residuals beyond this share count as this much, since what is hidden there is further away by any amount."""
+MIN_SAMPLES = 30
+"""Pairs of views that share fewer samples have no offset of their own."""
 EDGE = 0.05
 """Pixels beside a step of the depth by more than this share are not carried over: a pixel's size decides there."""
 
@@ -119,26 +121,62 @@ def residuals(views: DepthViews) -> Float64[np.ndarray, "V V n"]:
     """r of the samples of view i (first axis) in view j (second axis); NaN where nothing can be compared, and on the
     diagonal."""
     points = world_samples(views)
-    count, height, width = views.depths.shape
-    result = np.full((count, count, points.shape[1]), np.nan)
-    flat = points.reshape(-1, 3)
-    known = (views.values > 0).reshape(-1)
-    for other in range(count):
-        local = transform(views.cam_from_world[other], flat)
-        pixels = project_points(local, views.Ks[other])
-        z = local[:, 2]
-        with np.errstate(invalid="ignore"):
-            inside = known & (z > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-        columns, rows = np.floor(pixels[inside]).astype(np.int64).T
-        measured = views.depths[other][rows, columns].astype(np.float64) * views.scale
-        given = z[inside] if views.measure == "z" else np.linalg.norm(local[inside], axis=1)
-        ratio = np.full(len(measured), np.nan)
-        np.divide(given, measured, out=ratio, where=measured > 0)
-        row = np.full(len(flat), np.nan)
-        row[inside] = ratio - 1
-        result[:, other] = row.reshape(count, -1)
+    count = len(views)
+    flat, known = points.reshape(-1, 3), (views.values > 0).reshape(-1)
+    result = np.stack(
+        [_depth_ratio(views, other, flat, known).reshape(count, -1) - 1 for other in range(count)], axis=1
+    )
     result[np.arange(count), np.arange(count)] = np.nan
     return result
+
+
+def agreement_map(views: DepthViews, view: int) -> Float32[np.ndarray, "h w"]:
+    """For each pixel of a small depth image, the share of the views that see its place whose depth agrees within
+    `TOLERANCE`; NaN where it has no depth, or no other view sees the place.
+
+    A view in which something nearer hides the place is not counted.
+    """
+    count, height, width = views.depths.shape
+    here = slice(view, view + 1)
+    pixels = pixel_centers(width, height).reshape(1, -1, 2)
+    points = world_samples(
+        replace(
+            views,
+            depths=views.depths[here],
+            pixels=pixels,
+            values=views.depths[here].reshape(1, -1).astype(np.float64),
+            cam_from_world=views.cam_from_world[here],
+            Ks=views.Ks[here],
+        )
+    )[0]
+    agree, seen = np.zeros(len(points)), np.zeros(len(points))
+    known = views.depths[view].reshape(-1) > 0
+    for other in range(count):
+        if other == view:
+            continue
+        ratio = _depth_ratio(views, other, points, known)
+        compared = np.isfinite(ratio) & (ratio < 1 + CLIP)
+        seen += compared
+        agree += compared & (np.abs(ratio - 1) <= TOLERANCE)
+    share = np.divide(agree, seen, out=np.full(len(points), np.nan), where=seen > 0)
+    return share.reshape(height, width).astype(np.float32)
+
+
+def _depth_ratio(
+    views: DepthViews, other: int, points: Float64[np.ndarray, "n 3"], known: Bool[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """The depth of world points in a view, divided by the view's own depth there; NaN where there is none."""
+    height, width = views.depths.shape[1:]
+    local = transform(views.cam_from_world[other], points)
+    pixels = project_points(local, views.Ks[other])
+    with np.errstate(invalid="ignore"):
+        inside = known & (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+    columns, rows = np.floor(pixels[inside]).astype(np.int64).T
+    measured = views.depths[other][rows, columns].astype(np.float64) * views.scale
+    given = local[inside, 2] if views.measure == "z" else np.linalg.norm(local[inside], axis=1)
+    ratio = np.full(len(points), np.nan)
+    ratio[inside] = np.divide(given, measured, out=np.full(len(measured), np.nan), where=measured > 0)
+    return ratio
 
 
 def world_samples(views: DepthViews) -> Float64[np.ndarray, "V n 3"]:
@@ -159,7 +197,8 @@ class Agreement:
     """What residuals say.
 
     Attributes:
-        share: of the samples that another view's depth can be compared with, those that agree within `TOLERANCE`.
+        share: of the samples that another view sees, those whose depth agrees with it within `TOLERANCE`. Samples that
+            lie further away than the other view's surface by more than `CLIP` are hidden there, and do not count.
         spread: mean of |r|, clipped at `CLIP`.
         offset: median of r among those within `CLIP`.
         compared: number of comparisons.
@@ -179,11 +218,26 @@ def agreement(residual: Float64[np.ndarray, "*n"]) -> Agreement:
     size = np.abs(known)
     near = known[size <= CLIP]
     return Agreement(
-        share=float((size <= TOLERANCE).mean()),
+        share=float((size <= TOLERANCE).sum() / max(1, (known <= CLIP).sum())),
         spread=float(np.minimum(size, CLIP).mean()),
         offset=float(np.median(near)) if len(near) else float("nan"),
         compared=len(known),
     )
+
+
+def pair_offsets(residual: Float64[np.ndarray, "V V n"]) -> tuple[float, float]:
+    """The median size of the offset (median r) of pairs of views: of those up to three places apart in the order of the
+    files, and of those at least half the views apart; NaN where there are no such pairs. Poses that drift have a second
+    number well above the first."""
+    count = len(residual)
+    near: list[float] = []
+    far: list[float] = []
+    for view, other in np.ndindex(count, count):
+        distance = abs(view - other)
+        known = residual[view, other][np.abs(residual[view, other]) <= CLIP]
+        if len(known) >= MIN_SAMPLES and (distance <= 3 or distance >= count / 2):
+            (near if distance <= 3 else far).append(abs(float(np.median(known))))
+    return tuple(float(np.median(each)) if each else float("nan") for each in (near, far))  # type: ignore[return-value]
 
 
 def chosen_views(count: int, limit: int = 32) -> Int64[np.ndarray, " n"]:

@@ -4,13 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float, Int64
 
 from gsencoder.data.check.depth_agreement import Agreement, DepthViews, agreement, residuals
-from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.data.check.pose_readings import other_orders, other_poses
 
 SCALES = (1e-3, 1e-2, 0.1, 0.2, 0.25, 0.5, 2.0, 4.0, 5.0, 10.0, 1e2, 1e3)
 """Depth scales that files are mistaken by: other units, and steps of other sensors."""
-NEAR_FACTORS = tuple(np.round(np.geomspace(0.8, 1.25, 25), 4))
+NEAR_FACTORS: tuple[float, ...] = tuple(np.round(np.geomspace(0.8, 1.25, 25), 4).tolist())
 """Factors of the depth scale and of the focal length that are tried first; the best is refined."""
 REFINEMENTS = 6
 MIN_COMPARED = 0.02
@@ -23,7 +24,8 @@ class Reading:
 
     Attributes:
         cause: what would be wrong with the files if this reading is right; empty for the files' own.
-        factor: of the depth scale or of the focal length, where the cause has one.
+        factor: of the depth scale or of the focal length, or the places that poses are moved by, where the cause has
+            one.
         views: the depth images under this reading.
         agreement: of them.
     """
@@ -39,18 +41,28 @@ def as_given(views: DepthViews) -> Reading:
     return Reading(cause="", views=views, agreement=agreement(residuals(views)))
 
 
-def other_readings(views: DepthViews) -> list[Reading]:
-    """Every other reading, those with a factor at the factor where depths agree best."""
-    flip = OPENCV_FROM_OPENGL
-    inverse = invert_rigid(views.cam_from_world)
-    fixed = {
-        "axes": replace(views, cam_from_world=flip @ views.cam_from_world),
-        "inverse": replace(views, cam_from_world=inverse),
-        "inverse and axes": replace(views, cam_from_world=flip @ inverse),
-        "ray length": replace(views, measure="ray"),
-    }
+def other_readings(
+    views: DepthViews, chosen: Int64[np.ndarray, " V"], all_poses: Float[np.ndarray, "n 4 4"]
+) -> list[Reading]:
+    """Every other reading, those with a factor at the factor where depths agree best.
+
+    Args:
+        views: the depth images that are compared.
+        chosen: their rows among all views.
+        all_poses: cam_from_world of all views.
+    """
+    fixed: list[tuple[str, float | None, DepthViews]] = [
+        (cause, None, replace(views, cam_from_world=poses))
+        for cause, poses in other_poses(views.cam_from_world).items()
+    ]
+    fixed += [
+        ("order", float(places), replace(views, cam_from_world=poses[chosen].astype(np.float64)))
+        for places, poses in other_orders(all_poses)
+    ]
+    fixed.append(("ray length", None, replace(views, measure="ray")))
     readings = [
-        Reading(cause=cause, views=other, agreement=agreement(residuals(other))) for cause, other in fixed.items()
+        Reading(cause=cause, views=other, agreement=agreement(residuals(other)), factor=factor)
+        for cause, factor, other in fixed
     ]
     readings.append(_best_factor("depth scale", lambda factor: replace(views, scale=factor), (*SCALES, *NEAR_FACTORS)))
     readings.append(_best_factor("depth focal length", views.with_focal_times, NEAR_FACTORS))

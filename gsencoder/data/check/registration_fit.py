@@ -6,6 +6,7 @@ f (X + t) / Z + c; with the right f and t both photographs have the same details
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -21,8 +22,10 @@ FINE, COARSE = 1.0, 12.0
 """Details are the difference of two Gaussian blurs of these widths in pixels."""
 MIN_SHARED = 60
 """Pairs of views that share fewer samples say nothing."""
-MAX_PAIRS = 60
-FOCAL_FACTORS = tuple(np.round(np.geomspace(0.8, 1.25, 13), 4))
+MAX_PAIRS = 160
+SMALLEST_DETAIL = 1e-4
+"""Standard deviation of details, of an intensity from 0 to 1, below which a pair of views shows none."""
+FOCAL_FACTORS: tuple[float, ...] = tuple(np.round(np.geomspace(0.8, 1.25, 13), 4).tolist())
 SHIFTS = (-0.02, -0.01, 0.0, 0.01, 0.02)
 """Shifts that are tried first, as shares of the median depth."""
 REFINEMENTS = 5
@@ -77,18 +80,13 @@ def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: Depth
     )
     if not pairs:
         return nothing
-    used = sorted({view for pair in pairs for view in pair.views})
-    details, Ks = {}, {}
-    small = views.cameras.resized(PICTURE_SIZE, enlarge=False)
-    for view in used:
-        row = int(chosen[view])
-        details[view] = _details(views, row, int(small.widths[row]), int(small.heights[row]))
-        Ks[view] = small.Ks[row].astype(np.float64)
+    places = [_places_of_view(pairs, view, views, chosen) for view in range(len(chosen))]
+    places = [each for each in places if len(each.points)]
 
     def score(factor: float, shift: Float64[np.ndarray, "2"]) -> float:
         key = (round(factor, 6), *np.round(shift / typical, 6))
         if key not in known:
-            known[key] = _correlation(pairs, details, Ks, factor, shift)
+            known[key] = _correlation(places, len(pairs), factor, shift)
         return known[key]
 
     typical = float(np.median(np.concatenate([pair.points[0][:, 2] for pair in pairs])))
@@ -134,6 +132,43 @@ def _shared_places(depth: DepthViews) -> list[_Pair]:
     return sorted(pairs, key=lambda pair: -len(pair.points[0]))[:MAX_PAIRS]
 
 
+class _Places(NamedTuple):
+    """What the correlation needs to know about one view.
+
+    Attributes:
+        details: of its photograph.
+        K: intrinsics of the photograph at that size.
+        points: places that it shares with others, in the axes of its depth camera, pair by pair.
+        entries: where each of them stands among the places of all pairs, first those of the pairs' first views.
+        pairs: number of the pair of each.
+    """
+
+    details: Float64[np.ndarray, "h w"]
+    K: Float64[np.ndarray, "3 3"]
+    points: Float64[np.ndarray, "n 3"]
+    entries: Int64[np.ndarray, " n"]
+    pairs: Int64[np.ndarray, " n"]
+
+
+def _places_of_view(pairs: list[_Pair], view: int, views: Views, chosen: Int64[np.ndarray, " V"]) -> _Places:
+    sizes = np.array([len(pair.points[0]) for pair in pairs])
+    starts = np.concatenate(([0], np.cumsum(sizes)))
+    points, entries, numbers = [np.empty((0, 3))], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for number, pair in enumerate(pairs):
+        for side in range(2):
+            if pair.views[side] == view:
+                points.append(pair.points[side])
+                entries.append(side * starts[-1] + np.arange(starts[number], starts[number + 1]))
+                numbers.append(np.full(sizes[number], number))
+    row = int(chosen[view])
+    small = views.cameras.select([row]).resized(PICTURE_SIZE, enlarge=False)
+    everything = np.concatenate(points)
+    details = _details(views, row, int(small.widths[0]), int(small.heights[0])) if len(everything) else np.zeros((1, 1))
+    return _Places(
+        details, small.Ks[0].astype(np.float64), everything, np.concatenate(entries), np.concatenate(numbers)
+    )
+
+
 def _details(views: Views, row: int, width: int, height: int) -> Float64[np.ndarray, "h w"]:
     from PIL import Image
     from scipy.ndimage import gaussian_filter
@@ -141,35 +176,38 @@ def _details(views: Views, row: int, width: int, height: int) -> Float64[np.ndar
     assert views.images is not None
     grey = Image.fromarray(views.images[row]).convert("L").resize((width, height), Image.Resampling.BOX)
     values = np.asarray(grey, np.float64) / 255
-    return gaussian_filter(values, FINE) - gaussian_filter(values, COARSE)
+    return np.asarray(gaussian_filter(values, FINE) - gaussian_filter(values, COARSE))
 
 
-def _correlation(
-    pairs: list[_Pair],
-    details: dict[int, Float64[np.ndarray, "h w"]],
-    Ks: dict[int, Float64[np.ndarray, "3 3"]],
-    factor: float,
-    shift: Float64[np.ndarray, "2"],
-) -> float:
+def _correlation(places: list[_Places], pairs: int, factor: float, shift: Float64[np.ndarray, "2"]) -> float:
     """Mean correlation of the details of pairs of views with a color camera."""
     from scipy.ndimage import map_coordinates
 
-    correlations = []
-    for pair in pairs:
-        both = []
-        for view, points in zip(pair.views, pair.points, strict=True):
-            K = Ks[view].copy()
-            K[0, 0] *= factor
-            K[1, 1] *= factor
-            moved = points.copy()
-            moved[:, :2] += shift
-            columns, rows = project_points(moved, K).T - 0.5
-            height, width = details[view].shape
-            outside = (columns < 0) | (rows < 0) | (columns > width - 1) | (rows > height - 1)
-            values = map_coordinates(details[view], (rows, columns), order=1, mode="nearest")
-            values[outside] = np.nan
-            both.append(values)
-        use = np.isfinite(both[0]) & np.isfinite(both[1])
-        if use.sum() >= MIN_SHARED // 2 and min(values[use].std() for values in both) > 1e-4:
-            correlations.append(np.corrcoef(both[0][use], both[1][use])[0, 1])
-    return float(np.mean(correlations)) if len(correlations) >= max(1, len(pairs) // 2) else float("nan")
+    total = sum(len(each.points) for each in places)
+    values, numbers = np.full(total, np.nan), np.zeros(total, np.int64)
+    for details, K, points, entries, pair in places:
+        focal = K.copy()
+        focal[0, 0] *= factor
+        focal[1, 1] *= factor
+        moved = points.copy()
+        moved[:, :2] += shift
+        columns, rows = project_points(moved, focal).T - 0.5
+        height, width = details.shape
+        inside = (columns >= 0) & (rows >= 0) & (columns <= width - 1) & (rows <= height - 1)
+        values[entries[inside]] = map_coordinates(details, (rows[inside], columns[inside]), order=1, mode="nearest")
+        numbers[entries] = pair
+    first, second = values.reshape(2, -1)
+    use = np.isfinite(first) & np.isfinite(second)
+    first, second, number = first[use], second[use], numbers[: total // 2][use]
+    count = np.bincount(number, minlength=pairs)
+
+    def mean(products: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " p"]:
+        return np.asarray(np.bincount(number, products, minlength=pairs) / np.maximum(count, 1))
+
+    centered = first - mean(first)[number], second - mean(second)[number]
+    variances = mean(np.square(centered[0])), mean(np.square(centered[1]))
+    clear = (count >= MIN_SHARED // 2) & (np.minimum(*variances) > SMALLEST_DETAIL**2)
+    if clear.sum() < max(1, pairs // 2):
+        return float("nan")
+    correlations = mean(centered[0] * centered[1])[clear] / np.sqrt(variances[0] * variances[1])[clear]
+    return float(correlations.mean())

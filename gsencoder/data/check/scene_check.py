@@ -1,70 +1,121 @@
 """What is wrong with a scene's poses, depth and photographs, found by holding its views against each other."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
+from gsencoder.core.errors import SceneWarning
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.check.color_agreement import color_correlations, grey_pictures, view_correlations
-from gsencoder.data.check.depth_agreement import Agreement, DepthViews, chosen_views, depth_views, residuals
+from gsencoder.data.check.depth_agreement import (
+    Agreement,
+    DepthViews,
+    chosen_views,
+    depth_views,
+    pair_offsets,
+    residuals,
+)
+from gsencoder.data.check.epipolar import EpipolarCheck, check_matches
+from gsencoder.data.check.findings import ADVICE, Finding
 from gsencoder.data.check.readings import Reading, as_given, other_readings
+from gsencoder.data.check.registration_fit import RegistrationFit, fit_registration
 from gsencoder.data.check.stray_views import fit_pose, surface_normals, view_spreads
-from gsencoder.types import Views
+from gsencoder.types import Scene, Views
 
 BETTER = 0.95
 """Another reading of the files is named if its spread is below this share of the files' own."""
 SMALLEST_FACTOR = 1.015
 """Factors nearer to one are within what sensors are calibrated to."""
+UNFIT = 0.3
+"""If a smaller share of the depth agrees under every reading, poses and depth do not belong together."""
+CLEAR = 0.7
+"""Where the files' own reading compares nothing, another one is named if this share agrees under it."""
+COMPARABLE = 0.02
+"""Samples that land in another view, as a share of all pairs, below which depth says nothing about poses."""
 STRAY = 0.9
 """A view is astray if moving it brings its spread below this share."""
 SUSPECTS = 8
 """So many views, those that fit worst, are tried to be moved."""
 OTHER_PICTURE = 0.8
 """A view whose colors correlate with the others' by less than this share of the median shows something else."""
-
-ADVICE = {
-    "axes": "the poses are in OpenGL's camera axes where OpenCV's are expected, or the reverse",
-    "inverse": "the matrices are cam_from_world where world_from_cam is expected, or the reverse",
-    "inverse and axes": "the matrices are the inverse of what is expected, in the other camera axes",
-    "ray length": "depth is the length of the ray where the coordinate z is expected",
-    "depth scale": "the depth scale is wrong: depths should be {factor:.4g} times as large",
-    "depth focal length": "depth has the focal length of another sensor: {factor:.4g} times the stated one",
-}
+SAME_FACTOR = 0.03
+"""Depth and photographs whose focal lengths are off by factors this near to each other share one wrong camera."""
+SUSPICIOUS = 0.9
+"""`suspicious_depth` looks for the cause where a smaller share of the depth agrees."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
-    """Something that is wrong.
-
-    Attributes:
-        cause: a key of `ADVICE`, "stray view" or "other picture".
-        message: for people.
-        view: name of the view, if it is one alone.
-        factor: of the depth scale or the focal length, where the cause has one.
-    """
-
-    cause: str
-    message: str
-    view: str | None = None
-    factor: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DepthCheck:
     """How the depth images and photographs of a scene agree.
 
     Attributes:
-        views: names of the views that were looked at.
+        views: rows of the views that were looked at.
         given: agreement of depth as the files have it.
         best: that of the reading that fits best; `given` unless a finding names another.
+        offsets: see `pair_offsets`, under the reading that fits best.
         findings: what is wrong, causes that concern all views first.
         color: median correlation of the photographs' intensities at the same places; NaN without photographs.
+        registration: of photographs and depth; None without photographs.
+        depth: the depth images, as the files have them.
     """
 
-    views: tuple[str, ...]
+    views: Int64[np.ndarray, " V"]
     given: Agreement
     best: Agreement
+    offsets: tuple[float, float]
     findings: tuple[Finding, ...]
     color: float
+    registration: RegistrationFit | None
+    depth: DepthViews
+
+    @property
+    def comparable(self) -> bool:
+        """Whether enough of the depth lands in other views for a judgement."""
+        return self.best.compared >= _needed(self.depth)
+
+
+def check_scene(
+    views: Views, *, limit: int = 0, track: Track = untracked
+) -> tuple[DepthCheck | None, EpipolarCheck | None]:
+    """Holds the views of a scene against each other: by their depth and, where that says nothing, by matched features.
+
+    Args:
+        views: posed.
+        limit: largest number of views to look at; 0 = 32 of depth images, 24 of photographs.
+        track: progress.
+
+    Raises:
+        InputError: a file is damaged, or photographs need matching and pycolmap is missing.
+    """
+    depth = check_depth(views, limit=limit or 32) if views.depths is not None and len(views) > 1 else None
+    if depth is not None and depth.comparable:
+        return depth, None
+    if views.images is None or len(views) < 2:
+        return depth, None
+    return depth, check_matches(views, limit=limit or 24, track=track)
+
+
+def fit_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> float:
+    """The share of what views share that agrees: of depth if it can be compared, else of matches; NaN of neither."""
+    if depth is not None and depth.comparable:
+        return depth.given.share
+    return matches.share if matches is not None else float("nan")
+
+
+def warn_of_faults(scene: Scene) -> None:
+    """Warns if a quick look at a scene's depth images says that they, or the poses, are wrong."""
+    views = scene.views
+    if views is None or views.depths is None or len(views) < 2:
+        return
+    _, finding = suspicious_depth(views)
+    if finding is not None:
+        warnings.warn(
+            f"scene {scene.name}: {finding.message}; gsencoder inspect says more, and gsencoder repair can mend it",
+            SceneWarning,
+            stacklevel=2,
+        )
 
 
 def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
@@ -78,46 +129,110 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
     names = tuple(views.names[int(view)] for view in chosen)
     small = depth_views(views, chosen)
     given = as_given(small)
-    best = _best_reading(given, small)
-    findings = []
-    if best is not given:
-        message = ADVICE[best.cause].format(factor=best.factor)
-        shares = f"{given.agreement.share:.0%} of the depth agrees across views, {best.agreement.share:.0%} if so read"
-        findings.append(Finding(cause=best.cause, message=f"{message} ({shares})", factor=best.factor))
-    stray = _stray_views(best.views, names)
-    findings += stray
-    color = float("nan")
-    if views.images is not None:
+    best = _best_reading(given, small, chosen, views)
+    comparable = best.agreement.compared >= _needed(small)
+    findings = _reading_findings(given, best) if comparable else []
+    fits = comparable and best.agreement.share >= UNFIT
+    stray = _stray_views(best.views, names) if fits else []
+    color, registration = float("nan"), None
+    other: list[Finding] = []
+    if views.images is not None and fits:
+        registration = fit_registration(views, chosen, best.views)
+        findings = _with_registration(findings, registration)
         grey = grey_pictures(views, chosen, small.depths.shape[1:])
-        correlation = view_correlations(color_correlations(best.views, grey, small.Ks))
+        Ks = small.Ks.copy()
+        if registration.differs:
+            Ks[:, :2, :2] *= registration.focal_factor
+        correlation = view_correlations(color_correlations(best.views, grey, Ks))
         if np.isfinite(correlation).any():
             color = float(np.nanmedian(correlation))
-            findings += [
-                Finding(
-                    cause="other picture",
-                    message=f"its photograph does not show what its depth does (correlation with other views "
-                    f"{correlation[view]:.2f}, median {color:.2f})",
-                    view=names[view],
-                )
-                for view in np.flatnonzero(correlation < OTHER_PICTURE * color)
-                if names[view] not in {finding.view for finding in stray}
-            ]
-    return DepthCheck(views=names, given=given.agreement, best=best.agreement, findings=tuple(findings), color=color)
+            other = _other_pictures(correlation, color, names, {str(finding.view) for finding in stray})
+    return DepthCheck(
+        views=chosen,
+        given=given.agreement,
+        best=best.agreement,
+        offsets=pair_offsets(residuals(best.views)),
+        findings=(*findings, *stray, *other),
+        color=color,
+        registration=registration,
+        depth=small,
+    )
 
 
-def _best_reading(given: Reading, views: DepthViews) -> Reading:
+def suspicious_depth(views: Views, *, limit: int = 10) -> tuple[Agreement, Finding | None]:
+    """A quick look at few views: how well their depth agrees and, if not well, the likely cause.
+
+    Args:
+        views: with depth, two or more.
+        limit: largest number of views to look at.
+    """
+    chosen = chosen_views(len(views), limit)
+    small = depth_views(views, chosen)
+    given = as_given(small)
+    if given.agreement.compared >= _needed(small) and given.agreement.share >= SUSPICIOUS:
+        return given.agreement, None
+    best = _best_reading(given, small, chosen, views)
+    if best.agreement.compared < _needed(small):
+        return given.agreement, None
+    return given.agreement, next(iter(_reading_findings(given, best)), None)
+
+
+def _needed(views: DepthViews) -> float:
+    """So many samples must land in other views before their depth says anything."""
+    return COMPARABLE * len(views) * (len(views) - 1) * views.values.shape[1]
+
+
+def _best_reading(given: Reading, depth: DepthViews, chosen: Int64[np.ndarray, " V"], views: Views) -> Reading:
     """The files' own reading, or another one that fits clearly better."""
-    needed = 0.02 * len(views) * (len(views) - 1) * views.values.shape[1]
     candidates = [
         reading
-        for reading in other_readings(views)
-        if reading.agreement.compared >= needed
-        and (reading.factor is None or abs(np.log(reading.factor)) >= np.log(SMALLEST_FACTOR))
+        for reading in other_readings(depth, chosen, views.cameras.cam_from_world)
+        if reading.agreement.compared >= _needed(depth)
+        and (reading.cause == "order" or reading.factor is None or _differs(reading.factor))
     ]
     best = min(candidates, key=lambda reading: reading.agreement.spread, default=given)
-    if not np.isfinite(given.agreement.spread):
-        return best
+    if given.agreement.compared < _needed(depth):
+        # Views that share nothing are no fault; only a reading under which they agree says that they should.
+        return best if best.agreement.share >= CLEAR else given
     return best if best.agreement.spread < BETTER * given.agreement.spread else given
+
+
+def _differs(factor: float) -> bool:
+    return abs(float(np.log(factor))) >= float(np.log(SMALLEST_FACTOR))
+
+
+def _reading_findings(given: Reading, best: Reading) -> list[Finding]:
+    """What the reading that fits best says about the files."""
+    share = best.agreement.share
+    if share < UNFIT:
+        message = (
+            f"poses and depth do not belong together: {given.agreement.share:.0%} of the depth agrees across views, "
+            f"and no other reading of the files has more than {share:.0%}"
+        )
+        return [Finding(cause="unknown", message=message)]
+    if best is given:
+        return []
+    message = ADVICE[best.cause].format(factor=best.factor)
+    shares = f"{given.agreement.share:.0%} of the depth agrees across views, {share:.0%} if so read"
+    return [Finding(cause=best.cause, message=f"{message} ({shares})", factor=best.factor)]
+
+
+def _with_registration(findings: list[Finding], fit: RegistrationFit) -> list[Finding]:
+    """The findings, and that depth and photographs are not registered; a focal length that is wrong for both is one
+    finding."""
+    if not fit.differs:
+        return findings
+    correlations = f"details of the photographs correlate by {fit.given:.2f} across views, {fit.best:.2f} if so"
+    focal = next((finding for finding in findings if finding.cause == "depth focal length"), None)
+    if focal is not None and focal.factor and abs(np.log(fit.focal_factor / focal.factor)) < SAME_FACTOR:
+        message = f"{ADVICE['focal length'].format(factor=focal.factor)}, and so is that of the depth ({correlations})"
+        return [Finding(cause="focal length", message=message, factor=focal.factor)]
+    x, y = fit.shift
+    message = (
+        f"color and depth are not registered: the photographs have {fit.focal_factor:.4g} times the stated focal "
+        f"length, and their camera stands {np.hypot(x, y):.3g} units beside the depth camera ({correlations})"
+    )
+    return [*findings, Finding(cause="color registration", message=message, factor=fit.focal_factor)]
 
 
 def _stray_views(views: DepthViews, names: tuple[str, ...]) -> list[Finding]:
@@ -134,3 +249,19 @@ def _stray_views(views: DepthViews, names: tuple[str, ...]) -> list[Finding]:
             )
             findings.append(Finding(cause="stray view", message=message, view=names[view]))
     return findings
+
+
+def _other_pictures(
+    correlation: Float64[np.ndarray, " V"], usual: float, names: tuple[str, ...], excluded: set[str]
+) -> list[Finding]:
+    """Views whose photographs show something else than their depth."""
+    return [
+        Finding(
+            cause="other picture",
+            message=f"its photograph does not show what its depth does (correlation with other views "
+            f"{correlation[view]:.2f}, median {usual:.2f})",
+            view=names[view],
+        )
+        for view in np.flatnonzero(correlation < OTHER_PICTURE * usual)
+        if names[view] not in excluded
+    ]

@@ -18,13 +18,14 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
+from gsencoder.types.cameras import pixel_centers, unproject_points
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -224,6 +225,16 @@ class _Files(Sequence[Array]):
         return values
 
 
+DepthMeasure = Literal["z", "ray"]
+"""What the numbers of a depth file are: the coordinate z in the camera, or the distance from its center."""
+
+
+def ray_lengths(K: Float64[np.ndarray, "3 3"], width: int, height: int) -> Float64[np.ndarray, "height width"]:
+    """The distance from the camera of a point of depth z = 1, for each pixel."""
+    rays = unproject_points(pixel_centers(width, height), np.ones((height, width)), K)
+    return np.asarray(np.linalg.norm(rays, axis=2))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DepthSensor:
     """How the numbers of a depth file become depth of the photograph.
@@ -231,11 +242,13 @@ class DepthSensor:
     Attributes:
         scale: world units for each step of the file.
         no_depth: a step that means none, besides 0.
+        measure: whether a depth is the coordinate z or the length of the ray.
         color_from_depth: where the sensor stands beside the photograph's camera, world units; None = in one place.
     """
 
     scale: float = 1.0
     no_depth: int | None = None
+    measure: DepthMeasure = "z"
     color_from_depth: Float64[np.ndarray, "4 4"] | None = None
 
 
@@ -295,15 +308,15 @@ class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
             values[values == sensor.no_depth] = 0
         if sensor.color_from_depth is None:
             depth = self._nearest(view, values) * sensor.scale
+            if sensor.measure == "ray":
+                depth /= ray_lengths(grid.pinhole.matrix(grid.width, grid.height), grid.width, grid.height)
         else:
-            depth = self._registered(view, values * sensor.scale, sensor.color_from_depth)
+            depth = self._registered(view, values * sensor.scale, sensor)
         if depth.size and depth.max() > np.finfo(np.float32).max:
             raise InputError(f"{path}: depth of {depth.max():g} world units; check the depth scale")
         return depth.astype(np.float32)
 
-    def _registered(
-        self, view: int, depth: np.ndarray, color_from_depth: Float64[np.ndarray, "4 4"]
-    ) -> Float32[np.ndarray, "H W"]:
+    def _registered(self, view: int, depth: np.ndarray, sensor: DepthSensor) -> Float32[np.ndarray, "H W"]:
         """The depth of a sensor that stands elsewhere, as the photograph's camera sees it."""
         # The kernel needs numba and torch, which scenes without such sensors do without.
         from gsencoder.data.readers.registration import register_depth
@@ -311,14 +324,18 @@ class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
         grid = self._grids[view]
         self._checked(view, depth.shape)
         source = grid.source
-        sensor = pinhole_for(source, str(self._paths[view]))
-        remap = self._remaps.get(sensor, source)
+        pinhole = pinhole_for(source, str(self._paths[view]))
+        remap = self._remaps.get(pinhole, source)
         if remap is not None:
             depth = remap.nearest(depth)
+        K = pinhole.matrix(pinhole.width, pinhole.height)
+        if sensor.measure == "ray":
+            depth = depth / ray_lengths(K, pinhole.width, pinhole.height)
+        assert sensor.color_from_depth is not None
         return register_depth(
             depth.astype(np.float32),
-            sensor.matrix(sensor.width, sensor.height),
-            color_from_depth,
+            K,
+            sensor.color_from_depth,
             grid.pinhole.matrix(grid.width, grid.height),
             grid.width,
             grid.height,

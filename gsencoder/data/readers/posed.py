@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.images import DepthMeasure
 from gsencoder.data.readers.undistort import CameraModel
 
 RIGID_TOLERANCE = 1e-3
@@ -36,6 +37,7 @@ class PosedImage:
             world units; None = both look from one place.
         depth_scale: world units for each step of the depth file.
         no_depth: a step of the depth file that means none, besides 0.
+        depth_measure: whether a depth is the coordinate z or the length of the ray.
         mask: pixels to use, or None.
         instance: instance map, or None.
     """
@@ -49,6 +51,7 @@ class PosedImage:
     depth_from_color: Float64[np.ndarray, "4 4"] | None = None
     depth_scale: float = 1.0
     no_depth: int | None = None
+    depth_measure: DepthMeasure = "z"
     mask: Path | None = None
     instance: Path | None = None
 

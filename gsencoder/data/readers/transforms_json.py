@@ -7,7 +7,9 @@ or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `applied_trans
 
 Beside the keys of those programs these are read: `instance_file_path` (integers, 0 = none) for a frame, and
 `metres_per_unit` and `up` for the file; for both, `depth_camera` (an object with fl_x, fl_y, cx and cy, for the depth
-file's pixels) and `depth_from_color` (4×4, OpenCV axes, world units), where depth is not registered to color.
+file's pixels) and `depth_from_color` (4×4, OpenCV axes, world units), where depth is not registered to color,
+`depth_measure` ("z", the default, or "ray", the distance from the camera) and `no_depth` (a step that means none,
+besides 0).
 """
 
 import json
@@ -128,6 +130,11 @@ def read_transforms(
             raise InputError(f"{where}: the depth scale must be positive, got {scale}")
         pose = rigid_pose(_matrix(frame, "transform_matrix", where), where)
         depth_camera, depth_from_color = _depth_sensor(data | frame, beside["depth"], where)
+        measure, no_depth = (data | frame).get("depth_measure", "z"), number(data | frame, "no_depth", where)
+        if measure not in ("z", "ray"):
+            raise InputError(f"{where}: depth_measure must be z or ray, got {str(measure)[:40]!r}")
+        if no_depth is not None and (no_depth < 0 or no_depth != int(no_depth)):
+            raise InputError(f"{where}: no_depth must be an integer of at least 0, got {no_depth:g}")
         images.append(
             PosedImage(
                 name=name,
@@ -138,6 +145,8 @@ def read_transforms(
                 depth_camera=depth_camera,
                 depth_from_color=depth_from_color,
                 depth_scale=scale,
+                depth_measure=measure,
+                no_depth=None if no_depth is None else int(no_depth),
                 mask=beside["mask"],
                 instance=beside["instance"],
             )

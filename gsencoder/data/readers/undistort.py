@@ -70,6 +70,11 @@ class CameraModel:
         return self.params[:4]  # type: ignore[return-value]
 
 
+def focal_count(camera: CameraModel) -> int:
+    """Whether a model has one focal length or two; they come first in its parameters."""
+    return _FOCALS.get(camera.model, 2)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pinhole:
     """A camera without distortion, in pixels, pixel centers at .5."""

@@ -15,9 +15,15 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.readers.undistort import load_pycolmap
+from gsencoder.data.seeding.feature_matches import (
+    detect_features,
+    epipolar_distances,
+    fundamental_matrix,
+    image_ids,
+    match_pairs,
+)
 from gsencoder.data.seeding.view_pairs import choose_pairs
 from gsencoder.types import Cameras, Views
-from gsencoder.types.poses import invert_rigid
 
 MAX_EPIPOLAR_ERROR = 2.0
 """Largest distance of a match from the epipolar line, in pixels of the pictures that are matched."""
@@ -67,9 +73,9 @@ def triangulate(
         database_path, pictures = folder / "database.db", folder / "images"
         pictures.mkdir()
         try:
-            _detect_features(pycolmap, database_path, pictures, views, cameras, features, track)
+            detect_features(pycolmap, database_path, pictures, views, cameras, features, track)
             pairs = choose_pairs(cameras, neighbors)
-            _match(pycolmap, database_path, folder / "pairs.txt", pairs)
+            match_pairs(pycolmap, database_path, folder / "pairs.txt", pairs)
             verified = _verify(pycolmap, database_path, cameras, pairs)
             if not verified:
                 return _result(None, verified)
@@ -85,72 +91,13 @@ def triangulate(
         return _result(model, verified)
 
 
-def _picture_name(view: int) -> str:
-    return f"{view:06d}.png"
-
-
-def _detect_features(
-    pycolmap: Any,
-    database_path: Path,
-    pictures: Path,
-    views: Views,
-    cameras: Cameras,
-    features: int,
-    track: Track,
-) -> None:
-    """Writes the pictures at the size of `cameras`, and their features into a new database."""
-    from PIL import Image
-
-    masks = pictures.with_name("masks")
-    assert views.images is not None
-    for view in track(range(len(views)), "reading photographs"):
-        size = int(cameras.widths[view]), int(cameras.heights[view])
-        Image.fromarray(views.images[view]).resize(size, Image.Resampling.BOX).save(
-            pictures / _picture_name(view), compress_level=1
-        )
-        if views.masks is not None:
-            masks.mkdir(exist_ok=True)
-            mask = Image.fromarray(views.masks[view].astype(np.uint8) * 255).resize(size, Image.Resampling.NEAREST)
-            mask.save(masks / f"{_picture_name(view)}.png", compress_level=1)
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.max_image_size = max(int(cameras.widths.max()), int(cameras.heights.max()))
-    extraction.use_gpu = False
-    extraction.sift.max_num_features = features
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
-    if views.masks is not None:
-        reader.mask_path = masks
-    pycolmap.extract_features(
-        database_path,
-        pictures,
-        image_names=[_picture_name(view) for view in range(len(views))],
-        camera_mode=pycolmap.CameraMode.PER_IMAGE,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
-
-
-def _match(pycolmap: Any, database_path: Path, list_path: Path, pairs: Sequence[tuple[int, int]]) -> None:
-    lines = [f"{_picture_name(first)} {_picture_name(second)}\n" for first, second in pairs]
-    list_path.write_text("".join(lines), encoding="utf-8")
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    matching.skip_geometric_verification = True
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = list_path
-    pycolmap.match_image_pairs(
-        database_path, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
-    )
-
-
 def _verify(
     pycolmap: Any, database_path: Path, cameras: Cameras, pairs: Sequence[tuple[int, int]]
 ) -> list[tuple[int, int]]:
     """Writes the matches that lie on the epipolar lines of the poses; returns the pairs that have enough of them."""
     verified = []
     with pycolmap.Database.open(database_path) as database:
-        ids = _image_ids(database, len(cameras))
+        ids = image_ids(database, len(cameras))
         keypoints = [database.read_keypoints(number)[:, :2].astype(np.float64) for number in ids]
         for first, second in pairs:
             if not database.exists_matches(ids[first], ids[second]):
@@ -178,36 +125,14 @@ def on_epipolar_lines(
 ) -> Bool[np.ndarray, " M"]:
     """Which pairs of pixels may show one point: each lies near the epipolar line of the other."""
     fundamental = fundamental_matrix(cameras, first, second)
-    good = np.ones(len(first_pixels), bool)
-    for pixels, other, matrix in (
-        (second_pixels, first_pixels, fundamental),
-        (first_pixels, second_pixels, fundamental.T),
-    ):
-        lines = np.column_stack((other, np.ones(len(other)))) @ matrix.T
-        distance = np.abs(np.einsum("mi,mi->m", lines[:, :2], pixels) + lines[:, 2])
-        good &= distance <= MAX_EPIPOLAR_ERROR * np.linalg.norm(lines[:, :2], axis=1)
-    return good
-
-
-def fundamental_matrix(cameras: Cameras, first: int, second: int) -> Float64[np.ndarray, "3 3"]:
-    """F with x₂ᵀ F x₁ = 0 for the homogeneous pixels of one point in both views (Hartley and Zisserman, eq. 9.2)."""
-    poses = cameras.cam_from_world.astype(np.float64)
-    relative = poses[second] @ invert_rigid(poses[first])
-    x, y, z = relative[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    inverse = [np.linalg.inv(cameras.Ks[view].astype(np.float64)) for view in (first, second)]
-    return inverse[1].T @ cross @ relative[:3, :3] @ inverse[0]
-
-
-def _image_ids(database: Any, count: int) -> list[int]:
-    return [database.read_image_with_name(_picture_name(view)).image_id for view in range(count)]
+    return epipolar_distances(fundamental, first_pixels, second_pixels) <= MAX_EPIPOLAR_ERROR
 
 
 def _posed_model(pycolmap: Any, database_path: Path, cameras: Cameras) -> Any:
     """A COLMAP model of the cameras, with the numbers that they have in the database, and no points."""
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database_path) as database:
-        for view, number in enumerate(_image_ids(database, len(cameras))):
+        for view, number in enumerate(image_ids(database, len(cameras))):
             image = database.read_image(number)
             camera = database.read_camera(image.camera_id)
             K = cameras.Ks[view].astype(np.float64)

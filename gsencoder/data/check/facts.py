@@ -1,0 +1,189 @@
+"""What a scene holds, and what it lacks."""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsencoder.core.even_indices import even_indices
+from gsencoder.data.readers.posed import PosedImage, PosedImages
+from gsencoder.data.up import Up, up_of_scene
+from gsencoder.types import Scene
+
+MAX_DEPTH_IMAGES = 24
+"""So many depth images, evenly spaced, are read for their coverage and range."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthFacts:
+    """The depth images of a scene.
+
+    Attributes:
+        views: views that have one.
+        coverage: share of the pixels with depth.
+        near: 1st percentile of the depth, world units.
+        far: 99th percentile.
+        sensor: how the depth camera differs from the photographs'; empty if it is the same.
+    """
+
+    views: int
+    coverage: float
+    near: float
+    far: float
+    sensor: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SceneFacts:
+    """What a scene with posed views holds.
+
+    Attributes:
+        layout: in which it is stored.
+        views: number of them.
+        sizes: width and height of the views, after undistortion and scaling, with the number of views that have it.
+        models: names of the camera models in the files, with the number of views.
+        focal: smallest and largest focal length, pixels.
+        field: median horizontal and vertical field of view, degrees.
+        spread: extent of the camera centers along the world's axes, units.
+        depth: None where there is none.
+        masks: whether there are any.
+        points: of structure from motion.
+        objects: labeled ones.
+        metres_per_unit: None where unknown.
+        up: stated or estimated; None where nothing says.
+        missing: what is not there, and what follows from it.
+    """
+
+    layout: str
+    views: int
+    sizes: dict[tuple[int, int], int]
+    models: dict[str, int]
+    focal: tuple[float, float]
+    field: tuple[float, float]
+    spread: tuple[float, float, float]
+    depth: DepthFacts | None
+    masks: bool
+    points: int
+    objects: int
+    metres_per_unit: float | None
+    up: Up | None
+    missing: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The facts as JSON values."""
+        up, depth = self.up, self.depth
+        return {
+            "layout": self.layout,
+            "views": self.views,
+            "sizes": [[*size, count] for size, count in self.sizes.items()],
+            "models": self.models,
+            "focal": list(self.focal),
+            "field_of_view": list(self.field),
+            "camera_extent": list(self.spread),
+            "depth": None
+            if depth is None
+            else {
+                "views": depth.views,
+                "coverage": depth.coverage,
+                "near": depth.near,
+                "far": depth.far,
+                "sensor": depth.sensor,
+            },
+            "masks": self.masks,
+            "points": self.points,
+            "objects": self.objects,
+            "metres_per_unit": self.metres_per_unit,
+            "up": None
+            if up is None
+            else {"direction": up.direction.tolist(), "source": up.source, "confidence": up.confidence},
+            "missing": list(self.missing),
+        }
+
+
+def scene_facts(scene: Scene, posed: PosedImages, layout: str) -> SceneFacts:
+    """The facts of a loaded scene; some of its depth images are read.
+
+    Args:
+        scene: with views.
+        posed: the same views as their files describe them.
+        layout: the name of the layout.
+
+    Raises:
+        InputError: a depth image is damaged.
+    """
+    views = scene.views
+    assert views is not None
+    cameras, names = views.cameras, set(views.names)
+    posed = replace(posed, images=tuple(image for image in posed.images if image.name in names))
+    focal = cameras.Ks[:, 0, 0]
+    fields = [
+        float(np.rad2deg(2 * np.median(np.arctan(size / 2 / cameras.Ks[:, axis, axis]))))
+        for axis, size in enumerate((cameras.widths, cameras.heights))
+    ]
+    extent = np.ptp(cameras.centers, axis=0) if len(cameras) else np.zeros(3)
+    up = up_of_scene(scene)
+    return SceneFacts(
+        layout=layout,
+        views=len(views),
+        sizes=dict(Counter(zip(cameras.widths.tolist(), cameras.heights.tolist(), strict=True)).most_common()),
+        models=dict(Counter(image.camera.model for image in posed.images).most_common()),
+        focal=(float(focal.min()), float(focal.max())),
+        field=(fields[0], fields[1]),
+        spread=(float(extent[0]), float(extent[1]), float(extent[2])),
+        depth=_depth_facts(scene, posed),
+        masks=views.masks is not None,
+        points=0 if scene.sfm_points is None else len(scene.sfm_points),
+        objects=len(scene.objects),
+        metres_per_unit=scene.metres_per_unit,
+        up=up,
+        missing=_missing(scene, up),
+    )
+
+
+def _depth_facts(scene: Scene, posed: PosedImages) -> DepthFacts | None:
+    views = scene.views
+    if views is None or views.depths is None:
+        return None
+    known, pixels, values = 0, 0, []
+    for view in even_indices(len(views), MAX_DEPTH_IMAGES):
+        depth = views.depths[int(view)]
+        measured = depth[depth > 0]
+        known, pixels = known + len(measured), pixels + depth.size
+        values.append(measured[:: max(1, len(measured) // 10_000)])
+    sample = np.concatenate(values)
+    near, far = np.percentile(sample, (1, 99)) if len(sample) else (float("nan"),) * 2
+    sensors = {_sensor(image) for image in posed.images if image.depth is not None} - {""}
+    return DepthFacts(
+        views=sum(image.depth is not None for image in posed.images),
+        coverage=known / max(1, pixels),
+        near=float(near),
+        far=float(far),
+        sensor="; ".join(sorted(sensors)[:2]),
+    )
+
+
+def _sensor(image: PosedImage) -> str:
+    """How a depth camera differs from the photograph's, in words."""
+    parts = []
+    if image.depth_camera is not None and image.depth_camera.params[0] != image.camera.params[0]:
+        parts.append(f"f = {image.depth_camera.params[0]:g} (photographs {image.camera.params[0]:g})")
+    if image.depth_from_color is not None:
+        shift = float(np.linalg.norm(image.depth_from_color[:3, 3]))
+        parts.append(f"{shift:.3g} units beside the camera")
+    return ", ".join(parts)
+
+
+def _missing(scene: Scene, up: Up | None) -> tuple[str, ...]:
+    views = scene.views
+    assert views is not None
+    missing = []
+    if views.depths is None and scene.sfm_points is None:
+        missing.append("depth and points: seeds are triangulated from the photographs")
+    elif views.depths is None:
+        missing.append("depth: visibility is tested against rendered depth, and seeds come from the points")
+    if scene.metres_per_unit is None:
+        missing.append("unit of length: sizes are in world units (metres_per_unit=)")
+    if up is None or up.source != "stated":
+        missing.append("up: it is estimated" if up is not None else "up: boxes have any orientation")
+    return tuple(missing)

@@ -1,0 +1,250 @@
+"""Faults of poses, depth and photographs are named with their cause; scenes without faults raise none."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from textured_box import box_cameras, box_views, look
+
+from gsencoder.core.errors import SceneWarning
+from gsencoder.data.check.depth_agreement import agreement_map, chosen_views, depth_views, residuals
+from gsencoder.data.check.epipolar import check_matches
+from gsencoder.data.check.scene_check import check_depth, check_scene, suspicious_depth, warn_of_faults
+from gsencoder.data.orbits import looking_cameras
+from gsencoder.types import Scene, Views
+from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
+
+ROW = 4
+"""The view that alone is wrong."""
+
+
+@pytest.fixture(scope="module")
+def box() -> Views:
+    return box_views()
+
+
+def with_poses(views: Views, change: Callable[[np.ndarray], np.ndarray]) -> Views:
+    poses = change(views.cameras.cam_from_world.astype(np.float64))
+    return replace(views, cameras=replace(views.cameras, cam_from_world=poses.astype(np.float32)))
+
+
+def with_focal(views: Views, factor: float) -> Views:
+    Ks = views.cameras.Ks.copy()
+    Ks[:, :2, :2] *= np.float32(factor)
+    return replace(views, cameras=replace(views.cameras, Ks=Ks))
+
+
+def with_depths(views: Views, change: Callable[[np.ndarray], np.ndarray]) -> Views:
+    assert views.depths is not None
+    return replace(views, depths=[change(depth).astype(np.float32) for depth in views.depths])
+
+
+def with_stray(views: Views, size: float = 1.0) -> Views:
+    """One view turned by 1° and moved by 3 cm, times `size`."""
+    noise = np.eye(4)
+    noise[:3, :3] = Rotation.from_rotvec(np.deg2rad([0.6 * size, 0.6 * size, 0.5 * size])).as_matrix()
+    noise[:3, 3] = 0.02 * size, -0.02 * size, 0.01 * size
+    return with_poses(views, lambda poses: np.stack([*poses[:ROW], noise @ poses[ROW], *poses[ROW + 1 :]]))
+
+
+def with_other_picture(views: Views) -> Views:
+    assert views.images is not None
+    images = list(views.images)
+    images[ROW] = images[0]
+    return replace(views, images=images)
+
+
+def ray_lengths(views: Views) -> np.ndarray:
+    rays = views.cameras.rays(0)
+    return np.asarray(np.linalg.norm(rays, axis=2))
+
+
+def other_sensor(depth: np.ndarray, factor: float = 1.1) -> np.ndarray:
+    """The depth image of a sensor with a longer focal length, as if it had the stated one."""
+    height, width = depth.shape
+    rows, columns = ((np.arange(n) + 0.5 - n / 2) / factor + n / 2 for n in (height, width))
+    return depth[rows.astype(int)][:, columns.astype(int)]
+
+
+POSE_FAULTS: dict[str, Callable[[Views], Views]] = {
+    "axes": lambda views: with_poses(views, lambda poses: OPENCV_FROM_OPENGL @ poses),
+    "inverse": lambda views: with_poses(views, invert_rigid),
+    "inverse and axes": lambda views: with_poses(views, lambda poses: invert_rigid(OPENCV_FROM_OPENGL @ poses)),
+    "order": lambda views: with_poses(views, lambda poses: np.roll(poses, 1, axis=0)),
+    "focal length": lambda views: with_focal(views, 1.1),
+}
+DEPTH_FAULTS: dict[str, Callable[[Views], Views]] = {
+    "depth scale": lambda views: with_depths(views, lambda depth: 1.03 * depth),
+    "ray length": lambda views: with_depths(views, lambda depth: depth * ray_lengths(views)),
+    "depth focal length": lambda views: with_depths(views, other_sensor),
+}
+VIEW_FAULTS: dict[str, Callable[[Views], Views]] = {"stray view": with_stray, "other picture": with_other_picture}
+FACTORS = {"depth scale": 1 / 1.03, "depth focal length": 1.1, "focal length": 1 / 1.1, "order": -1.0}
+
+
+def test_a_scene_without_faults_has_no_findings(box: Views) -> None:
+    check = check_depth(box)
+    assert check.findings == ()
+    assert check.given.share > 0.99
+    assert abs(check.given.offset) < 1e-4
+    assert check.color > 0.98
+
+
+@pytest.mark.parametrize("fault", [*POSE_FAULTS, *DEPTH_FAULTS])
+def test_a_fault_of_all_views_is_named_with_its_factor(box: Views, fault: str) -> None:
+    check = check_depth((POSE_FAULTS | DEPTH_FAULTS)[fault](box))
+    assert [(finding.cause, finding.view) for finding in check.findings] == [(fault, None)]
+    if fault in FACTORS:
+        assert check.findings[0].factor == pytest.approx(FACTORS[fault], rel=0.01)
+    assert check.best.share > 0.95
+    assert check.best.spread < 0.6 * check.given.spread
+
+
+@pytest.mark.parametrize("fault", VIEW_FAULTS)
+def test_a_view_that_is_wrong_alone_is_named(box: Views, fault: str) -> None:
+    check = check_depth(VIEW_FAULTS[fault](box))
+    assert [(finding.cause, finding.view) for finding in check.findings] == [(fault, box.names[ROW])]
+
+
+def test_two_faults_at_once_are_both_named(box: Views) -> None:
+    check = check_depth(with_other_picture(POSE_FAULTS["inverse"](box)))
+    assert {(finding.cause, finding.view) for finding in check.findings} == {
+        ("inverse", None),
+        ("other picture", box.names[ROW]),
+    }
+
+
+def test_photographs_of_a_camera_beside_the_depth_camera_are_not_registered() -> None:
+    cameras = box_cameras()
+    beside = box_cameras(focal=0.9 * 224)
+    poses = beside.cam_from_world.copy()
+    poses[:, 0, 3] += 0.03
+    check = check_depth(box_views(cameras, color_cameras=replace(beside, cam_from_world=poses)))
+    assert [finding.cause for finding in check.findings] == ["color registration"]
+    assert check.registration is not None
+    assert check.registration.focal_factor == pytest.approx(0.9, abs=0.005)
+    np.testing.assert_allclose(check.registration.shift, (0.03, 0), atol=0.004)
+
+
+@pytest.mark.parametrize("fault", POSE_FAULTS)
+def test_without_depth_matched_features_name_faults_of_the_poses(box: Views, fault: str) -> None:
+    photographs = replace(box, depths=None)
+    assert check_matches(photographs).findings == ()
+    check = check_matches(POSE_FAULTS[fault](photographs))
+    assert [(finding.cause, finding.view) for finding in check.findings] == [(fault, None)]
+    assert check.best_error < 0.7 < check.error
+
+
+@pytest.mark.parametrize("wrong", [lambda views: with_stray(views, 3.0), with_other_picture])
+def test_without_depth_a_view_that_is_wrong_alone_is_astray(box: Views, wrong: Callable[[Views], Views]) -> None:
+    check = check_matches(wrong(replace(box, depths=None)))
+    assert [(finding.cause, finding.view) for finding in check.findings] == [("stray view", box.names[ROW])]
+
+
+def test_poses_at_random_are_named_as_such(box: Views) -> None:
+    made = np.random.default_rng(0)
+
+    def scatter(poses: np.ndarray) -> np.ndarray:
+        turned = poses.copy()
+        turned[:, :3, :3] = Rotation.random(len(poses), random_state=0).as_matrix()
+        turned[:, :3, 3] = made.normal(size=(len(poses), 3))
+        return turned
+
+    astray = with_poses(box, scatter)
+    assert [finding.cause for finding in check_depth(astray).findings] == ["unknown"]
+    assert [finding.cause for finding in check_matches(replace(astray, depths=None)).findings] == ["unknown"]
+
+
+def test_depth_that_no_other_view_sees_leaves_the_judgement_to_matches() -> None:
+    """Views from one place that look away from each other share nothing, whatever is wrong with them."""
+    turns = np.linspace(0, 2 * np.pi, 4, endpoint=False)
+    forward = np.stack((np.cos(turns), np.sin(turns), np.zeros(4)), axis=1)
+    away = looking_cameras(0.3 * forward, forward, np.array([0.0, 0, 1]), width=64, height=48, focal=80.0)
+    depth, matches = check_scene(box_views(away))
+    assert depth is not None
+    assert not depth.comparable
+    assert depth.findings == ()
+    assert matches is not None
+    assert (matches.pairs, matches.findings) == (0, ())
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_views_are_checked_as_far_as_they_go(box: Views, count: int) -> None:
+    few = replace(box_views(box.cameras.select(range(count))), names=box.names[:count])
+    depth, matches = check_scene(few)
+    assert (depth is None) == (count == 1)
+    assert matches is None
+    if depth is not None:
+        assert depth.findings == ()
+
+
+def test_grey_photographs_say_nothing(box: Views) -> None:
+    assert box.images is not None
+    grey = replace(box, images=[np.full_like(image, 128) for image in box.images])
+    check = check_depth(grey)
+    assert check.findings == ()
+    assert np.isnan(check.color)
+    matches = check_matches(replace(grey, depths=None))
+    assert matches.pairs == 0
+    assert np.isnan(matches.error)
+
+
+def test_views_from_one_place_are_no_fault() -> None:
+    turns = np.linspace(0, 1.0, 6)
+    forward = np.stack((np.cos(turns), np.sin(turns), np.zeros(6)), axis=1)
+    tripod = looking_cameras(np.zeros((6, 3)), forward, np.array([0.0, 0, 1]), width=160, height=120, focal=112.0)
+    assert check_depth(box_views(tripod)).findings == ()
+    assert check_matches(replace(box_views(tripod), depths=None)).findings == ()
+
+
+def test_a_quick_look_warns_of_what_the_check_names(box: Views) -> None:
+    assert suspicious_depth(box)[1] is None
+    wrong = POSE_FAULTS["axes"](box)
+    _, finding = suspicious_depth(wrong)
+    assert finding is not None
+    assert finding.cause == "axes"
+    with pytest.warns(SceneWarning, match=r"scene box: the poses are in OpenGL's camera axes.*gsencoder inspect"):
+        warn_of_faults(Scene(name="box", views=wrong))
+    warn_of_faults(Scene(name="box", views=box))
+    warn_of_faults(Scene(name="box", views=replace(wrong, depths=None)))
+
+
+def test_residuals_of_exact_depth_are_zero_and_the_map_shows_what_agrees(box: Views) -> None:
+    small = depth_views(box, chosen_views(len(box)))
+    known = residuals(small)
+    assert np.isnan(known[np.arange(len(box)), np.arange(len(box))]).all()
+    assert np.nanmedian(np.abs(known)) < 1e-3
+    share = agreement_map(small, 3)
+    assert np.nanmean(share) > 0.99
+    # A piece of the view's depth that is wrong is what the map shows.
+    depths = small.depths.copy()
+    depths[3, 100:140, 100:150] *= 0.8
+    wrong = agreement_map(replace(small, depths=depths), 3)
+    piece = np.zeros(wrong.shape, bool)
+    piece[100:140, 100:150] = True
+    assert np.nanmean(wrong[piece]) < 0.1
+    assert np.nanmean(wrong[~piece]) > 0.99
+
+
+def test_what_something_nearer_hides_is_no_disagreement() -> None:
+    """A plate before half of one view: behind it the others' surfaces are hidden there."""
+    views = box_views()
+    assert views.depths is not None
+    depths = [depth.copy() for depth in views.depths]
+    depths[ROW][:, :100] = 0.3
+    small = depth_views(replace(views, depths=depths), chosen_views(len(views)))
+    others = [view for view in range(len(views)) if view != ROW]
+    for view in others:
+        assert np.nanmean(agreement_map(small, view)) > 0.95
+
+
+def test_the_cameras_that_the_box_is_seen_by_are_its_own() -> None:
+    """The oracle: depth of one view, back-projected, lies on the walls."""
+    cameras = box_cameras(2)
+    depth = look(cameras, 1)[1]
+    pixels = np.stack(np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5), axis=2)
+    points = cameras.unproject(pixels.reshape(-1, 2), depth.reshape(-1).astype(np.float64), 1)
+    nearest = np.abs(np.abs(points) - np.array([2.0, 2.5, 1.4])).min(axis=1)
+    assert nearest.max() < 1e-5
