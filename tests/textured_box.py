@@ -1,9 +1,15 @@
 """A box with blotchy walls and what cameras in it see: exact photographs and depth, with features to match."""
 
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+from PIL import Image
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.types import Cameras, Views
+from gsencoder.types.poses import OPENCV_FROM_OPENGL
 
 HALF = np.array([2.0, 2.5, 1.4])
 """Half of the box's sides, meters; z is up."""
@@ -53,3 +59,31 @@ def box_views(cameras: Cameras | None = None, *, color_cameras: Cameras | None =
         images=[look(colors, view)[0] for view in rows],
         depths=[look(cameras, view)[1] for view in rows],
     )
+
+
+def write_box(folder: Path, views: Views, *, millimeters: float = 1000.0) -> dict[str, Any]:
+    """Writes views as a nerfstudio scene, 16-bit depth in steps of 1 / `millimeters`; returns its transforms.json."""
+    assert views.images is not None
+    assert views.depths is not None
+    for name in ("images", "depth"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    frames = []
+    for view, pose in enumerate(views.cameras.world_from_cam @ OPENCV_FROM_OPENGL):
+        stem = f"{view:03d}.png"
+        Image.fromarray(views.images[view]).save(folder / "images" / stem)
+        steps = np.round(views.depths[view].astype(np.float64) * millimeters).astype(np.uint16)
+        Image.fromarray(steps).save(folder / "depth" / stem)
+        frames.append(
+            {"file_path": f"images/{stem}", "depth_file_path": f"depth/{stem}", "transform_matrix": pose.tolist()}
+        )
+    K = views.cameras.Ks[0].astype(float)
+    content = {
+        "fl_x": K[0, 0],
+        "fl_y": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        "depth_unit_scale_factor": 1 / millimeters,
+        "frames": frames,
+    }
+    (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    return content

@@ -121,12 +121,15 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
 
     assert cli.main(["repair", "a b.ply", "fix=quats,huge", "out=null", "--cfg"]) == 0
     data = OmegaConf.to_container(OmegaConf.create(capsys.readouterr().out))
+    assert isinstance(data, dict)
+    assert data.pop("data")["max_views"] == 0
     assert data == {
         "out": "null",
         "overwrite": False,
         "quiet": False,
         "paths": ["a b.ply"],
         "fix": ["quats", "huge"],
+        "views": 0,
     }
 
 
@@ -139,11 +142,11 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
         (["inspect", "--hepl"], "--hepl: no such flag; did you mean --help?"),
         (["inspect", "--out=x"], "--out=…: no such flag; settings are written out=…"),
         (["inspect", "a.ply", "overwrit=true"], "did you mean overwrite?"),
-        (["inspect"], "SPLAT is missing: splat files"),
+        (["inspect"], "PATH is missing: scenes with posed views, or splats"),
         (["inspect", ""], "a path is empty"),
         (["inspect", "no/such.ply"], "no/such.ply: no such file"),
         (["repair", "a.ply"], "out= is missing"),
-        (["repair", "a.ply", "b.ply", "out=x.ply"], "paths: expected one splat file, got 2"),
+        (["repair", "a.ply", "b.ply", "out=x.ply"], "paths: expected one splat file or scene, got 2"),
         (["repair", "a.ply", "fix=quat", "out=x.ply"], "got 'quat'; did you mean quats?"),
         (["repair", "a.ply", "fix=", "out=x.ply"], "fix: expected the name of a defect, got none"),
         (["inspect", "a.ply", "quiet=x\ny"], "quiet: expected true or false"),

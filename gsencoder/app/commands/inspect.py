@@ -48,13 +48,20 @@ class InspectConfig(CommonConfig):
 def run(config: InspectConfig, summary: Summary) -> None:
     """Reads each splat or scene, prints one table for each, and writes the summary if asked to."""
     screen = console(config.quiet)
+
+    def show(lines: list[Table | str]) -> None:
+        for line in lines:
+            screen.print(line, highlight=False)
+
     if config.out is None:
         for path in _paths(config.paths):
-            _inspect(path, config, summary, None, screen)
+            show(_inspect(path, config, summary, None))
         return
     with output_folder(config.out, overwrite=config.overwrite, summary=summary) as folder:
-        for path in _paths(config.paths):
-            _inspect(path, config, summary, folder, screen)
+        shown = [_inspect(path, config, summary, folder) for path in _paths(config.paths)]
+    # What was written stays, also if nobody reads what is printed.
+    for lines in shown:
+        show(lines)
 
 
 def _paths(given: tuple[str, ...]) -> list[Path]:
@@ -65,20 +72,20 @@ def _paths(given: tuple[str, ...]) -> list[Path]:
     return paths
 
 
-def _inspect(path: Path, config: InspectConfig, summary: Summary, folder: Path | None, screen: Any) -> None:
+def _inspect(path: Path, config: InspectConfig, summary: Summary, folder: Path | None) -> list[Table | str]:
+    """What there is to say about a splat or a scene."""
     if path.exists() and has_views(path):
-        _inspect_scene(path, config, summary, folder, screen)
-        return
+        return _inspect_scene(path, config, summary, folder)
     source = find_splat(path) if path.is_dir() else path
     with summary.step("read"):
         raw = read_raw(source)
     with summary.step("inspect"):
         report = inspect_splat(raw)
     summary.results.setdefault("splats", []).append({"path": str(path), **report.to_dict()})
-    screen.print(report_table(str(path), report))
+    return [report_table(str(path), report)]
 
 
-def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: Path | None, screen: Any) -> None:
+def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: Path | None) -> list[Table | str]:
     # Only scenes need Pillow and, for some depth sensors, torch.
     from gsencoder.app.commands.inspect_scene import (
         check_lines,
@@ -88,8 +95,8 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
         save_check_picture,
         scene_table,
     )
-    from gsencoder.data.check.facts import scene_facts
     from gsencoder.data.check.scene_check import check_scene
+    from gsencoder.data.scene_facts import scene_facts
 
     with summary.step("read"):
         scene = load_scene(path, options=config.data)
@@ -98,18 +105,14 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
         assert posed is not None
     with summary.step("facts"):
         facts = scene_facts(scene, posed, layout)
-    screen.print(scene_table(str(path), facts))
+    lines: list[Table | str] = [scene_table(str(path), facts)]
     results: dict[str, Any] = {"path": str(path), **facts.to_dict()}
     if config.check:
         with summary.step("check"):
             depth, matches = check_scene(scene.views, limit=config.views, track=Progress(quiet=config.quiet))
         findings = findings_of(depth, matches)
-        for line in check_lines(facts, depth, matches):
-            screen.print(line, highlight=False)
-        for finding in findings:
-            screen.print(f"wrong: {finding_line(finding)}", highlight=False)
-        if not findings:
-            screen.print("nothing wrong was seen")
+        lines += check_lines(facts, depth, matches)
+        lines += [f"wrong: {finding_line(finding)}" for finding in findings] or ["nothing wrong was seen"]
         results["check"] = check_results(depth, matches)
         results["findings"] = [
             {"cause": each.cause, "view": each.view, "factor": each.factor, "message": each.message}
@@ -120,6 +123,7 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
             if save_check_picture(folder / picture, scene.views, depth, matches):
                 results["picture"] = picture
     summary.results.setdefault("scenes", []).append(results)
+    return lines
 
 
 def report_table(path: str, report: SplatReport) -> Table:

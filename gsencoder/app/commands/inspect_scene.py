@@ -11,9 +11,9 @@ from rich.table import Table
 from gsencoder.core.even_indices import even_indices
 from gsencoder.data.check.depth_agreement import agreement_map
 from gsencoder.data.check.epipolar import EpipolarCheck
-from gsencoder.data.check.facts import SceneFacts
 from gsencoder.data.check.findings import Finding
 from gsencoder.data.check.scene_check import DepthCheck
+from gsencoder.data.scene_facts import SceneFacts
 from gsencoder.data.seeding.feature_matches import epipolar_distances, fundamental_matrix
 from gsencoder.infer.draw.pictures import contact_sheet, depth_picture
 from gsencoder.types import Views
