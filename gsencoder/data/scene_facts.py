@@ -94,9 +94,7 @@ class SceneFacts:
             "points": self.points,
             "objects": self.objects,
             "metres_per_unit": self.metres_per_unit,
-            "up": None
-            if up is None
-            else {"direction": up.direction.tolist(), "source": up.source, "confidence": up.confidence},
+            "up": None if up is None else up.to_dict(),
             "missing": list(self.missing),
         }
 

@@ -62,6 +62,10 @@ class SceneConfig:
     metres_per_unit: float | None = field(
         default=None, metadata={"help": "meters in a world unit; empty = that of the files"}
     )
+    up: tuple[float, float, float] | None = field(
+        default=None,
+        metadata={"help": "the world's up, three numbers of any length; empty = that of the files, else an estimate"},
+    )
     images: str = field(
         default="", metadata={"help": "folder of the photographs of a COLMAP model; empty = images/ beside the model"}
     )
@@ -90,6 +94,8 @@ class SceneConfig:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name}: expected a positive number, got {value}")
+        if self.up is not None and not 1e-6 < math.hypot(*self.up) < 1e6:
+            raise InputError(f"up: expected three finite numbers that are not all zero, got {list(self.up)}")
         if self.depth_from_color is not None and len(self.depth_from_color) not in (12, 16):
             raise InputError(f"depth_from_color: expected 12 or 16 numbers, got {len(self.depth_from_color)}")
 
@@ -130,7 +136,14 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
             raise InputError(f"{given}: splat= is for scenes with views, and here there are none; give one splat only")
         name = _name_of(root) if root.is_dir() else root.stem
         bare, origin = read_bare_splat(find_splat(root))
-        return Scene(name=name, gaussians=bare, origin=origin, metres_per_unit=options.metres_per_unit, folder=folder)
+        return Scene(
+            name=name,
+            gaussians=bare,
+            origin=origin,
+            metres_per_unit=options.metres_per_unit,
+            up=_unit(options.up),
+            folder=folder,
+        )
     views, origin = make_views(posed, max_views=options.max_views, image_scale=options.image_scale)
     gaussians = load_splat(file_of_scene("splat", splat, folder), origin=origin) if splat is not None else None
     if splat is None:
@@ -144,12 +157,16 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         views=views,
         origin=origin,
         metres_per_unit=options.metres_per_unit or posed.metres_per_unit,
-        up=posed.up,
+        up=posed.up if options.up is None else _unit(options.up),
         objects=read_objects(objects) if beside_transforms and objects.is_file() else (),
         sfm_points=(points - origin).astype(np.float32) if len(points) else None,
         sfm_colors=posed.colors if len(points) else None,
         folder=folder,
     )
+
+
+def _unit(direction: tuple[float, float, float] | None) -> Float64[np.ndarray, "3"] | None:
+    return None if direction is None else np.array(direction) / math.hypot(*direction)
 
 
 def scene_name(path: Path) -> str:

@@ -7,8 +7,8 @@ up directions say which end of the axis is up. Of a bare splat that end is the o
 at an end of the scene is seen, since things stand on floors.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -33,6 +33,8 @@ DIRECTIONS = 4000
 REFINEMENTS = 10
 FLAT = 0.5
 """Gaussians whose thinnest axis is above this share of the middle one have no normal."""
+MIN_CONFIDENCE = 0.1
+"""Below this, surfaces alone say nothing about up."""
 FLOOR_THICKNESS = 0.01
 """Thickness of the slices in which floors are sought, as a share of the scene's extent along up."""
 
@@ -53,6 +55,17 @@ class Up:
     confidence: float
     source: str
     from_cameras: float | None
+
+    def describe(self) -> str:
+        """The direction and how it is known, for people."""
+        direction = ", ".join(f"{value + 0.0:.3f}" for value in self.direction)
+        if self.source == "stated":
+            return f"({direction}), stated"
+        return f"({direction}), estimated from {self.source}, confidence {self.confidence:.2f}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The direction and how it is known, as JSON values."""
+        return {"direction": self.direction.tolist(), "source": self.source, "confidence": self.confidence}
 
 
 def up_of_cameras(cameras: Cameras) -> Float64[np.ndarray, "3"]:
@@ -152,6 +165,15 @@ def up_of_scene(scene: Scene) -> Up | None:
     if surfaces is None and cameras is None:
         return None
     return estimate_up(surfaces, cameras)
+
+
+def with_up(scene: Scene) -> tuple[Scene, Up | None]:
+    """The scene with `up` filled in where its files do not state it, and how it is known; None, and the scene as it
+    is, where nothing says or where the surfaces of a bare splat lean nowhere (`MIN_CONFIDENCE`)."""
+    up = up_of_scene(scene)
+    if up is None or (up.source == "surfaces" and up.confidence < MIN_CONFIDENCE):
+        return scene, None
+    return (scene if scene.up is not None else replace(scene, up=up.direction)), up
 
 
 def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
@@ -53,6 +54,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
         if scene.gaussians is None:
             with one.step("seeds"):
                 scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
+        scene = with_reported_up(scene, one, quiet=config.quiet)
         out = config.out or Path("outputs") / scene.name / "features"
         if len(paths) > 1:
             out = out / scene.name

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
@@ -76,6 +77,7 @@ def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Sce
     if scene.gaussians is None:
         with summary.step("seeds"):
             scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
+    scene = with_reported_up(scene, summary, quiet=config.quiet)
     return with_views(scene, config.orbits, config.fusion.blend)
 
 

@@ -54,16 +54,7 @@ def scene_table(path: str, facts: SceneFacts) -> Table:
     if facts.objects:
         table.add_row("objects", f"{facts.objects:,} with boxes")
     table.add_row("unit", "unknown" if facts.metres_per_unit is None else f"{facts.metres_per_unit:g} m")
-    if facts.up is None:
-        table.add_row("up", "unknown")
-    else:
-        direction = ", ".join(f"{value + 0.0:.3f}" for value in facts.up.direction)
-        source = facts.up.source
-        table.add_row(
-            "up",
-            f"({direction}), "
-            + ("stated" if source == "stated" else f"estimated from {source}, confidence {facts.up.confidence:.2f}"),
-        )
+    table.add_row("up", "unknown" if facts.up is None else facts.up.describe())
     for line in facts.missing:
         table.add_row("missing", line)
     return table

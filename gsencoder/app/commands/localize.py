@@ -12,6 +12,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
+from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.draw.relevancy_views import relevancy_pictures
@@ -46,6 +47,8 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
     words = query_words(config.query, config.queries)
     with summary.step("load"):
         scene = load_features(folder)
+        # Features of earlier versions may lie in a scene whose up nobody estimated.
+        scene, _ = with_up(scene)
         table = load_words(folder, config.words)
     with summary.step("localize"):
         localization = localize(scene, words, table, config.localize, space=config.space or None)
