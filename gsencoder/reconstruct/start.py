@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.photographs import Photographs
@@ -10,7 +9,7 @@ from gsencoder.data.seeding.dense import DenseConfig, DenseSeeds, densify
 from gsencoder.data.seeding.from_photographs import MAX_DENSE_SPACING, seeds_of_photographs
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
 from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
-from gsencoder.types import Gaussians, Scene, Views
+from gsencoder.types import Gaussians, Scene
 
 MEASURED_SOURCES = ("depth", "mesh", "tsdf")
 """Sources of seeds that were measured on surfaces; points of photographs are estimates, and a splat was optimized."""
@@ -38,28 +37,6 @@ class Start:
         return self.source in MEASURED_SOURCES
 
 
-class _Subset(Sequence[Any]):
-    """A lazy sequence of selected entries of another."""
-
-    def __init__(self, items: Sequence[Any], rows: Sequence[int]) -> None:
-        self.items, self.rows = items, rows
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self.items[self.rows[index]]
-
-
-def select_views(views: Views, rows: Sequence[int]) -> Views:
-    """Selected views; pictures are decoded on access."""
-    lazy = {
-        name: None if getattr(views, name) is None else _Subset(getattr(views, name), rows)
-        for name in ("images", "depths", "masks", "instances")
-    }
-    return Views(cameras=views.cameras.select(rows), names=tuple(views.names[row] for row in rows), **lazy)
-
-
 def initial_gaussians(
     scene: Scene,
     photographs: Photographs,
@@ -85,7 +62,7 @@ def initial_gaussians(
     if scene.gaussians is not None:
         return Start(gaussians=scene.gaussians, source="splat")
     assert scene.views is not None
-    views = select_views(scene.views, list(training))
+    views = scene.views.select(training)
     seen = replace(scene, views=views)
     source = choose_source(seen, seeds)
     if source == "photographs":

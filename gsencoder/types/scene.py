@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, UInt8
@@ -45,6 +46,30 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    def select(self, views: Sequence[int] | np.ndarray) -> "Views":
+        """The views of these rows, in that order; files are still read on access."""
+        rows = [int(view) for view in views]
+        lazy = {
+            name: None if (items := getattr(self, name)) is None else _Selected(items, rows)
+            for name in ("images", "depths", "masks", "instances")
+        }
+        return Views(cameras=self.cameras.select(rows), names=tuple(self.names[row] for row in rows), **lazy)
+
+
+class _Selected(Sequence[Any]):
+    """Selected entries of a sequence, each read on access."""
+
+    def __init__(self, items: Sequence[Any], rows: list[int]) -> None:
+        self._items, self._rows = items, rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return _Selected(self._items, self._rows[index])
+        return self._items[self._rows[index]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -90,15 +90,7 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
     """
     rows = _spread_triples(len(views), limit)
     cameras = views.cameras.select(rows).resized(PICTURE_SIZE, enlarge=False)
-    chosen = replace(
-        views,
-        cameras=views.cameras.select(rows),
-        names=tuple(views.names[int(row)] for row in rows),
-        images=_Rows(views.images, rows),
-        masks=None if views.masks is None else _Rows(views.masks, rows),
-        depths=None,
-        instances=None,
-    )
+    chosen = views.select(rows)
     pairs = [(first, second) for first in range(len(rows)) for second in range(first + 1, len(rows))]
     matches = consistent_matches(match_photographs(chosen, cameras, pairs, features=FEATURES, track=track))
     if not matches:
@@ -153,20 +145,6 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
         worst=matches[int(np.argmax(errors))],
         cameras=cameras,
     )
-
-
-class _Rows(Sequence[np.ndarray]):
-    """A lazy sequence of selected entries of another."""
-
-    def __init__(self, items: Sequence[np.ndarray] | None, rows: Int64[np.ndarray, " V"]) -> None:
-        assert items is not None
-        self._items, self._rows = items, rows
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return self._items[int(self._rows[index])]
 
 
 def _spread_triples(count: int, limit: int) -> Int64[np.ndarray, " n"]:
