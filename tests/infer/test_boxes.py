@@ -1,6 +1,7 @@
 """Clusters, boxes and scores: laws, and the clusters of one, two and three points."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsencoder.data.seeding.spacing import scene_spacing
-from gsencoder.infer.localize.boxes import Extents, box_around, cluster, oriented_axes, score_clusters
+from gsencoder.infer.localize.boxes import Extents, box_around, oriented_axes, score_clusters
+from gsencoder.infer.localize.cluster import cluster
 from gsencoder.types import Gaussians
 
 
@@ -68,11 +70,11 @@ def two_groups(rng: np.random.Generator) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("grid_above", [0, 10**9])
+@pytest.mark.parametrize("grid_above", [0, 10**12])
 def test_two_groups_and_a_floater_are_told_apart_on_the_grid_and_without(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, grid_above: int
 ) -> None:
-    monkeypatch.setattr("gsencoder.infer.localize.boxes.MAX_EXACT_POINTS", grid_above)
+    monkeypatch.setattr("gsencoder.infer.localize.cluster.MAX_NEIGHBORS", grid_above)
     labels = cluster(two_groups(rng), 0.2, 3)
     assert len(set(labels[:200])) == 1
     assert len(set(labels[200:300])) == 1
@@ -86,11 +88,41 @@ def test_clusters_on_the_grid_are_those_of_dbscan_on_a_surface(
     centers = rng.random((30, 3)) * 4
     points = (centers[rng.integers(0, 30, 6000)] + rng.normal(0, 0.03, (6000, 3))).astype(np.float32)
     exact = cluster(points, 0.08, 3)
-    monkeypatch.setattr("gsencoder.infer.localize.boxes.MAX_EXACT_POINTS", 0)
+    monkeypatch.setattr("gsencoder.infer.localize.cluster.MAX_NEIGHBORS", 0)
     coarse = cluster(points, 0.08, 3)
     from sklearn.metrics import adjusted_rand_score
 
     assert adjusted_rand_score(exact, coarse) > 0.99
+
+
+def test_clusters_are_those_of_scikit_learn_whichever_library_finds_them(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """open3d does where it can be loaded; scikit-learn is the oracle, and takes its turn elsewhere."""
+    from sklearn.cluster import DBSCAN
+    from sklearn.metrics import adjusted_rand_score
+
+    centers = rng.random((40, 3)) * 4
+    points = (centers[rng.integers(0, 40, 8000)] + rng.normal(0, 0.05, (8000, 3))).astype(np.float32)
+    expected = DBSCAN(eps=0.06, min_samples=5).fit_predict(points.astype(np.float64))
+    assert 20 < expected.max() < 200
+    for library in ("as it is", "none"):
+        if library == "none":
+            monkeypatch.setitem(sys.modules, "open3d", None)
+        labels = cluster(points, 0.06, 5)
+        np.testing.assert_array_equal(labels == -1, expected == -1)
+        assert adjusted_rand_score(labels, expected) > 0.999
+
+
+def test_points_that_crowd_in_few_places_are_clustered_without_their_neighbors(rng: np.random.Generator) -> None:
+    """A million neighbors of each of 100,000 points would take a terabyte."""
+    crowd = rng.normal(0, 0.01, (100_000, 3)).astype(np.float32)
+    points = np.concatenate([crowd, crowd + np.float32(3), np.full((1, 3), 9, np.float32)])
+    labels = cluster(points, 0.5, 3)
+    assert (labels[:100_000] == labels[0]).all()
+    assert (labels[100_000:-1] == labels[100_000]).all()
+    assert labels[0] != labels[100_000]
+    assert labels[-1] == -1
 
 
 def test_nothing_selected_has_no_clusters() -> None:

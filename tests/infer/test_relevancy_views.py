@@ -1,11 +1,18 @@
 """Which views are drawn for a word, and what the pictures are called."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
+import pytest
+import torch
 from splats import random_gaussians
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer.draw.relevancy_views import best_views, relevancy_pictures
 from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.render import blend
+from gsencoder.render.zbuffer import visible_shares
 from gsencoder.types import Cameras, Gaussians, Localization, Scene, Views
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -50,6 +57,54 @@ def test_many_groups_at_once_are_as_one_by_one(rng: np.random.Generator) -> None
     assert together == [best_views(splat, cameras, [group], 3)[0] for group in groups]
 
 
+def test_the_best_views_are_those_of_all_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A depth buffer spares most blends; the oracle blends every view."""
+    splat = random_gaussians(400)
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    centers = 3.0 * np.stack((np.cos(angles), np.sin(angles), 0.2 * np.sin(5 * angles)), axis=1)
+    cameras = looking_cameras(centers, -centers / np.linalg.norm(centers, axis=1, keepdims=True), UP, 40.0, 64, 48)
+    groups = [np.arange(10), np.arange(30, 45), np.arange(100, 190)]
+    worth = np.zeros((24, 3))
+    for view in range(24):
+        blended = blend(splat, cameras.resized(96), view)
+        for column, rows in enumerate(groups):
+            member = np.zeros(400, np.float32)
+            member[rows] = 1
+            worth[view, column] = float(blended.render(torch.from_numpy(member)).mean())
+    counted = []
+
+    def counting(gaussians: Gaussians, *arguments: Any, **options: Any) -> Any:
+        counted.append(len(gaussians))
+        return blend(gaussians, *arguments, **options)
+
+    monkeypatch.setattr("gsencoder.infer.draw.relevancy_views.blend", counting)
+    chosen = best_views(splat, cameras, groups, 3)
+    for column, views in enumerate(chosen):
+        best = np.sort(worth[:, column])[::-1]
+        np.testing.assert_array_equal(worth[views, column], np.sort(worth[views, column])[::-1])
+        assert worth[views, column].sum() > 0.8 * best[:3].sum()
+        assert worth[views[0], column] == best[0]
+    assert len(counted) < 24
+
+
+def test_the_depth_buffer_sees_what_blending_sees() -> None:
+    """Two walls, one behind the other from each side: shares of the pictures, and what hides what."""
+    left, right = wall(-0.5), wall(0.5)
+    splat = splat_of(np.concatenate([left, right]))
+    groups = [np.arange(len(left)), np.arange(len(left), len(splat)), np.zeros(0, np.int64)]
+    cameras = facing(1.0, -1.0)
+    shares = visible_shares(splat, cameras, groups)
+    for view, (seen, hidden) in enumerate(((1, 0), (0, 1))):
+        member = np.zeros(len(splat), np.float32)
+        member[groups[seen]] = 1
+        exact = float(blend(splat, cameras, view).render(torch.from_numpy(member)).mean())
+        assert shares[view, seen] == pytest.approx(exact, rel=0.15)
+        assert shares[view, hidden] < 0.02
+        assert shares[view, 2] == 0
+    clear = replace(splat, opacities=np.full(len(splat), 0.1, np.float32))
+    assert not visible_shares(clear, cameras, groups).any()
+
+
 def test_views_that_show_nothing_come_in_their_own_order() -> None:
     splat = splat_of(wall(50.0))
     cameras = looking_cameras(np.zeros((3, 3)), np.tile([-1.0, 0, 0], (3, 1)), UP, 40.0, 64, 48)
@@ -70,7 +125,7 @@ def test_every_word_gets_its_pictures_with_names_that_any_disk_takes() -> None:
         boxes=(),
     )
     pictures = dict(relevancy_pictures(scene, found, per_word=2))
-    assert list(pictures) == [
+    assert sorted(pictures) == [
         f"{index:02d}_{word}_view{view:03d}" for index, word in enumerate(("a_b_c", "é_", "x" * 60)) for view in (0, 1)
     ]
     assert all(picture.width >= 64 for picture in pictures.values())

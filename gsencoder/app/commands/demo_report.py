@@ -153,7 +153,9 @@ def _colors_of(features: GaussianFeatures) -> PcaColors:
 
 def _answers(report: HtmlReport, scene: Scene, one: TeacherResult) -> None:
     report.section(*TEXTS[one.title])
-    pictures = [np.asarray(picture) for _, picture in relevancy_pictures(scene, one.localization, per_word=1)]
+    # Names begin with the number of the word.
+    named = dict(relevancy_pictures(scene, one.localization, per_word=1))
+    pictures = [np.asarray(named[name]) for name in sorted(named)]
     boxed = {box.query for box in one.localization.boxes}
     captions = [
         f"{word}: IoU {iou:.2f} with the true box" if word in boxed else f"{word}: no box"

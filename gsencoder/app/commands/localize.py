@@ -15,7 +15,6 @@ from gsencoder.core.files.json_values import write_json
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
-from gsencoder.infer.draw.relevancy_views import relevancy_pictures
 from gsencoder.infer.localize.localize import LocalizeConfig, localization_to_json, localize
 from gsencoder.types import Localization
 
@@ -60,6 +59,9 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         write_json(target / "boxes.json", boxes)
         write_boxes_ply(target / "boxes.ply", scene, localization)
         if config.pictures and scene.views is not None:
+            # Drawing needs torch, which finding boxes does without.
+            from gsencoder.infer.draw.relevancy_views import relevancy_pictures
+
             with summary.step("pictures"):
                 for name, picture in relevancy_pictures(scene, localization, per_word=config.pictures):
                     picture.save(target / f"{name}.png")

@@ -221,7 +221,8 @@ def wrong_value(option: Option, value: Any) -> str:
     allowed = [str(word) for word in _words(option.annotation)]
     removed = REMOVED_VALUES.get(f"{option.key}={value}")
     hint = f", which was removed: {removed}" if removed else near(str(value), allowed) if allowed else ""
-    if option.kind == "value" and isinstance(value, str) and "," in value:
+    is_list = any(get_origin(member) is tuple for member in union_members(option.annotation))
+    if is_list and option.kind == "value" and isinstance(value, str) and "," in value:
         hint = f"; a list of numbers stands in brackets: {option.key}=[{value}]"
     meaning = f" ({option.help})" if option.help and not hint else ""
     return f"{option.key}: expected {describe(option.annotation)}, got {value!r}{hint}{meaning}"

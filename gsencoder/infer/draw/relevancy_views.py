@@ -11,8 +11,11 @@ from gsencoder.core.errors import InputError
 from gsencoder.infer.draw.pictures import draw_boxes, relevancy_overlay
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import render_image
+from gsencoder.render.zbuffer import visible_shares
 from gsencoder.types import Cameras, Gaussians, Localization, Scene
 
+SPARE = 4
+"""At least so many views beside the wanted ones are blended before the best are chosen."""
 _SIDE = 96
 """Views are judged at this size, longer side in pixels, which is enough to see who sees what."""
 
@@ -23,18 +26,25 @@ def best_views(
     """For each group of Gaussians the `count` views that show the most of it, best first.
 
     A view's worth is the share of its picture that the group's rows fill, by their blending weights: what hides them
-    counts.
+    counts. It is estimated for all views by a depth buffer, and blended for those that may be among the best: for each
+    group the first `count` and as many again, or four. A group that the depth buffer shows in fewer than `count` views
+    is blended in all of them.
     """
     small = cameras.resized(_SIDE)
+    estimates = visible_shares(gaussians, small, groups)
     chosen = np.zeros((len(gaussians), len(groups)), np.float32)
     for column, rows in enumerate(groups):
         chosen[rows, column] = 1
     members = torch.from_numpy(chosen)
-    visible_share = np.array(
-        [blend(gaussians, small, view).render(members).mean(dim=0).numpy() for view in range(len(cameras))]
-    )
+    order = np.argsort(-estimates, axis=0, kind="stable")
+    few = (estimates > 0).sum(axis=0) < min(count, len(cameras))
+    candidates = order if few.any() else order[: count + max(count, SPARE)]
+    # Views that nobody looks at come after all others.
+    worth = np.full(estimates.shape, -1.0)
+    for view in np.unique(candidates):
+        worth[view] = blend(gaussians, small, int(view)).render(members).mean(dim=0).numpy()
     # A stable sort of negated values: of equal views the first.
-    return [order[:count].tolist() for order in np.argsort(-visible_share, axis=0, kind="stable").T]
+    return [views[:count].tolist() for views in np.argsort(-worth, axis=0, kind="stable").T]
 
 
 def relevancy_pictures(
@@ -53,7 +63,7 @@ def relevancy_pictures(
         config: accuracy of the rendering.
 
     Yields:
-        A name (word and view, safe for a file) and the picture.
+        A name (word and view, safe for a file) and the picture, view by view.
 
     Raises:
         InputError: the scene has no Gaussians or no cameras.
@@ -69,15 +79,17 @@ def relevancy_pictures(
         )
     ]
     chosen = best_views(scene.gaussians, cameras, groups, per_word)
-    for index, word in enumerate(localization.queries):
-        boxes = boxes_of[word]
-        for view in chosen[index]:
-            b = blend(scene.gaussians, cameras, view, config=config)
-            rgb = render_image(scene.gaussians, cameras, view, blended=b)
-            scores = torch.from_numpy(np.nan_to_num(localization.relevancy[index], nan=0.0))
-            heat = b.render(scores).reshape(b.shape).numpy()
-            picture = relevancy_overlay(rgb, heat)
-            pose, K = cameras.cam_from_world[view], cameras.Ks[view]
-            picture = draw_boxes(picture, boxes, pose, K, origin=scene.origin)
+    # Each view is looked at once, for all words that want it.
+    for view in sorted({view for views in chosen for view in views}):
+        b = blend(scene.gaussians, cameras, view, config=config)
+        rgb = render_image(scene.gaussians, cameras, view, blended=b)
+        pose, K = cameras.cam_from_world[view], cameras.Ks[view]
+        wanted = [index for index, views in enumerate(chosen) if view in views]
+        scores = torch.from_numpy(np.nan_to_num(localization.relevancy[wanted].T, nan=0.0))
+        heats = b.render(scores).numpy()
+        for column, index in enumerate(wanted):
+            word = localization.queries[index]
+            picture = relevancy_overlay(rgb, heats[:, column].reshape(b.shape))
+            picture = draw_boxes(picture, boxes_of[word], pose, K, origin=scene.origin)
             safe = "".join(c if c.isalnum() else "_" for c in word)[:60]
             yield f"{index:02d}_{safe}_view{view:03d}", Image.fromarray(picture)

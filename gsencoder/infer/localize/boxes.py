@@ -6,39 +6,14 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64, Integer
+from jaxtyping import Float, Float64, Int64, Integer
 
 from gsencoder.types import Gaussians
 from gsencoder.types.poses import perpendicular
 
 Extent = Literal["means", "sigma"]
-MAX_EXACT_POINTS = 50_000
-"""Above this number of points, clusters are computed on a grid of eps / 4."""
 EMPTY_EXTENT = 1e-5
 """Share of the largest extent below which a direction counts as empty (float32 coordinates are good to 1e-7)."""
-
-
-def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) -> Int64[np.ndarray, " n"]:
-    """DBSCAN labels (Ester et al. 1996), −1 = noise.
-
-    scikit-learn keeps the neighbors of every point, which on a dense splat grows with the square of the density.
-    Above 50,000 points the occupied cells of a grid of eps / 4 are therefore clustered instead, each weighted by its
-    number
-    of points, and points take the label of their cell: distances are then off by up to 0.43 eps.
-    """
-    from sklearn.cluster import DBSCAN
-
-    if len(points) == 0:
-        return np.zeros(0, np.int64)
-    local = points.astype(np.float64) - points.min(axis=0)
-    if len(points) <= MAX_EXACT_POINTS:
-        return DBSCAN(eps=eps, min_samples=min_samples).fit_predict(local).astype(np.int64)
-    cells = np.floor(local * (4 / eps))
-    _, cell_of, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    cell_of = cell_of.ravel()
-    centers = np.stack([np.bincount(cell_of, local[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
-    labels = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(centers, sample_weight=counts)
-    return labels[cell_of].astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

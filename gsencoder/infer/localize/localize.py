@@ -11,7 +11,8 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.spacing import scene_spacing
-from gsencoder.infer.localize.boxes import box_around, cluster, score_clusters
+from gsencoder.infer.localize.boxes import box_around, score_clusters
+from gsencoder.infer.localize.cluster import cluster
 from gsencoder.infer.localize.relevancy import ThresholdConfig, relevancy, threshold
 from gsencoder.text.encoder import TextEncoder, check_space
 from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scene
@@ -96,7 +97,7 @@ def localize(
 
     Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
     score that `gsencoder.infer.localize.boxes.score_clusters` defines. Axis-aligned and oriented boxes are drawn
-    around Gaussian means, with `config.margin` spacings on every side, unless `config.extent` says "sigma", and have
+    around Gaussian means, unless `config.extent` says "sigma", and have
     the scene's origin added back in float64. A word's boxes do not depend on the other queries, unless
     `config.contrast` is on.
 
