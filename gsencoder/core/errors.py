@@ -12,6 +12,10 @@ class InputError(ValueError):
     """A file, option or array given by the user cannot be used; the message says why and what to do."""
 
 
+class BusyError(InputError):
+    """Another run is writing what this one was to write."""
+
+
 class SceneWarning(UserWarning):
     """Something in the input was left out or estimated; the message counts it and says how."""
 

@@ -203,7 +203,7 @@ def _name_of(folder: Path) -> str:
 
 
 def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
-    """The scenes at paths: a path is a scene, or a folder of scenes, which are sorted by name.
+    """The scenes at paths: a path is a scene, a folder of scenes, which are sorted by name, or a list of paths (.txt).
 
     A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched. A scene
     that is named twice, also by different paths, is returned once.
@@ -212,7 +212,7 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
         InputError: a path does not exist, or a folder holds no scene.
     """
     scenes: dict[Path, Path] = {}
-    for given in map(Path, paths):
+    for given in listed_paths(paths):
         try:
             if not given.exists():
                 raise InputError(f"{given}: no such file or folder")
@@ -228,6 +228,33 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
         for path in inside:
             scenes.setdefault(path.resolve(), path)
     return tuple(scenes.values())
+
+
+def listed_paths(paths: Iterable[str | Path]) -> list[Path]:
+    """Paths, with those in list files in place of the files: text files (.txt) with one path a line, relative to the
+    file; blank lines and those that begin with # are left out.
+
+    Raises:
+        InputError: a list cannot be read, or is empty.
+    """
+    result: list[Path] = []
+    for given in map(Path, paths):
+        try:
+            is_list = given.suffix.lower() == ".txt" and given.is_file()
+        except (OSError, ValueError):
+            is_list = False
+        if not is_list:
+            result.append(given)
+            continue
+        try:
+            lines = given.read_text(encoding="utf-8-sig").splitlines()
+        except (OSError, ValueError) as error:
+            raise InputError(f"{given}: not a readable list of scenes ({type(error).__name__})") from error
+        names = [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
+        if not names:
+            raise InputError(f"{given}: lists no scene; expected one path a line")
+        result += [given.parent / name for name in names]
+    return result
 
 
 def is_scene(path: Path) -> bool:

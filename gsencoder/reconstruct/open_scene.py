@@ -2,12 +2,13 @@
 
 import os
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed
 from gsencoder.core.runtime.clock import Clock
-from gsencoder.data.scenes import SceneConfig, find_scenes, is_scene, load_scene
+from gsencoder.data.scenes import SceneConfig, find_scenes, is_scene, listed_paths, load_scene
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
 from gsencoder.reconstruct.sfm import PLACED_FILE, Placed, SfmConfig, load_placement, photographs_in, place_photographs
 from gsencoder.types import Scene
@@ -32,6 +33,30 @@ class OpenedScene:
     seconds: dict[str, float]
 
 
+def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
+    """What can be reconstructed at paths: scenes, folders of photographs alone, those in folders of such, and those
+    that a list (.txt) names.
+
+    Raises:
+        InputError: a path does not exist, or holds nothing of the kind.
+    """
+    chosen: dict[Path, Path] = {}
+    for given in listed_paths(paths):
+        inside = [given]
+        if given.is_dir() and not is_scene(given) and _pictures_of(given) is None:
+            entries = sorted(entry for entry in given.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+            inside = [entry for entry in entries if is_scene(entry) or _pictures_of(entry) is not None]
+        # Of a path that holds nothing `find_scenes` says what was expected.
+        for path in inside or find_scenes([given]):
+            chosen.setdefault(path.resolve(), path)
+    return tuple(chosen.values())
+
+
+def _pictures_of(path: Path) -> Path | None:
+    """The folder of the photographs of a scene: itself, or its folder images."""
+    return next((folder for folder in (path, path / "images") if folder.is_dir() and photographs_in(folder)), None)
+
+
 def open_scene(
     path: Path, work: Path, *, splat: str = "", data: SceneConfig = SceneConfig(), sfm: SfmConfig = SfmConfig()
 ) -> OpenedScene:
@@ -51,7 +76,7 @@ def open_scene(
         SceneWarning: photographs that could not be placed.
     """
     clock = Clock()
-    pictures = next((folder for folder in (path, path / "images") if folder.is_dir() and photographs_in(folder)), None)
+    pictures = _pictures_of(path)
     # A folder of photographs may also hold scenes of others, or the results of a run: the photographs are meant.
     scenes = [] if pictures is not None and not is_scene(path) else find_scenes([path])
     if len(scenes) > 1:

@@ -6,11 +6,12 @@ from pathlib import Path
 from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import about
 from gsencoder.core.runtime.heap import retain_freed_memory
-from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
@@ -34,6 +35,10 @@ class EncodeCommandConfig(CommonConfig):
         metadata={"help": "folder or file written by `train` or `export`, or the name of shipped weights"},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
+    worker: int = field(
+        default=0,
+        metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
+    )
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     encode: EncodeConfig = field(default_factory=EncodeConfig)
@@ -43,27 +48,34 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     """Encodes one scene into out=, or each of several into the folder OUT/NAME."""
     retain_freed_memory()
     paths = find_scenes(config.paths)
-    check_names(paths)
     with summary.step("weights"):
         encoder = load_encoder(config.weights, config.encode.device)
     screen = console(config.quiet)
-    for path in paths:
-        one = summary if len(paths) == 1 else Summary(summary.command, summary.settings)
-        with one.step("load"):
-            scene = load_scene(path, splat=config.splat or None, options=config.data)
-        if scene.gaussians is None:
-            with one.step("seeds"):
-                scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
-        scene = with_reported_up(scene, one, quiet=config.quiet)
-        out = config.out or Path("outputs") / scene.name / "features"
-        if len(paths) > 1:
-            out = out / scene.name
+
+    def run_one(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
+            with one.step("load"):
+                scene = load_scene(path, splat=config.splat or None, options=config.data)
+            if scene.gaussians is None:
+                with one.step("seeds"):
+                    scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
+            scene = with_reported_up(scene, one, quiet=config.quiet)
             with about(scene.name):
                 _encode_into(folder, scene, encoder, config, one)
             if encoder.words is not None:
                 save_text_table(folder / WORDS_FILE, encoder.words)
         screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
+
+    run_scenes(
+        paths,
+        config.out,
+        "features",
+        run_one,
+        summary,
+        overwrite=config.overwrite,
+        worker=config.worker,
+        screen=screen,
+    )
 
 
 def _encode_into(

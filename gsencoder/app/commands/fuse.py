@@ -9,10 +9,11 @@ import numpy as np
 from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.data.check.scene_check import warn_of_faults
-from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
@@ -34,6 +35,10 @@ class FuseCommandConfig(CommonConfig):
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
     orbits: int = field(default=24, metadata={"help": "number of cameras placed around a splat without views"})
+    worker: int = field(
+        default=0,
+        metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
+    )
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
@@ -46,17 +51,13 @@ class FuseCommandConfig(CommonConfig):
 def run(config: FuseCommandConfig, summary: Summary) -> None:
     """Fuses one scene into out=, or each of several into the folder OUT/NAME."""
     paths = find_scenes(config.paths)
-    check_names(paths)
     with summary.step("teacher"):
         words = text_table_of(config.teacher)
     screen = console(config.quiet)
-    for path in paths:
-        one = summary if len(paths) == 1 else Summary(summary.command, summary.settings)
-        scene = load_fusable(path, config, one)
-        out = config.out or Path("outputs") / scene.name / "features"
-        if len(paths) > 1:
-            out = out / scene.name
+
+    def run_one(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
+            scene = load_fusable(path, config, one)
             fusion = fuse_scene(scene, config.teacher, words, config, one, out)
             write_features(folder, scene, fusion, words, config, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
@@ -66,6 +67,17 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             f"(rank {one.results['rank']}, keeps {one.results['energy_kept']:.4f} of the energy), "
             f"from {one.results['views']} views"
         )
+
+    run_scenes(
+        paths,
+        config.out,
+        "features",
+        run_one,
+        summary,
+        overwrite=config.overwrite,
+        worker=config.worker,
+        screen=screen,
+    )
 
 
 def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Scene:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
@@ -19,7 +19,7 @@ from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats import READABLE, save_splat
 from gsencoder.infer.draw.pictures import contact_sheet
-from gsencoder.reconstruct.open_scene import open_scene
+from gsencoder.reconstruct.open_scene import find_photographed, open_scene
 from gsencoder.reconstruct.run import Comparison, LogRow, ReconstructConfig, describe, reconstruct
 from gsencoder.reconstruct.score import Score
 from gsencoder.reconstruct.sfm import SfmConfig
@@ -34,7 +34,7 @@ class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
     paths: tuple[str, ...] = field(
         default=(),
         metadata={
-            "help": "a scene with photographs and poses, or a folder of photographs alone",
+            "help": "scenes with photographs and poses, folders of photographs alone, or folders of these",
             "metavar": "SCENE",
             "required": True,
         },
@@ -42,21 +42,36 @@ class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
     splat: str = field(default="", metadata={"help": f"Gaussians to refine; empty = seeds. {READABLE}"})
     resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
     device: Device = field(default="auto", metadata={"help": "where to compute; on CUDA gsplat rasterizes"})
+    worker: int = field(
+        default=0,
+        metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
+    )
     data: SceneConfig = field(default_factory=SceneConfig)
     sfm: SfmConfig = field(default_factory=SfmConfig)
 
     def __post_init__(self) -> None:
         ReconstructConfig.__post_init__(self)
-        if len(self.paths) > 1:
-            raise InputError(f"paths: expected one scene, got {len(self.paths)}")
 
 
 def run(config: ReconstructCommandConfig, summary: Summary) -> None:
-    """Reads a scene or registers photographs, reconstructs, and writes splat, log and pictures into out=."""
+    """Reconstructs one scene into out=, or each of several into the folder OUT/NAME."""
     retain_freed_memory()
     choose_device(config.device)  # A missing device is an error before anything is read.
-    path, screen = Path(config.paths[0]), console(config.quiet)
-    out = config.out or Path("outputs") / (path.resolve().name or "scene") / "reconstruction"
+    run_scenes(
+        find_photographed(config.paths),
+        config.out,
+        "reconstruction",
+        lambda path, out, one: _reconstruct_one(path, out, config, one),
+        summary,
+        overwrite=config.overwrite,
+        worker=config.worker,
+        screen=console(config.quiet),
+    )
+
+
+def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, summary: Summary) -> None:
+    """Reads a scene or registers photographs, reconstructs, and writes splat, log and pictures into `out`."""
+    screen = console(config.quiet)
     target = Path(os.path.realpath(out))
     with (
         WorkFolder(target.with_name(f"{target.name}.reconstruction")) as work,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.app.runs.summary import SUMMARY_NAME, Summary
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import is_full_disk, lock_folder
 from gsencoder.core.files.json_values import json_bytes, write_bytes
 
@@ -45,7 +45,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         target.parent.mkdir(parents=True, exist_ok=True)
         partial, lock = _begin(target)
     except BlockingIOError:
-        raise InputError(f"{path}: another run is writing this folder now; wait for it or give another out=") from None
+        raise BusyError(f"{path}: another run is writing this folder now; wait for it or give another out=") from None
     except FileExistsError as error:
         raise InputError(f"{path}: {error.filename} is a file, so no folder can be made in it") from error
     except OSError as error:

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 from types import TracebackType
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import atomic_file, lock_folder
 
 MARKER_FILE = "unfinished.txt"
@@ -52,7 +52,7 @@ class WorkFolder:
             try:
                 self._descriptor = lock_folder(self.path)
             except BlockingIOError:
-                raise InputError(
+                raise BusyError(
                     f"{self.path}: another run saves its state here now; wait for it or give another out="
                 ) from None
             if anew:

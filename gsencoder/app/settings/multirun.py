@@ -49,7 +49,9 @@ def _job(composed: Any, *, cls: type[CommonConfig], run: Callable[[Any], int], s
     if not config.quiet:
         values = [text for text in job.overrides.task if text.partition("=")[0] in swept]
         print(one_line(f"run {job.job.num}: {' '.join(values)}"), file=sys.stderr)
-    return run(replace(config, out=config.out / str(job.job.num)))
+    # Workers share the scenes of one output folder.
+    shared = set(swept) == {"worker"}
+    return run(config if shared else replace(config, out=config.out / str(job.job.num)))
 
 
 def run_many(

@@ -1,0 +1,153 @@
+"""Many scenes in one command: what is finished is skipped, what fails waits for the end, and processes share."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from textured_box import box_cameras, box_views, write_box
+
+from gsencoder.app import cli
+from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.scene_queue import run_scenes
+from gsencoder.app.runs.summary import Summary
+from gsencoder.core.errors import BusyError, InputError
+from gsencoder.data.scenes import find_scenes, listed_paths
+from gsencoder.reconstruct.open_scene import find_photographed
+
+SETTINGS = {"voxel": 0.02, "paths": ["a"], "out": "somewhere", "quiet": False}
+
+
+class Work:
+    """A command that writes the name of a scene, and fails where it is asked to."""
+
+    def __init__(self, *failing: str, busy: str = "") -> None:
+        self.failing, self.busy, self.done = failing, busy, list[str]()
+
+    def __call__(self, path: Path, out: Path, summary: Summary) -> None:
+        if path.name == self.busy:
+            raise BusyError(f"{out}: another run is writing this folder now")
+        with output_folder(out, summary=summary) as folder:
+            if path.name in self.failing:
+                raise InputError(f"{path}: no photographs")
+            (folder / "name.txt").write_text(path.name)
+        self.done.append(path.name)
+
+
+def queue(tmp_path: Path, work: Work, names: str = "abcd", **options: Any) -> None:
+    settings = SETTINGS | options.pop("settings", {})
+    options = {"overwrite": False, "worker": 0} | options
+    paths = [tmp_path / "scenes" / name for name in names]
+    for path in paths:
+        path.mkdir(parents=True, exist_ok=True)
+    summary = Summary("fuse", settings)
+    run_scenes(paths, tmp_path / "out", "features", work, summary, screen=console(), **options)
+
+
+def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = Work("b", "d")
+    with pytest.raises(InputError, match=r"2 of 4 scenes failed.*tries them again: .*/b: .*no photographs; .*/d: "):
+        queue(tmp_path, first)
+    assert first.done == ["a", "c"]
+    assert "failed: " in capsys.readouterr().err
+    second = Work()
+    queue(tmp_path, second, settings={"quiet": True, "out": "elsewhere"})
+    assert second.done == ["b", "d"]
+    assert "2 of 4 scenes were finished before" in capsys.readouterr().out
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == list("abcd")
+
+
+def test_results_of_other_settings_are_neither_taken_nor_replaced(tmp_path: Path) -> None:
+    queue(tmp_path, Work())
+    other = Work()
+    with pytest.raises(InputError, match=r"4 of 4 scenes failed.*results of other settings \(voxel\)"):
+        queue(tmp_path, other, settings={"voxel": 0.01})
+    assert other.done == []
+    again = Work()
+    (tmp_path / "out" / "b" / "summary.json").write_text("{")
+    with pytest.raises(InputError, match=r"1 of 4 scenes failed.*summary.json: cannot be read"):
+        queue(tmp_path, again)
+
+
+def test_workers_begin_at_different_scenes_and_leave_alone_what_another_one_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    firsts = []
+    for worker in range(4):
+        work = Work()
+        queue(tmp_path / str(worker), work, worker=worker)
+        assert sorted(work.done) == list("abcd")
+        firsts.append(work.done[0])
+    assert len(set(firsts)) >= 3
+    shared = Work(busy="b")
+    queue(tmp_path / "shared", shared)
+    assert shared.done == ["a", "c", "d"]
+    assert "another run is writing it now" in capsys.readouterr().out
+
+
+def test_a_scene_that_another_process_finished_meanwhile_is_no_failure(tmp_path: Path) -> None:
+    class Late(Work):
+        def __call__(self, path: Path, out: Path, summary: Summary) -> None:
+            with output_folder(out, summary=summary):
+                pass
+            super().__call__(path, out, summary)
+
+    late = Late()
+    queue(tmp_path, late)
+    assert late.done == []
+
+
+def test_a_list_names_scenes_whatever_wrote_its_lines(tmp_path: Path) -> None:
+    for name in ("one", "two words"):
+        write_box(tmp_path / name, box_views(box_cameras(2, width=32, height=24, focal=22.0)))
+    text = "\ufeff# scenes\r\none\r\n\r\n\ttwo words \r\n"
+    (tmp_path / "list.txt").write_bytes(text.encode())
+    expected = (tmp_path / "one", tmp_path / "two words")
+    assert find_scenes([tmp_path / "list.txt"]) == expected
+    assert find_photographed([str(tmp_path / "list.txt")]) == expected
+    (tmp_path / "list.txt").write_text("# nothing\n\n")
+    with pytest.raises(InputError, match="lists no scene"):
+        listed_paths([tmp_path / "list.txt"])
+    (tmp_path / "list.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="not a readable list"):
+        listed_paths([tmp_path / "list.txt"])
+    (tmp_path / "list.txt").write_text("three\n")
+    with pytest.raises(InputError, match="three: no such file"):
+        find_scenes([tmp_path / "list.txt"])
+
+
+def test_folders_of_photographs_alone_are_reconstructed_beside_scenes(tmp_path: Path) -> None:
+    from PIL import Image
+
+    write_box(tmp_path / "all" / "scene", box_views(box_cameras(2, width=32, height=24, focal=22.0)))
+    for name in ("plain", "nested/images"):
+        (tmp_path / "all" / name).mkdir(parents=True)
+        Image.new("RGB", (8, 6)).save(tmp_path / "all" / name / "a.jpg")
+    (tmp_path / "all" / "notes").mkdir()
+    chosen = find_photographed([str(tmp_path / "all"), str(tmp_path / "all" / "plain")])
+    assert [path.name for path in chosen] == ["nested", "plain", "scene"]
+
+
+def test_a_broken_scene_does_not_stop_the_others_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("one", "two"):
+        write_box(tmp_path / "scenes" / name, box_views(box_cameras(3, width=64, height=48, focal=45.0)))
+    broken = tmp_path / "scenes" / "one" / "transforms.json"
+    good = broken.read_text()
+    broken.write_text(good.replace("file_path", "path"))
+    command = ["fuse", str(tmp_path / "scenes"), "teacher=palette", f"out={tmp_path / 'out'}", "worker=0"]
+    assert cli.main(command) == 2
+    assert "1 of 2 scenes failed" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["two"]
+    broken.write_text(good)
+    before = (tmp_path / "out" / "two" / "summary.json").stat().st_mtime_ns
+    # Two workers in one command, of which the second has nothing left to do.
+    assert cli.main([*command[:-1], "-m", "worker=0,1"]) == 0
+    assert "2 of 2 scenes were finished before" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"one", "two"}
+    assert (tmp_path / "out" / "two" / "summary.json").stat().st_mtime_ns == before
+    assert json.loads((tmp_path / "out" / "one" / "summary.json").read_text())["results"]["views"] == 3
