@@ -180,6 +180,8 @@ def _missing(scene: Scene, up: Up | None) -> tuple[str, ...]:
         missing.append("depth and points: seeds are triangulated from the photographs")
     elif views.depths is None:
         missing.append("depth: visibility is tested against rendered depth, and seeds come from the points")
+    if len(views) > 1 and not np.ptp(views.cameras.centers, axis=0).any():
+        missing.append("baselines: all cameras stand in one place, so that photographs alone say nothing about depth")
     if scene.metres_per_unit is None:
         missing.append("unit of length: sizes are in world units (metres_per_unit=)")
     if up is None or up.source != "stated":

@@ -391,6 +391,8 @@ def _any(paths: Sequence[Path | None]) -> bool:
 def _check_sizes(image: PosedImage, depth_camera: CameraModel, where: str) -> bool:
     """Checks the sizes in the headers of the files; returns whether the photograph has transparency."""
     camera = image.camera
+    if image.depth is not None and image.depth == image.image:
+        raise InputError(f"{where}: {image.image} is listed as photograph and as depth image; list the photograph")
     size, transparent = picture_info(image.image)
     if size != (camera.width, camera.height):
         raise InputError(

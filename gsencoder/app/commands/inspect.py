@@ -112,7 +112,9 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
             depth, matches = check_scene(scene.views, limit=config.views, track=Progress(quiet=config.quiet))
         findings = findings_of(depth, matches)
         lines += check_lines(facts, depth, matches)
-        lines += [f"wrong: {finding_line(finding)}" for finding in findings] or ["nothing wrong was seen"]
+        lines += [f"wrong: {finding_line(finding)}" for finding in findings]
+        if not findings and (depth is not None or matches is not None):
+            lines.append("nothing wrong was seen")
         results["check"] = check_results(depth, matches)
         results["findings"] = [
             {"cause": each.cause, "view": each.view, "factor": each.factor, "message": each.message}

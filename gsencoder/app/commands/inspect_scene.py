@@ -70,7 +70,8 @@ def check_lines(facts: SceneFacts, depth: DepthCheck | None, matches: EpipolarCh
             lines.append(
                 f"depth of {len(depth.views)} of {facts.views:,} views carried into each other: {given.share:.0%} "
                 "agree "
-                f"within 2 % where seen ({given.compared:,} comparisons); median offset {given.offset:+.2%}"
+                f"within 2 % where seen ({given.compared:,} comparisons); median offset "
+                f"{_percent(given.offset, sign=True)}"
             )
             lines.append(f"median offset of neighbors {_percent(near)}, of views far apart {_percent(far)}")
         else:
@@ -97,8 +98,10 @@ def check_lines(facts: SceneFacts, depth: DepthCheck | None, matches: EpipolarCh
     return lines
 
 
-def _percent(value: float) -> str:
-    return f"{value:.2%}" if np.isfinite(value) else "unknown"
+def _percent(value: float, *, sign: bool = False) -> str:
+    if not np.isfinite(value):
+        return "unknown"
+    return f"{value:+.2%}" if sign else f"{value:.2%}"
 
 
 def finding_line(finding: Finding) -> str:

@@ -20,7 +20,8 @@ class Finding:
     """Something that is wrong.
 
     Attributes:
-        cause: a key of `ADVICE`, "color registration", "stray view", "other picture" or "unknown".
+        cause: a key of `ADVICE`, "color registration", "stray view", "other picture", "photographs" or
+            "unknown".
         message: for people.
         view: name of the view, if it is one alone.
         factor: of the depth scale or a focal length, or how many places the poses are moved by, where the cause has

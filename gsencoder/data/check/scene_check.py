@@ -28,7 +28,7 @@ BETTER = 0.95
 """Another reading of the files is named if its spread is below this share of the files' own."""
 SMALLEST_FACTOR = 1.015
 """Factors nearer to one are within what sensors are calibrated to."""
-UNFIT = 0.3
+UNFIT = 0.5
 """If a smaller share of the depth agrees under every reading, poses and depth do not belong together."""
 CLEAR = 0.7
 """Where the files' own reading compares nothing, another one is named if this share agrees under it."""
@@ -40,10 +40,17 @@ SUSPECTS = 8
 """So many views, those that fit worst, are tried to be moved."""
 OTHER_PICTURE = 0.8
 """A view whose colors correlate with the others' by less than this share of the median shows something else."""
+UNRELATED = 0.3
+"""Photographs whose colors correlate by less than this across views show something else than the depth."""
 SAME_FACTOR = 0.03
 """Depth and photographs whose focal lengths are off by factors this near to each other share one wrong camera."""
 SUSPICIOUS = 0.9
 """`suspicious_depth` looks for the cause where a smaller share of the depth agrees."""
+
+
+UNRELATED_MESSAGE = (
+    "the photographs do not show what the depth does: colors at the same places correlate by {color:.2f} across views"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -111,8 +118,9 @@ def warn_of_faults(scene: Scene) -> None:
         return
     _, finding = suspicious_depth(views)
     if finding is not None:
+        mends = "" if finding.cause == "unknown" else ", and gsencoder repair can mend it"
         warnings.warn(
-            f"scene {scene.name}: {finding.message}; gsencoder inspect says more, and gsencoder repair can mend it",
+            f"scene {scene.name}: {finding.message}; gsencoder inspect says more{mends}",
             SceneWarning,
             stacklevel=2,
         )
@@ -146,7 +154,12 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
         correlation = view_correlations(color_correlations(best.views, grey, Ks))
         if np.isfinite(correlation).any():
             color = float(np.nanmedian(correlation))
-            other = _other_pictures(correlation, color, names, {str(finding.view) for finding in stray})
+            excluded = {str(finding.view) for finding in stray}
+            other = (
+                _other_pictures(correlation, color, names, excluded)
+                if color >= UNRELATED
+                else [Finding(cause="photographs", message=UNRELATED_MESSAGE.format(color=color))]
+            )
     return DepthCheck(
         views=chosen,
         given=given.agreement,

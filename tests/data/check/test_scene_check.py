@@ -199,6 +199,26 @@ def test_views_from_one_place_are_no_fault() -> None:
     assert check_matches(replace(box_views(tripod), depths=None)).findings == ()
 
 
+def test_photographs_of_something_else_are_one_finding(box: Views) -> None:
+    made = np.random.default_rng(0)
+    assert box.images is not None
+    noise = [made.integers(0, 255, image.shape, np.uint8) for image in box.images]
+    check = check_depth(replace(box, images=noise))
+    assert [(finding.cause, finding.view) for finding in check.findings] == [("photographs", None)]
+
+
+def test_poses_that_stand_in_one_place_but_do_not_fit_have_no_cause(box: Views) -> None:
+    def together(poses: np.ndarray) -> np.ndarray:
+        poses = poses.copy()
+        poses[:, :3, 3] = 0
+        return poses
+
+    check = check_depth(with_poses(box, together))
+    assert [finding.cause for finding in check.findings] == ["unknown"]
+    with pytest.warns(SceneWarning, match="inspect says more$"):
+        warn_of_faults(Scene(name="box", views=with_poses(box, together)))
+
+
 def test_a_quick_look_warns_of_what_the_check_names(box: Views) -> None:
     assert suspicious_depth(box)[1] is None
     wrong = POSE_FAULTS["axes"](box)
