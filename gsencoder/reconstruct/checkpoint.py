@@ -83,6 +83,9 @@ def load_state(
     """
     with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
         earlier = without_removed_options(file.value("settings", dict))
+        if "budget" not in earlier:
+            # Runs of earlier versions had none, and took the steps of their settings.
+            settings = {name: value for name, value in settings.items() if name != "budget"}
         if earlier != settings:
             raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
         step, adam_steps = file.value("step", int), file.value("adam_steps", int)

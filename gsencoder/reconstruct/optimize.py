@@ -246,6 +246,15 @@ class Optimizer:
                     f"{self.photographs.names[view]!r}; lower the learning rates, or look at this photograph"
                 )
 
+    def look(self, view: int, photo: ScaledPhotograph) -> Raster:
+        """A view as the next step would render it, differentiable; nothing changes."""
+        return self._look(view, photo, self.config.degree_at(self.step))[0]
+
+    def rows_seen(self, view: int) -> int:
+        """Number of Gaussians that may show in a view."""
+        pose, _ = camera_of(self.photographs.cameras, view, self.device)
+        return len(self._rows(pose, self.photographs.at_scale(view)))
+
     def gaussians(self) -> Gaussians:
         """The splat as it is now."""
         return gaussians_of(self.raw)

@@ -5,7 +5,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,6 +26,7 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.anchor import anchor_at
+from gsencoder.reconstruct.budget import BudgetConfig, measured_seconds, plan_steps, wanted_steps
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
@@ -55,6 +56,7 @@ class ReconstructConfig:
     seeds: SeedConfig = field(default_factory=SeedConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
     optimize: OptimizeConfig = field(default_factory=OptimizeConfig)
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
     prune: PruneConfig = field(default_factory=PruneConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
 
@@ -67,7 +69,7 @@ class ReconstructConfig:
 
     def identity(self) -> dict[str, Any]:
         """The settings that an interrupted run must share with the run that continues it, as JSON values."""
-        names = ("seeds", "dense", "optimize", "prune", "raster", "holdout")
+        names = ("seeds", "dense", "optimize", "budget", "prune", "raster", "holdout")
         return {name: plain(getattr(self, name)) for name in names}
 
 
@@ -157,7 +159,8 @@ def reconstruct(
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
         chosen_device, checkpoint = choose_device(device), folder / CHECKPOINT_FILE
         if continued := os.path.lexists(checkpoint):
-            shape = {"steps": config.optimize.steps, "sh_degree": config.optimize.sh_degree}
+            most = max(config.optimize.steps, wanted_steps(config.budget.minutes, config.optimize))
+            shape = {"steps": most, "sh_degree": config.optimize.sh_degree}
             state = load_state(checkpoint, identity, **shape, device=chosen_device)
         else:
             with clock("seeds"):
@@ -173,8 +176,14 @@ def reconstruct(
             step=state.step,
         )
         if not continued:
+            state = replace(state, facts={**state.facts, "steps_planned": plan_steps(optimizer, config.budget)})
             save_state(checkpoint, state, identity)
+        steps = int(state.facts.get("steps_planned", config.optimize.steps))
+        optimizer.config = replace(config.optimize, steps=steps)
+        with clock("trial"):
+            report(describe_plan(optimizer, config.optimize.steps, measured_seconds(optimizer)))
         with clock("optimise"):
+            config = replace(config, optimize=optimizer.config)
             log = optimize(optimizer, state, held_out, config, folder, identity, track, report)
         return Reconstruction(
             gaussians=optimizer.gaussians(),
@@ -220,6 +229,18 @@ def initial_state(
     adam = RowAdam(parameters_from(start.gaussians, config.optimize.sh_degree, device))
     anchor = anchor_at(adam.parameters, config.optimize.leash) if start.measured and config.optimize.leash else None
     return State(adam=adam, anchor=anchor, step=0, seconds=0.0, facts=seeding)
+
+
+def describe_plan(optimizer: Optimizer, usual: int, seconds: float) -> str:
+    """What is about to happen, and how long it should take."""
+    widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
+    steps = optimizer.config.steps
+    fewer = f" instead of {usual:,} (budget.minutes)" if steps != usual else ""
+    expected = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"
+    return (
+        f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "
+        f"{len(optimizer.raw['means']):,} Gaussians, {steps - optimizer.step:,} steps{fewer}: about {expected}"
+    )
 
 
 def optimize(

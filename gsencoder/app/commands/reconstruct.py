@@ -2,8 +2,12 @@
 
 import os
 import shutil
-from dataclasses import dataclass, field, fields
+import warnings
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+
+import numpy as np
+from rich.console import Console
 
 from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
@@ -11,6 +15,7 @@ from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.core.errors import SceneWarning
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
@@ -19,7 +24,8 @@ from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats import READABLE, save_splat
 from gsencoder.infer.draw.pictures import contact_sheet
-from gsencoder.reconstruct.open_scene import find_photographed, open_scene
+from gsencoder.reconstruct.budget import choose_scale
+from gsencoder.reconstruct.open_scene import OpenedScene, find_photographed, open_scene
 from gsencoder.reconstruct.run import Comparison, LogRow, ReconstructConfig, describe, reconstruct
 from gsencoder.reconstruct.score import Score
 from gsencoder.reconstruct.sfm import SfmConfig
@@ -80,6 +86,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
         refuse_to_replace_inputs(work.path, settings(config))
         work.take(anew=not config.resume)
         opened = open_scene(path, work.path, splat=config.splat, data=config.data, sfm=config.sfm)
+        opened = _at_affordable_size(opened, path, work.path, config, screen)
         summary.add_seconds(opened.seconds)
         with summary.step("check"):
             warn_of_faults(opened.scene)
@@ -124,6 +131,29 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             f"{out} holds the poses of the photographs, as a COLMAP scene: gsencoder fuse {out} splat={PLY_FILE} "
             f"data.images={opened.photographs}"
         )
+
+
+def _at_affordable_size(
+    opened: OpenedScene, path: Path, work: Path, config: ReconstructCommandConfig, screen: Console
+) -> OpenedScene:
+    """The scene with photographs of the size that the budget allows, unless data.image_scale states one."""
+    views = opened.scene.views
+    if views is None or config.data.image_scale != 1:
+        return opened
+    scale = choose_scale(views.cameras, config.budget, choose_device(config.device), config.optimize)
+    if scale == 1:
+        return opened
+    data = replace(config.data, image_scale=scale)
+    with warnings.catch_warnings():
+        # They were shown when the scene was read at its full size.
+        warnings.simplefilter("ignore", SceneWarning)
+        smaller = open_scene(path, work, splat=config.splat, data=data, sfm=config.sfm)
+    width, height = (int(np.median(sizes)) for sizes in (views.cameras.widths, views.cameras.heights))
+    screen.print(
+        f"photographs of {width}×{height} are looked at {scale:g} times as large, for a result in about "
+        f"{config.budget.minutes:g} minutes (budget.minutes=0 or data.image_scale= change that)"
+    )
+    return replace(smaller, sfm=opened.sfm, seconds=opened.seconds)
 
 
 def draw(path: Path, comparisons: tuple[Comparison, ...]) -> None:
