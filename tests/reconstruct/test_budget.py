@@ -1,0 +1,129 @@
+"""Picture sizes and steps that fit a time."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from splats import random_gaussians
+from walls import cameras, wall_views
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.photographs import Photographs
+from gsencoder.reconstruct.budget import (
+    LEAST_STEPS,
+    BudgetConfig,
+    choose_scale,
+    measured_seconds,
+    plan_steps,
+    step_seconds,
+    wanted_steps,
+)
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.parameters import parameters_from
+from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.run import ReconstructConfig, reconstruct
+from gsencoder.types import Cameras, Scene
+
+CPU, USUAL = torch.device("cpu"), OptimizeConfig()
+
+
+def pictures(width: int, height: int) -> Cameras:
+    return cameras(3, width=width, height=height)
+
+
+def test_small_photographs_stay_and_phone_photographs_are_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    ten = BudgetConfig()
+    assert choose_scale(pictures(320, 240), ten, CPU, USUAL) == 1
+    phone = choose_scale(pictures(4000, 3000), ten, CPU, USUAL)
+    assert 0.05 < phone < 0.2
+    assert choose_scale(pictures(4000, 3000), BudgetConfig(minutes=0.0), CPU, USUAL) == 1
+    # More time gives larger pictures, whatever they are; a GPU needs less.
+    scales = [choose_scale(pictures(4000, 3000), BudgetConfig(minutes=float(m)), CPU, USUAL) for m in (3, 10, 30, 100)]
+    assert scales == sorted(scales)
+    assert scales[0] < scales[-1]
+    assert choose_scale(pictures(4000, 3000), ten, torch.device("cuda"), USUAL) > phone
+    # What is chosen costs no more than there is time for.
+    pixels = 4000 * 3000 * phone**2
+    assert wanted_steps(10.0, USUAL) * step_seconds(pixels, 60_000.0, CPU, USUAL) <= 600 * 0.81
+
+
+def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 16)
+    seconds = []
+    for threads in (1, 2, 8):
+        monkeypatch.setattr("torch.get_num_threads", lambda threads=threads: threads)
+        seconds.append(step_seconds(300_000.0, 60_000.0, CPU, USUAL))
+    assert seconds[0] > seconds[1] > seconds[2]
+    whole = replace(USUAL, shrinks=(1,), shares=(1.0,))
+    assert step_seconds(300_000.0, 60_000.0, CPU, whole) > step_seconds(300_000.0, 60_000.0, CPU, USUAL)
+
+
+def optimizer(config: OptimizeConfig) -> Optimizer:
+    photographs = Photographs(wall_views(depth=True))
+    made = np.random.default_rng(0)
+
+    splat = random_gaussians(50)
+    means = np.column_stack((made.uniform(-1, 1, 50), made.uniform(-1, 1, 50), np.full(50, 3.0)))
+    adam = RowAdam(parameters_from(replace(splat, means=means.astype(np.float32)), config.sh_degree))
+    return Optimizer(adam, photographs, range(len(photographs)), config, prune=PruneConfig())
+
+
+def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time() -> None:
+    assert plan_steps(optimizer(OptimizeConfig(steps=5000)), BudgetConfig(minutes=0.1)) == 5000
+    usual = optimizer(USUAL)
+    assert plan_steps(usual, BudgetConfig(minutes=0.0)) == USUAL.steps
+    assert plan_steps(usual, BudgetConfig()) == USUAL.steps
+    assert plan_steps(usual, BudgetConfig(minutes=0.01)) == LEAST_STEPS
+    assert plan_steps(usual, BudgetConfig(minutes=80.0)) == 2 * USUAL.steps
+
+
+def test_the_trial_changes_nothing() -> None:
+    one, other = optimizer(OptimizeConfig(steps=10)), optimizer(OptimizeConfig(steps=10))
+    assert measured_seconds(one) > 0
+    for _ in range(3):
+        one.advance()
+        other.advance()
+    for name, value in one.raw.items():
+        assert torch.equal(value, other.raw[name]), name
+    assert measured_seconds(replaced_step(one, 10)) == 0
+
+
+def replaced_step(made: Optimizer, step: int) -> Optimizer:
+    made.step = step
+    return made
+
+
+def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also on a machine that would have planned other ones."""
+    scene = Scene(name="wall", views=wall_views(6, depth=True), metres_per_unit=1.0)
+    config = ReconstructConfig(holdout=0, budget=BudgetConfig(minutes=0.01))
+    real = Optimizer.advance
+
+    def cut(self: Optimizer) -> dict[str, float]:
+        if self.step == 7:
+            raise KeyboardInterrupt
+        return real(self)
+
+    monkeypatch.setattr(Optimizer, "advance", cut)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(scene, config, work=tmp_path)
+    monkeypatch.setattr(Optimizer, "advance", real)
+    monkeypatch.setattr("gsencoder.reconstruct.budget.LEAST_STEPS", 900)
+    lines: list[str] = []
+    result = reconstruct(scene, config, work=tmp_path, report=lines.append)
+    assert result.steps == LEAST_STEPS
+    assert f"{LEAST_STEPS - 7} steps instead of 1,500 (budget.minutes): about" in lines[0]
+    assert result.seeding["steps_planned"] == LEAST_STEPS
+
+
+@pytest.mark.parametrize("minutes", [-1.0, float("inf")])
+def test_a_time_that_cannot_be_is_refused(minutes: float) -> None:
+    with pytest.raises(InputError, match="minutes: expected 0"):
+        BudgetConfig(minutes=minutes)
