@@ -105,7 +105,7 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
         assert posed is not None
     with summary.step("facts"):
         facts = scene_facts(scene, posed, layout)
-    lines: list[Table | str] = [scene_table(str(path), facts)]
+    lines: list[Table | str] = [str(path), scene_table(facts)]
     results: dict[str, Any] = {"path": str(path), **facts.to_dict()}
     if config.check:
         with summary.step("check"):

@@ -24,9 +24,9 @@ GOOD, BAD, NOTHING = (44, 160, 44), (214, 39, 40), (64, 64, 64)
 """Colors of pixels whose depth agrees with other views, of those whose does not, and of those that none sees."""
 
 
-def scene_table(path: str, facts: SceneFacts) -> Table:
+def scene_table(facts: SceneFacts) -> Table:
     """The facts of a scene as a table of two columns."""
-    table = Table(title=path, title_justify="left", show_header=False)
+    table = Table(show_header=False)
     table.add_row("layout", facts.layout)
     sizes = ", ".join(f"{width}×{height} ({count})" for (width, height), count in list(facts.sizes.items())[:4])
     table.add_row("views", f"{facts.views:,}: {sizes}{', …' if len(facts.sizes) > 4 else ''}")

@@ -84,10 +84,15 @@ def _floor(folder: Path) -> Path:
     return path
 
 
-def test_one_of_many_scenes_must_be_chosen(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_of_many_scenes_has_its_own_folder(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a", "b"):
         shutil.copytree(room, tmp_path / "house" / name)
-    assert "holds 2 scenes (a, b); give one of them" in refusal(capsys, str(tmp_path / "house"), "quiet=true")
+    command = ["reconstruct", str(tmp_path / "house"), f"out={tmp_path / 'out'}", *QUICK[1:]]
+    assert cli.main(command) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b"]
+    capsys.readouterr()
+    assert cli.main(command) == 0
+    assert "2 of 2 scenes were finished before" in capsys.readouterr().out
 
 
 def test_photographs_are_placed_whatever_lies_in_folders_beside_them(
