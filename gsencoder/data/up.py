@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.check.depth_agreement import SAMPLES, chosen_views, depth_views
+from gsencoder.core.even_indices import even_indices
+from gsencoder.data.check.depth_agreement import SAMPLES, depth_views
 from gsencoder.data.seeding.depth import surface_pixels
 from gsencoder.types import Cameras, Gaussians, Scene, Views
 from gsencoder.types.cameras import unproject_points
@@ -128,7 +129,7 @@ def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfac
         limit: largest number of views to look at, evenly spaced.
         seed: of the choice of samples.
     """
-    depth = depth_views(views, chosen_views(len(views), limit), seed=seed)
+    depth = depth_views(views, even_indices(len(views), limit), seed=seed)
     made = np.random.default_rng(seed)
     world_from_cam = invert_rigid(depth.cam_from_world)
     parts = []

@@ -91,11 +91,10 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
         check_lines,
         check_results,
         finding_line,
-        findings_of,
         save_check_picture,
         scene_table,
     )
-    from gsencoder.data.check.scene_check import check_scene
+    from gsencoder.data.check.scene_check import check_scene, findings_of
     from gsencoder.data.scene_facts import scene_facts
 
     with summary.step("read"):

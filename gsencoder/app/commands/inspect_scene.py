@@ -142,11 +142,6 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
     return results
 
 
-def findings_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> list[Finding]:
-    """All findings."""
-    return [finding for check in (depth, matches) if check is not None for finding in check.findings]
-
-
 def save_check_picture(path: Path, views: Views, depth: DepthCheck | None, matches: EpipolarCheck | None) -> bool:
     """Draws what the checks saw; returns whether there was anything to draw.
 

@@ -94,7 +94,7 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
     """Writes a transforms.json whose poses, depth and cameras fit, and checks that they do."""
     # Only scenes need Pillow and, for some depth sensors, torch.
     from gsencoder.data.check.repair_scene import repair_posed
-    from gsencoder.data.check.scene_check import check_scene, fit_of
+    from gsencoder.data.check.scene_check import check_scene, findings_of, fit_of
     from gsencoder.data.readers.write_transforms import transforms_of
 
     assert config.out is not None
@@ -108,14 +108,13 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
         assert posed is not None
     with summary.step("check"):
         depth, matches = check_scene(scene.views, limit=config.views, track=track)
-    findings = [finding for check in (depth, matches) if check is not None for finding in check.findings]
-    repair = repair_posed(posed, findings, depth.registration if depth is not None else None)
+    repair = repair_posed(posed, findings_of(depth, matches), depth.registration if depth is not None else None)
     content = transforms_of(repair.posed, config.out.parent)
     with summary.step("check"):
         again = _load_back(content, config.out)
         assert again.views is not None
         checked = check_scene(again.views, limit=config.views, track=track)
-        left = [finding for check in checked if check is not None for finding in check.findings if finding.view is None]
+        left = [finding for finding in findings_of(*checked) if finding.view is None]
         if left:
             raise InputError(f"{path}: still wrong once repaired: {left[0].message}; nothing was written")
     with summary.step("write"):

@@ -4,10 +4,9 @@ same."""
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from gsencoder.data.check.depth_agreement import MIN_SAMPLES, TOLERANCE, DepthViews, world_samples
+from gsencoder.data.check.depth_agreement import MIN_SAMPLES, DepthViews, shared_samples
 from gsencoder.types import Views
 from gsencoder.types.cameras import project_points
-from gsencoder.types.poses import transform
 
 
 def grey_pictures(
@@ -36,29 +35,13 @@ def color_correlations(
         grey: photographs at the size of the depth images.
         Ks: intrinsics of these photographs.
     """
-    points = world_samples(views)
-    count, height, width = views.depths.shape
-    result = np.full((count, count), np.nan)
-    for view in range(count):
-        known = np.flatnonzero(views.values[view] > 0)
-        here, seen = _intensities(grey[view], Ks[view], transform(views.cam_from_world[view], points[view][known]))
-        for other in range(count):
-            if other == view:
-                continue
-            local = transform(views.cam_from_world[other], points[view][known])
-            pixels = project_points(local, views.Ks[other])
-            inside = (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-            columns, rows = np.floor(pixels[inside]).astype(np.int64).T
-            measured = views.depths[other][rows, columns] * views.scale
-            given = local[inside, 2] if views.measure == "z" else np.linalg.norm(local[inside], axis=1)
-            same = (measured > 0) & (np.abs(given - measured) <= TOLERANCE * measured)
-            if same.sum() < MIN_SAMPLES:
-                continue
-            there, seen_there = _intensities(grey[other], Ks[other], local[inside][same])
-            both = seen[inside][same] & seen_there
-            pair = here[inside][same][both], there[both]
-            if both.sum() >= MIN_SAMPLES and min(values.std() for values in pair) > 1e-3:
-                result[view, other] = np.corrcoef(*pair)[0, 1]
+    result = np.full((len(views), len(views)), np.nan)
+    for view, other, here, there in shared_samples(views, MIN_SAMPLES):
+        ours, seen = _intensities(grey[view], Ks[view], here)
+        theirs, seen_there = _intensities(grey[other], Ks[other], there)
+        pair = ours[seen & seen_there], theirs[seen & seen_there]
+        if len(pair[0]) >= MIN_SAMPLES and min(values.std() for values in pair) > 1e-3:
+            result[view, other] = np.corrcoef(*pair)[0, 1]
     return result
 
 

@@ -5,13 +5,13 @@ view's own depth image says d there, r = z / d − 1 is zero up to noise and the
 the point there. Wrong axes, poses, scales and intrinsics spread r.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.data.readers.images import ray_lengths
 from gsencoder.types import Views
 from gsencoder.types.cameras import pixel_centers, project_points
 from gsencoder.types.poses import invert_rigid, transform
@@ -29,8 +29,6 @@ MIN_SAMPLES = 30
 EDGE = 0.05
 """Pixels beside a step of the depth by more than this share are not carried over: a pixel's size decides there."""
 
-Measure = Literal["z", "ray"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DepthViews:
@@ -43,7 +41,6 @@ class DepthViews:
         cam_from_world: poses of the depth cameras.
         Ks: intrinsics of the small images.
         scale: world units for each unit of `depths`.
-        measure: whether a depth is the coordinate z or the length of the ray.
     """
 
     depths: Float32[np.ndarray, "V h w"]
@@ -52,7 +49,6 @@ class DepthViews:
     cam_from_world: Float64[np.ndarray, "V 4 4"]
     Ks: Float64[np.ndarray, "V 3 3"]
     scale: float = 1.0
-    measure: Measure = "z"
 
     def __len__(self) -> int:
         return len(self.depths)
@@ -62,6 +58,13 @@ class DepthViews:
         Ks = self.Ks.copy()
         Ks[:, :2, :2] *= factor
         return replace(self, Ks=Ks)
+
+    def of_rays(self) -> "DepthViews":
+        """The same images if their numbers are lengths of rays: the coordinates z of these."""
+        lengths = np.stack([ray_lengths(K, *self.depths.shape[:0:-1]) for K in self.Ks])
+        columns, rows = np.floor(self.pixels).astype(np.int64).transpose(2, 0, 1)
+        at_samples = lengths[np.arange(len(self))[:, None], rows, columns]
+        return replace(self, depths=(self.depths / lengths).astype(np.float32), values=self.values / at_samples)
 
 
 def depth_views(views: Views, chosen: Int64[np.ndarray, " V"], *, seed: int = 0) -> DepthViews:
@@ -173,10 +176,24 @@ def _depth_ratio(
         inside = known & (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
     columns, rows = np.floor(pixels[inside]).astype(np.int64).T
     measured = views.depths[other][rows, columns].astype(np.float64) * views.scale
-    given = local[inside, 2] if views.measure == "z" else np.linalg.norm(local[inside], axis=1)
     ratio = np.full(len(points), np.nan)
-    ratio[inside] = np.divide(given, measured, out=np.full(len(measured), np.nan), where=measured > 0)
+    ratio[inside] = np.divide(local[inside, 2], measured, out=np.full(len(measured), np.nan), where=measured > 0)
     return ratio
+
+
+def shared_samples(
+    views: DepthViews, least: int
+) -> Iterator[tuple[int, int, Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]]:
+    """The samples of one view on which the depth of another agrees within `TOLERANCE`, for each ordered pair of views
+    that shares at least so many: both rows, and the points in the axes of both cameras."""
+    points = world_samples(views)
+    for view, other in np.ndindex(len(views), len(views)):
+        if view == other:
+            continue
+        ratio = _depth_ratio(views, other, points[view], views.values[view] > 0)
+        same = points[view][np.abs(ratio - 1) <= TOLERANCE]
+        if len(same) >= least:
+            yield view, other, transform(views.cam_from_world[view], same), transform(views.cam_from_world[other], same)
 
 
 def world_samples(views: DepthViews) -> Float64[np.ndarray, "V n 3"]:
@@ -185,8 +202,6 @@ def world_samples(views: DepthViews) -> Float64[np.ndarray, "V n 3"]:
     rays = np.ones((*views.pixels.shape[:2], 3))
     for axis in range(2):
         rays[..., axis] = (views.pixels[..., axis] - K[:, axis, 2, None]) / K[:, axis, axis, None]
-    if views.measure == "ray":
-        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     local = rays * (views.scale * views.values)[..., None]
     world_from_cam = invert_rigid(views.cam_from_world)
     return np.einsum("vij,vnj->vni", world_from_cam[:, :3, :3], local) + world_from_cam[:, None, :3, 3]
@@ -238,8 +253,3 @@ def pair_offsets(residual: Float64[np.ndarray, "V V n"]) -> tuple[float, float]:
         if len(known) >= MIN_SAMPLES and (distance <= 3 or distance >= count / 2):
             (near if distance <= 3 else far).append(abs(float(np.median(known))))
     return tuple(float(np.median(each)) if each else float("nan") for each in (near, far))  # type: ignore[return-value]
-
-
-def chosen_views(count: int, limit: int = 32) -> Int64[np.ndarray, " n"]:
-    """The views that are compared: all, or evenly spaced ones of many."""
-    return even_indices(count, limit)

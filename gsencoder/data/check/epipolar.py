@@ -160,17 +160,19 @@ def consistent_matches(matches: Sequence[PairMatches]) -> list[PairMatches]:
     pycolmap = load_pycolmap()
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed, options.max_num_trials = INLIER_ERROR, 0, 2000
-    kept = []
+    consistent = []
     for pair in matches:
         if len(pair.first_pixels) < MIN_MATCHES:
             continue
-        found = pycolmap.estimate_fundamental_matrix(pair.first_pixels, pair.second_pixels, options)
-        if found is None:
+        estimate = pycolmap.estimate_fundamental_matrix(pair.first_pixels, pair.second_pixels, options)
+        if estimate is None:
             continue
-        good = np.asarray(found["inlier_mask"], bool)
+        good = np.asarray(estimate["inlier_mask"], bool)
         if good.sum() >= max(MIN_MATCHES, MIN_SHARE * len(good)):
-            kept.append(replace(pair, first_pixels=pair.first_pixels[good], second_pixels=pair.second_pixels[good]))
-    return kept
+            consistent.append(
+                replace(pair, first_pixels=pair.first_pixels[good], second_pixels=pair.second_pixels[good])
+            )
+    return consistent
 
 
 def _distances(cameras: Cameras, pair: PairMatches) -> Float64[np.ndarray, " M"]:

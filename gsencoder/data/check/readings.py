@@ -59,7 +59,7 @@ def other_readings(
         ("order", float(places), replace(views, cam_from_world=poses[chosen].astype(np.float64)))
         for places, poses in other_orders(all_poses)
     ]
-    fixed.append(("ray length", None, replace(views, measure="ray")))
+    fixed.append(("ray length", None, views.of_rays()))
     readings = [
         Reading(cause=cause, views=other, agreement=agreement(residuals(other)), factor=factor)
         for cause, factor, other in fixed

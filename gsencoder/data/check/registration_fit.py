@@ -11,10 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.data.check.depth_agreement import TOLERANCE, DepthViews, world_samples
+from gsencoder.data.check.depth_agreement import DepthViews, shared_samples
 from gsencoder.types import Views
 from gsencoder.types.cameras import project_points
-from gsencoder.types.poses import transform
 
 PICTURE_SIZE = 640
 """Longer side in pixels of the photographs that are compared; smaller ones keep theirs."""
@@ -111,24 +110,10 @@ def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: Depth
 
 def _shared_places(depth: DepthViews) -> list[_Pair]:
     """The pairs of views with the most samples on which their depth agrees."""
-    points = world_samples(depth)
-    count, height, width = depth.depths.shape
-    pairs = []
-    for view in range(count):
-        known = depth.values[view] > 0
-        here = transform(depth.cam_from_world[view], points[view][known])
-        for other in range(count):
-            if other == view:
-                continue
-            there = transform(depth.cam_from_world[other], points[view][known])
-            pixels = project_points(there, depth.Ks[other])
-            inside = (there[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-            columns, rows = np.floor(pixels[inside]).astype(np.int64).T
-            measured = depth.depths[other][rows, columns] * depth.scale
-            given = there[inside, 2] if depth.measure == "z" else np.linalg.norm(there[inside], axis=1)
-            same = (measured > 0) & (np.abs(given - measured) <= TOLERANCE * measured)
-            if same.sum() >= MIN_SHARED:
-                pairs.append(_Pair(views=(view, other), points=(here[inside][same], there[inside][same])))
+    pairs = [
+        _Pair(views=(view, other), points=(here, there))
+        for view, other, here, there in shared_samples(depth, MIN_SHARED)
+    ]
     return sorted(pairs, key=lambda pair: -len(pair.points[0]))[:MAX_PAIRS]
 
 

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import SceneWarning
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.check.color_agreement import color_correlations, grey_pictures, view_correlations
 from gsencoder.data.check.depth_agreement import (
     Agreement,
     DepthViews,
-    chosen_views,
     depth_views,
     pair_offsets,
     residuals,
@@ -104,6 +104,11 @@ def check_scene(
     return depth, check_matches(views, limit=limit or 24, track=track)
 
 
+def findings_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> list[Finding]:
+    """All findings of both checks."""
+    return [finding for check in (depth, matches) if check is not None for finding in check.findings]
+
+
 def fit_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> float:
     """The share of what views share that agrees: of depth if it can be compared, else of matches; NaN of neither."""
     if depth is not None and depth.comparable:
@@ -133,7 +138,7 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
         views: with depth.
         limit: largest number of views to look at, evenly spaced.
     """
-    chosen = chosen_views(len(views), limit)
+    chosen = even_indices(len(views), limit)
     names = tuple(views.names[int(view)] for view in chosen)
     small = depth_views(views, chosen)
     given = as_given(small)
@@ -179,7 +184,7 @@ def suspicious_depth(views: Views, *, limit: int = 10) -> tuple[Agreement, Findi
         views: with depth, two or more.
         limit: largest number of views to look at.
     """
-    chosen = chosen_views(len(views), limit)
+    chosen = even_indices(len(views), limit)
     small = depth_views(views, chosen)
     given = as_given(small)
     if given.agreement.compared >= _needed(small) and given.agreement.share >= SUSPICIOUS:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from textured_box import box_cameras, box_views, look
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.data.check.depth_agreement import agreement_map, chosen_views, depth_views, residuals
+from gsencoder.data.check.depth_agreement import agreement_map, depth_views, residuals
 from gsencoder.data.check.epipolar import check_matches
 from gsencoder.data.check.scene_check import check_depth, check_scene, suspicious_depth, warn_of_faults
 from gsencoder.data.orbits import looking_cameras
@@ -232,7 +232,7 @@ def test_a_quick_look_warns_of_what_the_check_names(box: Views) -> None:
 
 
 def test_residuals_of_exact_depth_are_zero_and_the_map_shows_what_agrees(box: Views) -> None:
-    small = depth_views(box, chosen_views(len(box)))
+    small = depth_views(box, np.arange(len(box)))
     known = residuals(small)
     assert np.isnan(known[np.arange(len(box)), np.arange(len(box))]).all()
     assert np.nanmedian(np.abs(known)) < 1e-3
@@ -254,7 +254,7 @@ def test_what_something_nearer_hides_is_no_disagreement() -> None:
     assert views.depths is not None
     depths = [depth.copy() for depth in views.depths]
     depths[ROW][:, :100] = 0.3
-    small = depth_views(replace(views, depths=depths), chosen_views(len(views)))
+    small = depth_views(replace(views, depths=depths), np.arange(len(views)))
     others = [view for view in range(len(views)) if view != ROW]
     for view in others:
         assert np.nanmean(agreement_map(small, view)) > 0.95
