@@ -127,13 +127,15 @@ def training(folder: Path) -> Made:
 
 def reconstruction(folder: Path) -> Made:
     parameters = parameters_from(random_gaussians(40), 1)
-    state = State(adam=RowAdam(parameters), anchor=anchor_at(parameters, 0.4), step=3, seconds=2.0, facts={"seeds": 40})
+    anchor, exposures = anchor_at(parameters, 0.4), torch.eye(3, 4).repeat(6, 1, 1)
+    facts = {"seeds": 40}
+    state = State(adam=RowAdam(parameters), anchor=anchor, exposures=exposures, step=3, seconds=2.0, facts=facts)
     save_state(folder / "r", state, {"rate": 0.1})
 
     def read() -> Any:
         got = load_state(folder / "r", {"rate": 0.1}, steps=5, sh_degree=1)
         assert got.anchor is not None
-        return got.adam.tables(), got.adam.steps, got.anchor, got.step, got.seconds, got.facts
+        return got.adam.tables(), got.adam.steps, got.anchor, got.exposures, got.step, got.seconds, got.facts
 
     return folder / "r", read
 

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, losses_of
+from gsencoder.reconstruct.losses import losses_of
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.types import Cameras
 
 FIXED_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 0.03, 7e-7, 1.25e-6
@@ -111,7 +112,9 @@ def measured_seconds(optimizer: Optimizer) -> float:
         for view in (views[0], *views):
             photo = optimizer.photographs.at_scale(view, shrink)
             start = time.perf_counter()
-            losses = losses_of(optimizer.look(view, photo), photo, config)
+            losses = losses_of(
+                optimizer.look(view, photo), photo, ssim_weight=config.ssim_weight, depth_weight=config.depth_weight
+            )
             torch.stack([*losses.values()]).sum().backward()
             seconds.append(time.perf_counter() - start)
         total += share * left * float(np.median(seconds[1:]))

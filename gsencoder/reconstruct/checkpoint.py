@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
@@ -26,6 +28,7 @@ class State:
     Attributes:
         adam: parameters and moments.
         anchor: what holds positions near their seeds, if anything does.
+        exposures: an affine map of colors for each fitted photograph, if they are fitted; None at step 0.
         step: steps that are done.
         seconds: that they took.
         facts: how it began, as JSON values: number and source of the seeds, and what was added to points.
@@ -33,6 +36,7 @@ class State:
 
     adam: RowAdam
     anchor: Anchor | None
+    exposures: Float[Tensor, "V 3 4"] | None = None
     step: int
     seconds: float
     facts: Mapping[str, Any]
@@ -56,6 +60,8 @@ def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
     }
     if state.anchor is not None:
         arrays |= {f"leash.{name}": getattr(state.anchor, name).cpu().numpy() for name in ANCHOR_SHAPES}
+    if state.exposures is not None:
+        arrays["exposure.maps"] = state.exposures.numpy()
     header = {
         "step": state.step,
         "adam_steps": state.adam.steps,
@@ -86,6 +92,9 @@ def load_state(
         if "budget" not in earlier:
             # Runs of earlier versions had none, and took the steps of their settings.
             settings = {name: value for name, value in settings.items() if name != "budget"}
+        # Runs of earlier versions fitted photographs as they were.
+        if "optimize" in earlier:
+            earlier["optimize"] = {"exposure": False, **earlier["optimize"]}
         if earlier != settings:
             raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
         step, adam_steps = file.value("step", int), file.value("adam_steps", int)
@@ -103,4 +112,8 @@ def load_state(
         if "leash.means" in file:
             arrays = {name: file.array(f"leash.{name}", "float32", shape) for name, shape in ANCHOR_SHAPES.items()}
             anchor = Anchor(**{name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()})
-    return State(adam=RowAdam.restored(tables, adam_steps), anchor=anchor, step=step, seconds=seconds, facts=facts)
+        exposures = None
+        if "exposure.maps" in file:
+            exposures = torch.from_numpy(file.array("exposure.maps", "float32", ("V", 3, 4)).copy())
+    adam = RowAdam.restored(tables, adam_steps)
+    return State(adam=adam, anchor=anchor, exposures=exposures, step=step, seconds=seconds, facts=facts)

@@ -1,4 +1,4 @@
-"""The scene that a reconstruction starts from: one with poses, or photographs that SfM registers first."""
+"""The scene that a reconstruction starts from: one with poses, or photographs or a video that SfM registers first."""
 
 import os
 import warnings
@@ -8,12 +8,17 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed
 from gsencoder.core.runtime.clock import Clock
+from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, find_scenes, is_scene, listed_paths, load_scene
+from gsencoder.data.video.decode import is_video
+from gsencoder.data.video.frames import VideoConfig, take_frames
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
 from gsencoder.reconstruct.sfm import PLACED_FILE, Placed, SfmConfig, load_placement, photographs_in, place_photographs
 from gsencoder.types import Scene
 
 START_AGAIN = "give resume=false to begin anew"
+FRAMES_FOLDER = "images"
+"""Frames of a video, in the working folder and in the results; the name that COLMAP scenes use."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,18 +29,21 @@ class OpenedScene:
         scene: its poses may come from structure from motion.
         sfm: the result of structure from motion; None if the scene had poses.
         photographs: the folder of photographs that structure from motion registered; None if the scene had poses.
-        seconds: wall-clock time of structure from motion, under "place".
+        is_video: whether they were taken from a video, and lie in the working folder.
+        seconds: wall-clock time of taking frames from a video, under "frames", and of structure from motion, under
+            "place".
     """
 
     scene: Scene
     sfm: Placed | None
     photographs: Path | None
+    is_video: bool
     seconds: dict[str, float]
 
 
 def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
-    """What can be reconstructed at paths: scenes, folders of photographs alone, those in folders of such, and those
-    that a list (.txt) names.
+    """What can be reconstructed at paths: scenes, folders of photographs alone, videos, those in folders of such, and
+    those that a list (.txt) names.
 
     Raises:
         InputError: a path does not exist, or holds nothing of the kind.
@@ -44,8 +52,8 @@ def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
     for given in listed_paths(paths):
         inside = [given]
         if given.is_dir() and not is_scene(given) and _pictures_of(given) is None:
-            entries = sorted(entry for entry in given.iterdir() if entry.is_dir() and not entry.name.startswith("."))
-            inside = [entry for entry in entries if is_scene(entry) or _pictures_of(entry) is not None]
+            entries = sorted(entry for entry in given.iterdir() if not entry.name.startswith("."))
+            inside = [entry for entry in entries if is_video(entry) or (entry.is_dir() and _is_photographed(entry))]
         # Of a path that holds nothing `find_scenes` says what was expected.
         for path in inside or find_scenes([given]):
             chosen.setdefault(path.resolve(), path)
@@ -57,28 +65,46 @@ def _pictures_of(path: Path) -> Path | None:
     return next((folder for folder in (path, path / "images") if folder.is_dir() and photographs_in(folder)), None)
 
 
+def _is_photographed(folder: Path) -> bool:
+    return is_scene(folder) or _pictures_of(folder) is not None
+
+
 def open_scene(
-    path: Path, work: Path, *, splat: str = "", data: SceneConfig = SceneConfig(), sfm: SfmConfig = SfmConfig()
+    path: Path,
+    work: Path,
+    *,
+    splat: str = "",
+    data: SceneConfig = SceneConfig(),
+    sfm: SfmConfig = SfmConfig(),
+    video: VideoConfig = VideoConfig(),
+    track: Track = untracked,
 ) -> OpenedScene:
-    """Reads a scene; a folder that holds photographs and nothing else is placed by structure from motion first.
+    """Reads a scene; photographs alone, or frames of a video, are registered by structure from motion first.
 
     Args:
-        path: a scene, or a folder of photographs.
+        path: a scene, a folder of photographs, or a video.
         work: an existing folder for the COLMAP model; one that an interrupted run completed there is used again.
         splat: file of Gaussians to refine; empty = none.
         data: how the scene is read.
         sfm: how photographs are placed.
+        video: which frames of a video are taken; they are written to `images` in `work`.
+        track: progress of decoding a video.
 
     Raises:
-        InputError: no photographs, several scenes, or structure from motion fails.
+        InputError: no photographs, several scenes, a video that cannot be used, or structure from motion fails.
 
     Warns:
         SceneWarning: photographs that could not be placed.
     """
     clock = Clock()
-    pictures = _pictures_of(path)
+    if is_video(path):
+        pictures: Path | None = work / FRAMES_FOLDER
+        with clock("frames"):
+            take_frames(path, work / FRAMES_FOLDER, video, track=track)
+    else:
+        pictures = _pictures_of(path)
     # A folder of photographs may also hold scenes of others, or the results of a run: the photographs are meant.
-    scenes = [] if pictures is not None and not is_scene(path) else find_scenes([path])
+    scenes = [] if pictures is not None and (path.is_file() or not is_scene(path)) else find_scenes([path])
     if len(scenes) > 1:
         names = listed([scene.name for scene in scenes])
         raise InputError(f"{path}: holds {len(scenes)} scenes ({names}); give one of them")
@@ -86,7 +112,7 @@ def open_scene(
         scene = load_scene(scenes[0], splat=splat or None, options=data)
         if scene.views is None:
             raise InputError(f"{path}: a splat without photographs; there is nothing to fit it to")
-        return OpenedScene(scene=scene, sfm=None, photographs=None, seconds=clock.seconds)
+        return OpenedScene(scene=scene, sfm=None, photographs=None, is_video=False, seconds=clock.seconds)
     if splat:
         raise InputError(
             f"{path}: splat={splat} lies in a world of its own, and photographs without poses are placed "
@@ -101,7 +127,7 @@ def open_scene(
         )
     if placed is None:
         with clock("place"):
-            placed = place_photographs(pictures, work, sfm)
+            placed = place_photographs(pictures, work, sfm, single_camera=is_video(path))
     if placed.missing:
         warnings.warn(
             f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "
@@ -111,4 +137,4 @@ def open_scene(
         )
     with advised(START_AGAIN):
         scene = load_scene(work, options=replace(data, images=str(pictures)))
-    return OpenedScene(scene=scene, sfm=placed, photographs=pictures, seconds=clock.seconds)
+    return OpenedScene(scene=scene, sfm=placed, photographs=pictures, is_video=path.is_file(), seconds=clock.seconds)

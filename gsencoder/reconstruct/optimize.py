@@ -14,6 +14,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.signals import defer_signals
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.anchor import Anchor
+from gsencoder.reconstruct.exposure import Exposures, apply_colors, fitted_colors, known_pixels
+from gsencoder.reconstruct.losses import losses_of
 from gsencoder.reconstruct.parameters import (
     Parameters,
     camera_of,
@@ -24,7 +26,6 @@ from gsencoder.reconstruct.parameters import (
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render.image_metrics import WINDOW as SSIM_WINDOW
-from gsencoder.render.image_metrics import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Gaussians
 
@@ -62,6 +63,13 @@ class OptimizeConfig:
     quats_rate: float = field(default=1e-3, metadata={"help": "learning rate of rotations"})
     opacities_rate: float = field(default=5e-2, metadata={"help": "learning rate of the logits of opacities"})
     colors_rate: float = field(default=2.5e-3, metadata={"help": "learning rate of colors; a 20th for directions"})
+    exposure: bool = field(
+        default=True,
+        metadata={
+            "help": "fit an affine map of colors to each photograph, for exposure and white balance that differ; "
+            "false = photographs are fitted as they are"
+        },
+    )
     seed: int = field(default=0, metadata={"help": "of the order in which photographs are looked at"})
 
     def __post_init__(self) -> None:
@@ -114,6 +122,7 @@ class Optimizer:
     Attributes:
         adam: holds the parameters, and their moments.
         anchor: what holds positions near their seeds, if anything does.
+        exposures: affine colors of the photographs; None where they are fitted as they are.
         step: steps that are done.
         is_consistent: whether the state is one between two steps.
     """
@@ -128,6 +137,7 @@ class Optimizer:
         prune: PruneConfig,
         raster: RasterConfig = RasterConfig(),
         anchor: Anchor | None = None,
+        exposures: Tensor | None = None,
         step: int = 0,
     ) -> None:
         """Args:
@@ -138,6 +148,7 @@ class Optimizer:
         prune: what is taken out, and when.
         raster: accuracy of rendering.
         anchor: what holds positions near their seeds; None = nothing.
+        exposures: maps [V, 3, 4] of a run that is continued; None = identities.
         step: steps that are done.
 
         Raises:
@@ -146,6 +157,7 @@ class Optimizer:
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
         self.adam, self.anchor, self.step, self.is_consistent = adam, anchor, step, True
+        self.exposures = Exposures(self.training, exposures) if config.exposure else None
         self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
         self._check_sizes()
@@ -179,9 +191,11 @@ class Optimizer:
         photo = self.photographs.at_scale(view, self.config.shrink_at(self.step))
         terms: dict[str, float] = {}
         grads: Parameters = {}
-        raster, rows, seen = self._look(view, photo, self.config.degree_at(self.step))
+        raster, rows, seen, colors = self._exposed(view, photo)
         if len(rows):
-            losses = losses_of(raster, photo, self.config)
+            losses = losses_of(
+                raster, photo, ssim_weight=self.config.ssim_weight, depth_weight=self.config.depth_weight
+            )
             total = torch.stack([*losses.values()]).sum()
             total.backward()
             grads = {name: value.grad for name, value in seen.items() if value.grad is not None}
@@ -195,6 +209,8 @@ class Optimizer:
                 self.adam.step(rows, grads, rates)
                 if self.anchor is not None:
                     self.anchor.pull(self.raw["means"], rows, rates["means"])
+                if self.exposures is not None and colors is not None:
+                    self.exposures.set(view, colors)
             self.step += 1
             if self.pruning.due(self.step, self.config.steps):
                 self.prune()
@@ -210,6 +226,17 @@ class Optimizer:
         shape = (seen["means"], seen["quats"], seen["log_scales"].exp(), seen["logit_opacities"].sigmoid())
         raster = rasterize(*shape, seen_colors(seen, degree, center), pose, K, *size, config=self.raster)
         return raster, rows, seen
+
+    def _exposed(
+        self, view: int, photo: ScaledPhotograph
+    ) -> tuple[Raster, Int64[Tensor, " n"], Parameters, Float[Tensor, "3 4"] | None]:
+        """A view as the next step renders it, with the exposure of its photograph, and the map that this gave."""
+        raster, rows, seen = self._look(view, photo, self.config.degree_at(self.step))
+        if self.exposures is None or not len(rows):
+            return raster, rows, seen, None
+        colors = self.exposures.moved(view, self._fitted_colors(raster.rgb, raster.alpha, photo))
+        rgb = apply_colors(raster.rgb, self.exposures.relative(view, colors))
+        return raster._replace(rgb=rgb), rows, seen, colors
 
     def _rows(self, pose: Float[Tensor, "4 4"], photo: ScaledPhotograph) -> Int64[Tensor, " n"]:
         knobs = {"near": self.raster.near, "eps2d": self.raster.eps2d}
@@ -248,12 +275,19 @@ class Optimizer:
 
     def look(self, view: int, photo: ScaledPhotograph) -> Raster:
         """A view as the next step would render it, differentiable; nothing changes."""
-        return self._look(view, photo, self.config.degree_at(self.step))[0]
+        return self._exposed(view, photo)[0]
 
     def rows_seen(self, view: int) -> int:
         """Number of Gaussians that may show in a view."""
         pose, _ = camera_of(self.photographs.cameras, view, self.device)
         return len(self._rows(pose, self.photographs.at_scale(view)))
+
+    @staticmethod
+    @torch.no_grad()
+    def _fitted_colors(
+        rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], photo: ScaledPhotograph
+    ) -> Float[Tensor, "3 4"]:
+        return fitted_colors(rgb, photo.image.to(rgb.device), known_pixels(alpha, photo.mask))
 
     def gaussians(self) -> Gaussians:
         """The splat as it is now."""
@@ -264,28 +298,10 @@ class Optimizer:
         """A view as it is now, in [0, 1]."""
         return self._look(view, photo, self.config.sh_degree)[0].rgb.clamp(0, 1).cpu()
 
-
-def losses_of(raster: Raster, photo: ScaledPhotograph, config: OptimizeConfig) -> dict[str, Float[Tensor, ""]]:
-    """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, and the relative error of depth where it is known."""
-    image = photo.image.to(raster.rgb.device)
-    rgb = raster.rgb
-    losses = {}
-    if photo.mask is not None:
-        # What is masked is made equal: it gives no gradient, and no edge to windows that reach over it.
-        mask = photo.mask.to(rgb.device)
-        image = torch.where(mask.unsqueeze(-1), image, rgb.detach())
-        share = mask.float().mean().clamp(min=1e-6)
-    else:
-        share = torch.ones((), device=rgb.device)
-    losses["l1"] = (1 - config.ssim_weight) * (rgb - image).abs().mean() / share
-    if config.ssim_weight:
-        losses["ssim"] = config.ssim_weight * (1 - ssim(rgb, image)) / share
-    if config.depth_weight and photo.depth is not None:
-        depth = photo.depth.to(rgb.device)
-        known = (depth > 0) & (raster.alpha.detach() > 0.5)
-        if photo.mask is not None:
-            known &= photo.mask.to(rgb.device)
-        expected = raster.depth / raster.alpha.clamp(min=1e-3)
-        error = ((expected - depth).abs() / depth.clamp(min=1e-6)).clamp(max=1)
-        losses["depth"] = config.depth_weight * torch.where(known, error, 0).mean()
-    return losses
+    @torch.no_grad()
+    def matched_picture(self, view: int, photo: ScaledPhotograph) -> Float[Tensor, "H W 3"]:
+        """A view as it is now, in the colors that fit the photograph best: the exposure of a photograph that was not
+        fitted is unknown, and no fault of the splat."""
+        raster = self._look(view, photo, self.config.sh_degree)[0]
+        fitted = self._fitted_colors(raster.rgb, raster.alpha, photo)
+        return apply_colors(raster.rgb, fitted).clamp(0, 1).cpu()

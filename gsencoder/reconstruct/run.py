@@ -10,12 +10,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning, advised
-from gsencoder.core.even_indices import even_indices
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.files.step_log import LOG_FILE, Log, read_log
 from gsencoder.core.runtime.clock import Clock
@@ -31,6 +28,7 @@ from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state,
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.report import Comparison, LogRow, compare, describe, describe_exposure, describe_plan
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, covisible_pixels, drop_masked_views, score, split
 from gsencoder.reconstruct.start import initial_gaussians
@@ -38,10 +36,6 @@ from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Gaussians, Scene
 
 START_AGAIN = "give resume=false to begin anew"
-MAX_COMPARISONS = 4
-"""Held-out photographs of which the result holds a render."""
-LogRow = dict[str, int | float]
-"""One line of the log: step, seconds, gaussians, and the fields of a Score."""
 Report = Callable[[str], None]
 """Receives one line of text for people."""
 
@@ -74,21 +68,6 @@ class ReconstructConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Comparison:
-    """A held-out photograph and the render of the same view.
-
-    Attributes:
-        name: of the view.
-        photograph: as decoded.
-        render: of the reconstructed splat.
-    """
-
-    name: str
-    photograph: UInt8[np.ndarray, "H W 3"]
-    render: UInt8[np.ndarray, "H W 3"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reconstruction:
     """A splat that was fitted to photographs, and how well it predicts those that were held out.
 
@@ -100,6 +79,8 @@ class Reconstruction:
         held_out: row numbers of the views that were not.
         log: one row a validation, oldest first; empty without held-out views.
         comparisons: up to four held-out photographs beside renders of them.
+        exposure: brightness of each fitted photograph, relative to their mean, from the affine maps of colors; None
+            where photographs are fitted as they are.
         seconds: wall-clock time by step of the stage.
     """
 
@@ -110,6 +91,7 @@ class Reconstruction:
     held_out: tuple[int, ...]
     log: tuple[LogRow, ...]
     comparisons: tuple[Comparison, ...]
+    exposure: tuple[float, ...] | None
     seconds: Mapping[str, float]
 
 
@@ -173,6 +155,7 @@ def reconstruct(
             prune=config.prune,
             raster=config.raster,
             anchor=state.anchor,
+            exposures=state.exposures,
             step=state.step,
         )
         if not continued:
@@ -185,6 +168,12 @@ def reconstruct(
         with clock("optimise"):
             config = replace(config, optimize=optimizer.config)
             log = optimize(optimizer, state, held_out, config, folder, identity, track, report)
+        exposure = differing = None
+        if optimizer.exposures is not None:
+            exposure = tuple(optimizer.exposures.brightness().tolist())
+            differing = describe_exposure(min(exposure), max(exposure))
+        if differing is not None:
+            report(differing)
         return Reconstruction(
             gaussians=optimizer.gaussians(),
             seeding=state.facts,
@@ -192,7 +181,8 @@ def reconstruct(
             training=optimizer.training,
             held_out=tuple(held_out),
             log=tuple(log),
-            comparisons=compare(optimizer, held_out),
+            comparisons=compare(optimizer, held_out, matched=differing is not None),
+            exposure=exposure,
             seconds=clock.seconds,
         )
 
@@ -229,18 +219,6 @@ def initial_state(
     adam = RowAdam(parameters_from(start.gaussians, config.optimize.sh_degree, device))
     anchor = anchor_at(adam.parameters, config.optimize.leash) if start.measured and config.optimize.leash else None
     return State(adam=adam, anchor=anchor, step=0, seconds=0.0, facts=seeding)
-
-
-def describe_plan(optimizer: Optimizer, usual: int, seconds: float) -> str:
-    """What is about to happen, and how long it should take."""
-    widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
-    steps = optimizer.config.steps
-    fewer = f" instead of {usual:,} (budget.minutes)" if steps != usual else ""
-    expected = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"
-    return (
-        f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "
-        f"{len(optimizer.raw['means']):,} Gaussians, {steps - optimizer.step:,} steps{fewer}: about {expected}"
-    )
 
 
 def optimize(
@@ -281,6 +259,7 @@ def optimize(
         now = State(
             adam=optimizer.adam,
             anchor=optimizer.anchor,
+            exposures=None if optimizer.exposures is None else optimizer.exposures.maps,
             step=optimizer.step,
             seconds=time.monotonic() - start,
             facts=state.facts,
@@ -312,32 +291,3 @@ def read_rows(path: Path) -> list[LogRow]:
         return [{name: float(cell) for name, cell in row.items()} for row in read_log(path)]
     except ValueError as error:
         raise InputError(f"{path}: damaged: {error}") from error
-
-
-def compare(optimizer: Optimizer, held_out: Sequence[int]) -> tuple[Comparison, ...]:
-    """Evenly spaced held-out photographs beside renders of their views."""
-
-    def pixels(image: torch.Tensor) -> UInt8[np.ndarray, "H W 3"]:
-        return (image * 255 + 0.5).to(torch.uint8).numpy()
-
-    comparisons = []
-    for view in (held_out[index] for index in even_indices(len(held_out), MAX_COMPARISONS)):
-        photo = optimizer.photographs.at_scale(view)
-        comparisons.append(
-            Comparison(
-                name=optimizer.photographs.names[view],
-                photograph=pixels(photo.image),
-                render=pixels(optimizer.picture(view, photo)),
-            )
-        )
-    return tuple(comparisons)
-
-
-def describe(row: LogRow) -> str:
-    """The scores of a row in words."""
-    overall = f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}"
-    if "seen_psnr" not in row:
-        return overall
-    return (
-        f"{row['seen_psnr']:.2f} dB where a fitted photograph shows the surface ({row['seen']:.0%}), {overall} in all"
-    )

@@ -27,6 +27,7 @@ class Score(NamedTuple):
     Attributes:
         psnr: in dB, of the pixels that masks leave.
         ssim: structural similarity of the same.
+        matched_psnr: in dB, as psnr, after the colors of each render were fitted to its photograph by an affine map.
         seen_psnr: in dB, of those of them that some fitted photograph shows too; None where no sensor tells.
         seen_ssim: structural similarity of the same.
         seen: share of the pixels that are such.
@@ -34,6 +35,7 @@ class Score(NamedTuple):
 
     psnr: float
     ssim: float
+    matched_psnr: float
     seen_psnr: float | None = None
     seen_ssim: float | None = None
     seen: float | None = None
@@ -129,7 +131,10 @@ def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Te
     for view in views:
         photo = optimizer.photographs.at_scale(view)
         picture = optimizer.picture(view, photo)
-        complete.append((psnr(picture, photo.image, photo.mask), float(ssim(picture, photo.image, photo.mask))))
+        matched = psnr(optimizer.matched_picture(view, photo), photo.image, photo.mask)
+        complete.append(
+            (psnr(picture, photo.image, photo.mask), float(ssim(picture, photo.image, photo.mask)), matched)
+        )
         if view in seen:
             mask = seen[view] if photo.mask is None else seen[view] & photo.mask
             shares.append(float(mask.float().mean()))

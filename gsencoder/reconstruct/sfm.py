@@ -15,10 +15,11 @@ from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.data.readers.images import check_picture
 from gsencoder.data.readers.undistort import load_pycolmap
+from gsencoder.data.video.decode import SUFFIXES as VIDEO_SUFFIXES
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")
-OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".nef", ".arw", ".mp4", ".mov", ".avi")
-"""Pictures and films that pycolmap does not read; that they are left out is said."""
+OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".nef", ".arw", *VIDEO_SUFFIXES)
+"""Pictures and videos that pycolmap does not read; that they are left out is said."""
 MAX_PIXELS, MAX_FEATURES = 100_000, 1_000_000
 PLACED_FILE = "placed.json"
 BYTES_PER_FEATURE, TYPICAL_FEATURES = 160, 8192
@@ -79,13 +80,16 @@ def _names_with(folder: Path, suffixes: tuple[str, ...]) -> list[str]:
     return sorted(entry.name for entry in entries if entry.suffix.lower() in suffixes)
 
 
-def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed:
+def place_photographs(
+    folder: Path, work: Path, config: SfmConfig = SfmConfig(), *, single_camera: bool = False
+) -> Placed:
     """Finds poses and intrinsics. Every photograph is decoded before.
 
     Args:
         folder: of the photographs.
         work: an existing folder for COLMAP's database; the model is written to `sparse/0` in it.
         config: see there.
+        single_camera: whether one camera took them all with one focal length, as the frames of a video.
 
     Raises:
         InputError: fewer than three photographs, one that cannot be decoded or has a name that is no UTF-8, no two
@@ -112,7 +116,7 @@ def place_photographs(folder: Path, work: Path, config: SfmConfig = SfmConfig())
     _check_room(work, len(names), config)
     attempts.mkdir()
     try:
-        _find_features(pycolmap, database, folder, names, config)
+        _find_features(pycolmap, database, folder, names, config, single_camera)
         _match(pycolmap, database, len(names), config)
         models = pycolmap.incremental_mapping(database, folder, attempts, options=_mapping(pycolmap))
     except (RuntimeError, ValueError) as error:
@@ -195,7 +199,7 @@ def _check(folder: Path, names: list[str]) -> None:
     if others:
         warnings.warn(
             f"{folder}: {len(others)} files are in formats that cannot be placed and are not used: "
-            f"{listed(others)}; expected {', '.join(SUFFIXES)}",
+            f"{listed(others)}; expected {', '.join(SUFFIXES)}, or a video by itself",
             SceneWarning,
             stacklevel=3,
         )
@@ -221,7 +225,9 @@ def _placed(model: Path, summary: Mapping[str, Any]) -> Placed:
     )
 
 
-def _find_features(pycolmap: Any, database: Path, folder: Path, names: list[str], config: SfmConfig) -> None:
+def _find_features(
+    pycolmap: Any, database: Path, folder: Path, names: list[str], config: SfmConfig, single_camera: bool
+) -> None:
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = config.size
     extraction.use_gpu = False
@@ -232,7 +238,7 @@ def _find_features(pycolmap: Any, database: Path, folder: Path, names: list[str]
         database,
         folder,
         image_names=names,
-        camera_mode=pycolmap.CameraMode.AUTO,
+        camera_mode=pycolmap.CameraMode.SINGLE if single_camera else pycolmap.CameraMode.AUTO,
         reader_options=reader,
         extraction_options=extraction,
         device=pycolmap.Device.cpu,

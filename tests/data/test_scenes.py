@@ -97,7 +97,7 @@ def test_scaling_keeps_rays_and_sizes_in_step(tmp_path: Path) -> None:
 
 
 def test_nothing_recognised_says_what_was_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"looked for transforms\.json.*COLMAP.*ScanNet.*splat"):
+    with pytest.raises(InputError, match=r"one of: transforms\.json.*COLMAP.*ScanNet.*Replica.*; a splat"):
         load_scene(tmp_path)
     with pytest.raises(InputError, match="no such file or folder"):
         load_scene(tmp_path / "nowhere")

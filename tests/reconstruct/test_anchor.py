@@ -84,9 +84,12 @@ def test_a_anchor_is_pruned_with_its_gaussians_and_taken_up_with_them(tmp_path: 
     assert cut.anchor is not None
     assert len(cut.raw["means"]) == len(cut.anchor.means) < len(held(0.3).raw["means"])
     assert strayed(cut, cut.anchor).max() < 3**0.5
-    save_state(tmp_path / "state", State(adam=cut.adam, anchor=cut.anchor, step=12, seconds=0.0, facts={}), {})
+    assert cut.exposures is not None
+    state = State(adam=cut.adam, anchor=cut.anchor, exposures=cut.exposures.maps, step=12, seconds=0.0, facts={})
+    save_state(tmp_path / "state", state, {})
     found = load_state(tmp_path / "state", {}, steps=30, sh_degree=0)
-    again = Optimizer(found.adam, cut.photographs, cut.training, ALL, prune=PRUNED, anchor=found.anchor, step=12)
+    held_back = {"anchor": found.anchor, "exposures": found.exposures}
+    again = Optimizer(found.adam, cut.photographs, cut.training, ALL, prune=PRUNED, step=12, **held_back)
     for _ in range(8):
         again.advance()
     for name, value in whole.raw.items():

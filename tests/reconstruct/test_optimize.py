@@ -112,12 +112,16 @@ def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None
         whole.advance()
     for _ in range(8):
         cut.advance()
-    state = State(adam=cut.adam, anchor=None, step=cut.step, seconds=1.5, facts={"seeds": 7})
+    assert cut.exposures is not None
+    maps = cut.exposures.maps
+    assert not torch.equal(maps[0], maps[1])
+    state = State(adam=cut.adam, anchor=None, exposures=maps, step=cut.step, seconds=1.5, facts={"seeds": 7})
     save_state(tmp_path / "state", state, {"run": 1})
     asked = {"steps": QUICK.steps, "sh_degree": QUICK.sh_degree}
     found = load_state(tmp_path / "state", {"run": 1}, **asked)
     assert (found.step, found.seconds, found.facts) == (8, 1.5, {"seeds": 7})
-    again = Optimizer(found.adam, cut.photographs, cut.training, QUICK, prune=NEVER, step=found.step)
+    carried_on = {"exposures": found.exposures, "step": found.step}
+    again = Optimizer(found.adam, cut.photographs, cut.training, QUICK, prune=NEVER, **carried_on)
     for _ in range(12):
         again.advance()
     for name, value in whole.raw.items():

@@ -15,6 +15,7 @@ from gsencoder.data.readers.scene_splat import find_splat
 from gsencoder.data.scenes import SceneConfig, find_scenes, has_views, load_scene, read_posed, scene_name
 from gsencoder.data.splat_formats.repair import SplatReport, inspect_splat
 from gsencoder.data.splats import READABLE, read_raw
+from gsencoder.data.video.decode import refuse_video
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +77,7 @@ def _inspect(path: Path, config: InspectConfig, summary: Summary, folder: Path |
     """What there is to say about a splat or a scene."""
     if path.exists() and has_views(path):
         return _inspect_scene(path, config, summary, folder)
+    refuse_video(path)
     source = find_splat(path) if path.is_dir() else path
     with summary.step("read"):
         raw = read_raw(source)

@@ -23,10 +23,12 @@ from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats import READABLE, save_splat
+from gsencoder.data.video.frames import RECORD_FILE, VideoConfig
 from gsencoder.infer.draw.pictures import contact_sheet
 from gsencoder.reconstruct.budget import choose_scale
-from gsencoder.reconstruct.open_scene import OpenedScene, find_photographed, open_scene
-from gsencoder.reconstruct.run import Comparison, LogRow, ReconstructConfig, describe, reconstruct
+from gsencoder.reconstruct.open_scene import FRAMES_FOLDER, OpenedScene, find_photographed, open_scene
+from gsencoder.reconstruct.report import Comparison, LogRow, describe
+from gsencoder.reconstruct.run import ReconstructConfig, reconstruct
 from gsencoder.reconstruct.score import Score
 from gsencoder.reconstruct.sfm import SfmConfig
 
@@ -40,7 +42,7 @@ class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
     paths: tuple[str, ...] = field(
         default=(),
         metadata={
-            "help": "scenes with photographs and poses, folders of photographs alone, or folders of these",
+            "help": "scenes with photographs and poses, folders of photographs alone, videos, or folders of these",
             "metavar": "SCENE",
             "required": True,
         },
@@ -54,6 +56,7 @@ class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
     )
     data: SceneConfig = field(default_factory=SceneConfig)
     sfm: SfmConfig = field(default_factory=SfmConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
 
     def __post_init__(self) -> None:
         ReconstructConfig.__post_init__(self)
@@ -85,7 +88,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
     ):
         refuse_to_replace_inputs(work.path, settings(config))
         work.take(anew=not config.resume)
-        opened = open_scene(path, work.path, splat=config.splat, data=config.data, sfm=config.sfm)
+        opened = _open(path, work.path, config, config.data)
         opened = _at_affordable_size(opened, path, work.path, config, screen)
         summary.add_seconds(opened.seconds)
         with summary.step("check"):
@@ -93,7 +96,8 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
         if opened.sfm is not None:
             sfm = opened.sfm
             summary.results.update(placed=len(sfm.placed), missing=list(sfm.missing), sfm_error=sfm.error)
-        reading = {"data": settings(config.data), "sfm": settings(config.sfm)}
+        parts = ("data", "sfm", "video") if opened.is_video else ("data", "sfm")
+        reading = {name: settings(getattr(config, name)) for name in parts}
         made_from = {"scene": str(path.resolve()), "splat": config.splat, **reading}
         result = reconstruct(
             opened.scene,
@@ -111,6 +115,9 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             # Without its poses the splat could not be fused.
             shutil.copytree(opened.sfm.model, folder / MODEL_FOLDER)
             summary.results["model"] = MODEL_FOLDER
+        if opened.is_video and opened.photographs is not None:
+            shutil.copytree(opened.photographs, folder / FRAMES_FOLDER, ignore=shutil.ignore_patterns(RECORD_FILE))
+            summary.results["images"] = FRAMES_FOLDER
         shutil.copy(work.path / LOG_FILE, folder / LOG_FILE)
         draw(folder / PICTURES_FILE, result.comparisons)
         last: LogRow = result.log[-1] if result.log else {}
@@ -120,6 +127,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             steps=result.steps,
             views=len(result.training),
             held_out=len(result.held_out),
+            exposure=None if result.exposure is None else [min(result.exposure), max(result.exposure)],
             **{name: last.get(name) for name in Score._fields},
             splat=PLY_FILE,
             log=LOG_FILE,
@@ -127,10 +135,16 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
     scores = f"; {describe(last)} on {len(result.held_out)} held-out photographs" if last else ""
     screen.print(f"{out / PLY_FILE}: {len(result.gaussians):,} Gaussians{scores}")
     if opened.sfm is not None:
+        images = "" if opened.is_video else f" data.images={opened.photographs}"
         screen.print(
-            f"{out} holds the poses of the photographs, as a COLMAP scene: gsencoder fuse {out} splat={PLY_FILE} "
-            f"data.images={opened.photographs}"
+            f"{out} holds the poses of the photographs, as a COLMAP scene: gsencoder fuse {out} "
+            f"splat={PLY_FILE}{images}"
         )
+
+
+def _open(path: Path, work: Path, config: ReconstructCommandConfig, data: SceneConfig) -> OpenedScene:
+    track = Progress(quiet=config.quiet)
+    return open_scene(path, work, splat=config.splat, data=data, sfm=config.sfm, video=config.video, track=track)
 
 
 def _at_affordable_size(
@@ -147,7 +161,7 @@ def _at_affordable_size(
     with warnings.catch_warnings():
         # They were shown when the scene was read at its full size.
         warnings.simplefilter("ignore", SceneWarning)
-        smaller = open_scene(path, work, splat=config.splat, data=data, sfm=config.sfm)
+        smaller = _open(path, work, config, data)
     width, height = (int(np.median(sizes)) for sizes in (views.cameras.widths, views.cameras.heights))
     screen.print(
         f"photographs of {width}×{height} are looked at {scale:g} times as large, for a result in about "

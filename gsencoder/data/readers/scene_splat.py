@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.layouts import describe_layouts
 from gsencoder.data.readers.posed import choose_origin
-from gsencoder.data.readers.transforms_json import TRANSFORMS
 from gsencoder.data.splats import gaussians_from_raw, read_raw
+from gsencoder.data.video.decode import refuse_video
 from gsencoder.types import Gaussians
 
 SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog")
@@ -26,6 +27,7 @@ def find_splat(root: Path) -> Path:
     if root.is_file():
         if root.suffix.lower() in SPLAT_SUFFIXES or root.name == "meta.json":
             return root
+        refuse_video(root)
         raise InputError(f"{root}: expected a transforms.json or a splat ({', '.join(SPLAT_SUFFIXES)})")
     if (root / "meta.json").is_file():
         return root
@@ -35,10 +37,7 @@ def find_splat(root: Path) -> Path:
     if files:
         names = ", ".join(path.name for path in files[:5])
         raise InputError(f"{root}: holds {len(files)} splats ({names}) and no views; give one of them")
-    raise InputError(
-        f"{root}: not a scene; looked for {' or '.join(TRANSFORMS)}, a COLMAP model (sparse/0, sparse, cameras.bin or "
-        f"cameras.txt), a ScanNet export (color/, pose/) and a splat ({', '.join(SPLAT_SUFFIXES)}, meta.json)"
-    )
+    raise InputError(f"{root}: not a scene; a scene holds one of: {describe_layouts()}; a splat")
 
 
 def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:

@@ -27,7 +27,7 @@ def test_a_room_becomes_a_splat_with_a_log_and_pictures(built: Path) -> None:
     assert len(splat) == results["gaussians"] > 500
     assert splat.sh_degree == 1
     lines = (built / "log.csv").read_text().splitlines()
-    assert lines[0] == "step,seconds,gaussians,psnr,ssim,seen_psnr,seen_ssim,seen"
+    assert lines[0] == "step,seconds,gaussians,psnr,ssim,matched_psnr,seen_psnr,seen_ssim,seen"
     first, last = (dict(zip(lines[0].split(","), map(float, line.split(",")), strict=True)) for line in lines[1:])
     assert (first["step"], last["step"]) == (0, 12)
     assert last["psnr"] == results["psnr"] > first["psnr"]

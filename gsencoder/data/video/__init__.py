@@ -1,0 +1,1 @@
+"""Videos: the frames of a film that structure from motion can use."""

@@ -1,0 +1,91 @@
+"""Per-photograph affine colors: a camera that sets exposure and white balance anew for every photograph shows one
+surface in several colors, which must not be explained by geometry or by colors that depend on the direction."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+RIDGE = 1e-3
+"""Pull toward the identity, as a variance of colors in [0, 1]: what a picture does not vary in is not fitted."""
+STEP = 0.5
+"""How far a map moves toward the one that fits best, each time its photograph is looked at."""
+OPAQUE = 0.5
+"""Pixels of a render below this alpha show the background, and tell nothing."""
+SAME = 0.03
+"""Photographs whose brightness differs by less from the mean do not count as differing in exposure."""
+
+IDENTITY = torch.eye(3, 4)
+
+
+class Exposures:
+    """An affine map of colors for each fitted photograph, relative to the mean of all.
+
+    The maps are not optimized by gradients: photographs are looked at too seldom for that. Each time a render of one is
+    at hand, its map moves halfway to the least-squares fit. What all maps have in common, such as the loss of contrast
+    where the splat is still blurred, is left to the splat: only the difference from their mean is applied.
+
+    Attributes:
+        maps: of the fitted photographs in their order, [V, 3, 4]: a matrix and an offset.
+    """
+
+    def __init__(self, training: Sequence[int], maps: Float[Tensor, "V 3 4"] | None = None) -> None:
+        """Args:
+        training: row numbers of the fitted photographs.
+        maps: of a run that is continued; None = nothing is known yet.
+        """
+        self._rows = {view: row for row, view in enumerate(training)}
+        self.maps = IDENTITY.repeat(len(training), 1, 1) if maps is None else maps
+
+    def moved(self, view: int, fitted: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+        """The map of a photograph, a step nearer to the one that fits; nothing changes."""
+        return self.maps[self._rows[view]].lerp(fitted, STEP)
+
+    def relative(self, view: int, moved: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+        """What is applied to a render of a photograph whose map is `moved`."""
+        own = self.maps[self._rows[view]]
+        return moved - (self.maps.sum(0) + moved - own) / len(self.maps) + IDENTITY
+
+    def set(self, view: int, moved: Float[Tensor, "3 4"]) -> None:
+        """Replaces the map of a photograph."""
+        self.maps[self._rows[view]] = moved
+
+    def brightness(self) -> Float[Tensor, " V"]:
+        """How bright each photograph is, relative to their mean: what its map makes of a middle grey."""
+        relative = self.maps - self.maps.mean(0) + IDENTITY
+        return (0.5 * relative[..., :3].sum(-1) + relative[..., 3]).mean(-1) / 0.5
+
+
+def fitted_colors(
+    render: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], known: Bool[Tensor, "H W"]
+) -> Float[Tensor, "3 4"]:
+    """The affine map A·c + b of the render's colors that is nearest to the photograph's, by ridge regression.
+
+    Args:
+        render: in [0, 1].
+        image: the photograph.
+        known: pixels to compare; without any the map is the identity.
+
+    Returns:
+        A in the first three columns and b in the last, on the CPU.
+    """
+    weights = known.unsqueeze(-1).to(render.dtype)
+    inputs = torch.cat((render, torch.ones_like(render[..., :1])), dim=-1) * weights
+    rows, wanted = inputs.flatten(0, 1), ((image - render) * weights).flatten(0, 1)
+    count = float(known.sum().clamp(min=1))
+    gram, moments = ((rows.T @ other).double().cpu() / count for other in (rows, wanted))
+    change = torch.linalg.solve(gram + RIDGE * torch.eye(4, dtype=torch.float64), moments)
+    return IDENTITY + change.T.float()
+
+
+def apply_colors(colors: Float[Tensor, "H W 3"], affine: Float[Tensor, "3 4"]) -> Float[Tensor, "H W 3"]:
+    """A·c + b for each pixel."""
+    affine = affine.to(colors)
+    return colors @ affine[:, :3].T + affine[:, 3]
+
+
+def known_pixels(alpha: Float[Tensor, "H W"], mask: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"]:
+    """Pixels whose colors are compared: what the splat covers and the mask leaves."""
+    covered = alpha > OPAQUE
+    return covered if mask is None else covered & mask.to(covered.device)

@@ -1,0 +1,89 @@
+"""What a reconstruction tells people: its plan, its scores, and held-out photographs beside renders."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from gsencoder.core.even_indices import even_indices
+from gsencoder.reconstruct.exposure import SAME
+from gsencoder.reconstruct.optimize import Optimizer
+
+MAX_COMPARISONS = 4
+"""Held-out photographs of which the result holds a render."""
+MATCHED_GAIN = 0.5
+"""Smallest gain in dB by fitting the exposure of held-out photographs that is worth a word."""
+LogRow = dict[str, int | float]
+"""One line of the log: step, seconds, gaussians, and the fields of a Score."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Comparison:
+    """A held-out photograph and the render of the same view.
+
+    Attributes:
+        name: of the view.
+        photograph: as decoded.
+        render: of the reconstructed splat; in the colors that fit the photograph best where photographs differ in
+            exposure.
+    """
+
+    name: str
+    photograph: UInt8[np.ndarray, "H W 3"]
+    render: UInt8[np.ndarray, "H W 3"]
+
+
+def describe_plan(optimizer: Optimizer, usual: int, seconds: float) -> str:
+    """What is about to happen, and how long it should take."""
+    widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
+    steps = optimizer.config.steps
+    fewer = f" instead of {usual:,} (budget.minutes)" if steps != usual else ""
+    expected = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"
+    return (
+        f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "
+        f"{len(optimizer.raw['means']):,} Gaussians, {steps - optimizer.step:,} steps{fewer}: about {expected}"
+    )
+
+
+def describe_exposure(darkest: float, brightest: float) -> str | None:
+    """How the photographs differ in brightness, relative to their mean; None where they hardly do."""
+    if 1 - darkest <= SAME and brightest - 1 <= SAME:
+        return None
+    return (
+        f"the exposure of photographs differs: {darkest:.2f} to {brightest:.2f} times the mean brightness; a map of "
+        "colors was fitted to each (optimize.exposure=false fits them as they are)"
+    )
+
+
+def compare(optimizer: Optimizer, held_out: Sequence[int], *, matched: bool) -> tuple[Comparison, ...]:
+    """Evenly spaced held-out photographs beside renders of their views, whose exposure is matched if so wanted."""
+    picture = optimizer.matched_picture if matched else optimizer.picture
+
+    def pixels(image: torch.Tensor) -> UInt8[np.ndarray, "H W 3"]:
+        return (image * 255 + 0.5).to(torch.uint8).numpy()
+
+    comparisons = []
+    for view in (held_out[index] for index in even_indices(len(held_out), MAX_COMPARISONS)):
+        photo = optimizer.photographs.at_scale(view)
+        comparisons.append(
+            Comparison(
+                name=optimizer.photographs.names[view],
+                photograph=pixels(photo.image),
+                render=pixels(picture(view, photo)),
+            )
+        )
+    return tuple(comparisons)
+
+
+def describe(row: LogRow) -> str:
+    """The scores of a row in words."""
+    overall = f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}"
+    if row["matched_psnr"] - row["psnr"] > MATCHED_GAIN:
+        overall = f"{row['matched_psnr']:.2f} dB with exposures matched, {overall} without"
+    if "seen_psnr" not in row:
+        return overall
+    return (
+        f"{row['seen_psnr']:.2f} dB where a fitted photograph shows the surface ({row['seen']:.0%}), {overall} in all"
+    )

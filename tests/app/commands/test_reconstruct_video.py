@@ -1,0 +1,118 @@
+"""`gsencoder reconstruct VIDEO`: frames, poses and a splat, which together are a scene."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reconstructions import summary_of
+from textured_box import box_cameras, look
+
+from gsencoder import load_scene
+from gsencoder.app import cli
+from gsencoder.reconstruct import run as reconstruct
+
+av = pytest.importorskip("av")
+pytestmark = pytest.mark.slow
+
+QUICK = ["steps=6", "optimize.shrinks=[1]", "optimize.shares=[1.0]", "frames=16", "holdout=0", "quiet=true"]
+FRAMES = 48
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("videos") / "walk.mp4"
+    cameras = box_cameras(FRAMES)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for view in range(FRAMES):
+            frame = av.VideoFrame.from_ndarray(look(cameras, view)[0], format="rgb24")
+            for packet in stream.encode(frame):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    return path
+
+
+@pytest.fixture(scope="module")
+def built(video: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("built") / "walk"
+    assert cli.main(["reconstruct", str(video), f"out={out}", *QUICK]) == 0
+    return out
+
+
+def test_the_results_of_a_video_are_a_scene_by_themselves(built: Path) -> None:
+    results = summary_of(built)["results"]
+    assert results["placed"] >= 14
+    scene = load_scene(built, splat="splat.ply")
+    assert scene.views is not None
+    assert scene.views.images is not None
+    assert len(scene.views) == results["placed"]
+    assert len(list((built / "images").glob("*.jpg"))) == results["placed"] + len(results["missing"])
+    assert scene.views.images[0].shape == (240, 320, 3)
+    # One camera took all frames; that of the box has a focal length of 224 pixels.
+    focal = scene.views.cameras.Ks[:, 0, 0]
+    assert np.ptp(focal) < 1e-3
+    assert focal[0] == pytest.approx(224, rel=0.05)
+    assert not built.with_name("walk.reconstruction").exists()
+
+
+def test_cameras_of_a_video_stand_where_they_stood(built: Path) -> None:
+    scene = load_scene(built, splat="splat.ply")
+    assert scene.views is not None
+    numbers = [int(name[6:12]) for name in scene.views.names]
+    found, truth = scene.views.cameras.centers, box_cameras(FRAMES).centers[numbers]
+    found, truth = found - found.mean(0), truth - truth.mean(0)
+    # Up to the similarity that photographs leave open (Umeyama, 1991).
+    left, stretch, right = np.linalg.svd(truth.T @ found)
+    left[:, 2] *= np.linalg.det(left) * np.linalg.det(right)
+    fitted = stretch.sum() / (found**2).sum() * found @ (left @ right).T
+    errors = np.linalg.norm(fitted - truth, axis=1)
+    assert np.median(errors) < 0.03 * np.linalg.norm(truth, axis=1).mean()
+
+
+def test_a_run_that_was_cut_off_takes_up_its_frames_and_poses(
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    advance, out = reconstruct.Optimizer.advance, tmp_path / "walk"
+
+    def stop_at_three(self: reconstruct.Optimizer) -> dict[str, float]:
+        if self.step == 3:
+            raise KeyboardInterrupt
+        return advance(self)
+
+    words = ["reconstruct", str(video), f"out={out}", *QUICK]
+    monkeypatch.setattr(reconstruct.Optimizer, "advance", stop_at_three)
+    assert cli.main(words) == 130
+    frames = tmp_path / "walk.reconstruction" / "images"
+    before = {path.name: path.stat().st_mtime_ns for path in frames.iterdir()}
+    assert len(before) > 10
+    monkeypatch.setattr(reconstruct.Optimizer, "advance", advance)
+    monkeypatch.setattr("gsencoder.reconstruct.open_scene.place_photographs", None)
+    assert cli.main(words) == 0
+    after = {path.name: path.stat().st_mtime_ns for path in (out / "images").iterdir()}
+    # shutil.copytree keeps the times.
+    assert all(after[name] == stamp for name, stamp in before.items() if name.endswith(".jpg"))
+
+
+def test_videos_of_a_folder_are_scenes_of_their_own_and_one_that_is_damaged_stops_no_other(
+    video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "walk.mp4").symlink_to(video)
+    (tmp_path / "broken.mov").write_bytes(b"no video")
+    out = tmp_path / "out"
+    assert cli.main(["reconstruct", str(tmp_path), f"out={out}", *QUICK]) == 2
+    assert (out / "walk" / "splat.ply").is_file()
+    assert not (out / "broken").exists()
+    said = capfd.readouterr().err
+    assert "1 of 2 scenes failed" in said
+    assert "broken.mov: not a video that can be decoded" in said
+
+
+@pytest.mark.parametrize("command", ["inspect", "fuse"])
+def test_other_commands_say_what_makes_a_scene_of_a_video(
+    video: Path, command: str, capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = [] if command == "inspect" else [f"out={tmp_path / 'out'}", "teacher=palette"]
+    assert cli.main([command, str(video), *words]) == 2
+    assert "walk.mp4: is a video; gsencoder reconstruct makes a scene of it" in capfd.readouterr().err
