@@ -102,7 +102,7 @@ def test_photographs_are_placed_whatever_lies_in_folders_beside_them(
     shutil.copytree(room, folder / "room")
     asked = []
 
-    def remembered(pictures: Path, *_: object) -> None:
+    def remembered(pictures: Path, *_: object, **__: object) -> None:
         asked.append(pictures)
         raise InputError("stop")
 
