@@ -22,7 +22,7 @@ from gsencoder.evaluate.protocols.localization import LocalizationProtocol, scor
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.localize.relevancy import ThresholdConfig
+from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
@@ -76,7 +76,11 @@ def main() -> None:
         scene = dataclasses.replace(scene, objects=known)
         for level in THRESHOLDS:
             found, _ = score_queries(
-                scene, features, table, LocalizationProtocol(), LocalizeConfig(threshold=ThresholdConfig(fixed=level))
+                scene,
+                features,
+                table,
+                LocalizationProtocol(),
+                LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=level)),
             )
             hits[level] += found
         print(f"asked {Path(path).name} after {time.perf_counter() - start:.0f} s", flush=True)

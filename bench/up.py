@@ -25,7 +25,7 @@ from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.build import build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.localize.relevancy import ThresholdConfig
+from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.text.table import TextTable
 from gsencoder.types import Box, Scene
 
@@ -67,7 +67,7 @@ def turned_splat(scene: Scene, other: Scene, rotation: np.ndarray) -> Scene:
 
 def first_boxes(scene: Scene, words: TextTable, names: list[str]) -> dict[str, Box]:
     """The best box of each name."""
-    config = LocalizeConfig(threshold=ThresholdConfig(fixed=0.5))
+    config = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.5))
     result = localize(scene, names, words, config)
     return {box.query: box for box in result.boxes if box.rank == 0}
 

@@ -23,7 +23,7 @@ from gsencoder.fusion.teachers.build import build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.localize.relevancy import ThresholdConfig
+from gsencoder.infer.localize.threshold import ThresholdConfig
 
 VISIBILITIES = {
     "none": VisibilityConfig(against=()),
@@ -70,7 +70,7 @@ def main() -> None:
                     features = fuse(scene, labels, config).features
                     seen.setdefault((voxel, lift, name), []).append(float(features.seen.mean()))
                     for level in thresholds:
-                        asked = LocalizeConfig(threshold=ThresholdConfig(fixed=level))
+                        asked = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=level))
                         found, _ = score_queries(scene, features, words, LocalizationProtocol(), asked)
                         hits.setdefault((voxel, lift, name, level), []).extend(found)
         print(f"{path.name}: {time.perf_counter() - start:.0f} s", flush=True)

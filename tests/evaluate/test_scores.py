@@ -22,6 +22,7 @@ def box(query: str, rank: int, low: float, high: float) -> Box:
         query=query,
         rank=rank,
         score=1.0 - 0.1 * rank,
+        probability=1.0,
         aabb_min=ONES * low,
         aabb_max=ONES * high,
         obb_center=ONES * (low + high) / 2,
@@ -72,6 +73,7 @@ def test_the_first_box_counts_and_any_object_of_its_name_may_be_the_one_found() 
         queries=("cup",),
         relevancy=np.zeros((1, 1), np.float32),
         thresholds=np.zeros(1, np.float32),
+        probabilities=np.ones(1, np.float32),
         # Out of order: ranks decide.
         boxes=(box("cup", 1, 0, 1), box("cup", 0, 5, 6.5)),
     )

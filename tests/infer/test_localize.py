@@ -11,8 +11,9 @@ import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer.draw.boxes_ply import EDGES, box_corners, write_boxes_ply
-from gsencoder.infer.localize.localize import LocalizeConfig, localization_to_json, localize
-from gsencoder.infer.localize.relevancy import ThresholdConfig
+from gsencoder.infer.localize.localization_json import localization_to_json
+from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.text.encoder import TextEncoder
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import Box, FeatureBasis, GaussianFeatures, Gaussians, Localization, Scene
@@ -103,6 +104,7 @@ def test_words_asked_together_are_found_as_they_are_one_by_one() -> None:
                 queries=together.queries,
                 relevancy=together.relevancy,
                 thresholds=together.thresholds,
+                probabilities=together.probabilities,
                 boxes=tuple(alone),
             )
         )
@@ -164,7 +166,7 @@ def test_every_kind_of_threshold_finds_the_chairs(kind: str) -> None:
 
 
 def test_contrast_finds_words_and_counts_the_negative_words_that_the_table_lacks() -> None:
-    config = LocalizeConfig(contrast=True, threshold=ThresholdConfig(fixed=0.8))
+    config = LocalizeConfig(contrast=True, threshold=ThresholdConfig(kind="fixed", fixed=0.8))
     with pytest.warns(SceneWarning, match="4 of 4 negative words are unknown to toy .*the mean of its words stands"):
         found = localize(SCENE, ["mug", "lamp"], TABLE, config)
     assert np.linalg.norm(first(found, "mug").center - PLACES["mug"][0]) < 0.02
@@ -283,7 +285,11 @@ def test_the_edges_of_a_box_are_its_twelve_sides() -> None:
 
 def test_no_boxes_make_an_empty_ply(tmp_path: Path) -> None:
     empty = Localization(
-        queries=("mug",), relevancy=np.zeros((1, 0), np.float32), thresholds=np.zeros(1, np.float32), boxes=()
+        queries=("mug",),
+        relevancy=np.zeros((1, 0), np.float32),
+        thresholds=np.zeros(1, np.float32),
+        probabilities=np.zeros(1, np.float32),
+        boxes=(),
     )
     write_boxes_ply(tmp_path / "none.ply", Scene(name="x"), empty)
     assert b"element vertex 0\n" in (tmp_path / "none.ply").read_bytes()

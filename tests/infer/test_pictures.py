@@ -30,6 +30,7 @@ def make_box(center: tuple[float, ...], size: tuple[float, ...] = (1, 1, 1), que
         query=query,
         rank=rank,
         score=0.75,
+        probability=1.0,
         aabb_min=middle - sides / 2,
         aabb_max=middle + sides / 2,
         obb_center=middle,

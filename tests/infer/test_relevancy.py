@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.localize.relevancy import ThresholdConfig, otsu, relevancy, threshold
+from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.infer.localize.threshold import ThresholdConfig, otsu, threshold
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 SPACE = FeatureSpace(name="toy", channels=24, text_encoder="toy")
@@ -181,6 +182,18 @@ def test_thresholds_of_each_kind() -> None:
     assert math.isnan(threshold(scores[-1:], ThresholdConfig()))
 
 
+def test_the_adaptive_threshold_follows_the_best_between_the_noise_and_the_fixed_value() -> None:
+    config = ThresholdConfig(fixed=0.5, relative=0.6, noise=4.0)
+    # Values from 0 to 0.1: median 0.05, median deviation 0.025, so that the noise ends at 0.05 + 4 · 1.4826 · 0.025.
+    background = np.linspace(0, 0.1, 10_001)
+    noise = 0.05 + 4 * 1.4826 * 0.025
+    for best, expected in ((1.0, 0.5), (0.9, 0.5), (0.7, 0.42), (0.5, 0.3), (0.25, noise), (0.1, noise)):
+        values = np.r_[background, best if best > 0.1 else np.zeros(0)].astype(np.float32)
+        assert threshold(values, config) == pytest.approx(expected, abs=1e-4)
+    # The noise is no reason to ask for more than the fixed value.
+    assert threshold(np.linspace(-0.9, 0.7, 99).astype(np.float32), config) == 0.5
+
+
 def test_otsu_splits_two_groups_between_them(rng: np.random.Generator) -> None:
     few = rng.normal(0.9, 0.02, 50)
     many = rng.normal(0.0, 0.05, 20_000)
@@ -201,7 +214,13 @@ def test_otsu_of_one_value_is_that_value() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "name"), [({"fixed": 1.5}, "fixed"), ({"relative": 0.0}, "relative"), ({"quantile": -0.1}, "quantile")]
+    ("wrong", "name"),
+    [
+        ({"fixed": 1.5}, "fixed"),
+        ({"relative": 0.0}, "relative"),
+        ({"noise": -1.0}, "noise"),
+        ({"quantile": -0.1}, "quantile"),
+    ],
 )
 def test_a_threshold_out_of_range_is_named(wrong: dict[str, float], name: str) -> None:
     with pytest.raises(InputError, match=name):

@@ -122,6 +122,7 @@ def test_every_word_gets_its_pictures_with_names_that_any_disk_takes() -> None:
         queries=words,
         relevancy=np.tile(scores, (3, 1)),
         thresholds=np.full(3, LocalizeConfig().threshold.fixed, np.float32),
+        probabilities=np.ones(3, np.float32),
         boxes=(),
     )
     pictures = dict(relevancy_pictures(scene, found, per_word=2))

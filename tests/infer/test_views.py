@@ -37,6 +37,7 @@ def box_of(word: str, rank: int, rows: np.ndarray) -> Box:
         query=word,
         rank=rank,
         score=0.5,
+        probability=1.0,
         aabb_min=np.zeros(3),
         aabb_max=np.ones(3),
         obb_center=np.full(3, 0.5),
@@ -54,6 +55,7 @@ def test_targets_are_the_best_boxes_of_each_word_with_the_ball_that_holds_them()
         queries=("a", "b", "c"),
         relevancy=np.zeros((3, len(splat_)), np.float32),
         thresholds=np.zeros(3, np.float32),
+        probabilities=np.ones(3, np.float32),
         boxes=boxes,
     )
     assert [each.name for each in targets_of(splat_, found)] == ["a", "b"]

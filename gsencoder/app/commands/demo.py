@@ -25,7 +25,8 @@ from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
-from gsencoder.infer.localize.localize import LocalizeConfig, localization_to_json, localize
+from gsencoder.infer.localize.localization_json import localization_to_json
+from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.types import Scene, SceneObject
 

@@ -17,6 +17,13 @@ from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
+from gsencoder.evaluate.protocols.absent import (
+    AbsentProtocol,
+    absent_scores,
+    evaluate_absent,
+    names_of,
+    probabilities_by_word,
+)
 from gsencoder.evaluate.protocols.localization import (
     LocalizationProtocol,
     SceneOutcome,
@@ -36,6 +43,23 @@ from gsencoder.text.table import TextTable
 from gsencoder.types import Scene
 
 SHOWN_NAMES = 15
+COLUMNS = {
+    "localization": {
+        "objects": "objects",
+        "Acc@0.25": "acc_25",
+        "Acc@0.5": "acc_50",
+        "mean IoU": "mean_iou",
+        "best box": "oracle_mean_iou",
+    },
+    "naming": {"gaussians": "gaussians", "accuracy": "accuracy"},
+    "absent": {
+        "present in": "present",
+        "absent in": "absent",
+        "probability where present": "probability_present",
+        "where absent": "probability_absent",
+    },
+}
+"""Columns of the table of names, and the fields of a row that they show, by protocol."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +76,7 @@ class EvaluateConfig(CommonConfig):
             "help": "encoder whose features are evaluated (see encode); empty = the fused features of the teacher"
         },
     )
-    protocol: LocalizationProtocol | NamingProtocol = field(default_factory=LocalizationProtocol)
+    protocol: LocalizationProtocol | NamingProtocol | AbsentProtocol = field(default_factory=LocalizationProtocol)
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
@@ -78,6 +102,8 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         if isinstance(config.protocol, NamingProtocol):
             _naming(config, config.protocol, source, words, folder, summary)
+        elif isinstance(config.protocol, AbsentProtocol):
+            _absent(config, config.protocol, source, words, folder, summary)
         else:
             _localization(config, config.protocol, source, words, folder, summary)
     screen = console(config.quiet)
@@ -130,6 +156,41 @@ def _naming(
     write_bytes(folder / "names.csv", csv_text(rows).encode())
 
 
+def _absent(
+    config: EvaluateConfig,
+    protocol: AbsentProtocol,
+    source: FeatureSource,
+    words: TextTable,
+    folder: Path,
+    summary: Summary,
+) -> None:
+    vocabulary = protocol.vocabulary or names_of(scene for scene, _ in _scenes(config))
+    scenes = evaluate_absent(
+        _scenes(config),
+        source,
+        words,
+        vocabulary,
+        protocol=protocol,
+        seeds=config.seeds,
+        localization=config.localize,
+    )
+    for scene in scenes:
+        summary.add_seconds(scene.seconds)
+    summary.results.update(
+        protocol="absent",
+        **absent_scores(scenes),
+        names=probabilities_by_word(scenes),
+        scenes=[scene.scene for scene in scenes],
+        words_table="words.csv",
+    )
+    rows = [
+        {"scene": w.scene, "word": w.word, "present": w.present, "probability": w.probability, "boxed": w.boxed}
+        for scene in scenes
+        for w in scene.words
+    ]
+    write_bytes(folder / "words.csv", csv_text(rows).encode())
+
+
 def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
     """Adds scores, scenes and seconds to the summary."""
     hits = [hit for outcome in outcomes for hit in outcome.hits]
@@ -164,6 +225,13 @@ def scores_line(results: dict) -> str:
             f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centered cosine "
             f"{results['cosine']:.3f}"
         )
+    if results["protocol"] == "absent":
+        return (
+            f"{results['present']} present and {results['absent']} absent words in {len(results['scenes'])} scenes: "
+            f"AUROC {results['auroc']:.3f} ± {results['auroc_se']:.3f}, calibration error "
+            f"{results['calibration_error']:.3f}, Brier {results['brier']:.3f}; given a box: "
+            f"{results['boxed_present']:.3f} of the present, {results['boxed_absent']:.3f} of the absent"
+        )
     return (
         f"{results['objects']} objects in {len(results['scenes'])} scenes: Acc@0.25 {results['acc_25']:.3f}, "
         f"Acc@0.5 {results['acc_50']:.3f}, mean IoU {results['mean_iou']:.3f} (best of all boxes: "
@@ -173,16 +241,12 @@ def scores_line(results: dict) -> str:
 
 def names_table(results: dict) -> Table:
     """A table of the names with the lowest scores."""
-    naming = results["protocol"] == "naming"
     names = results["names"]
     table = Table(title="hardest names" if len(names) > SHOWN_NAMES else "names", title_justify="left")
-    columns = ("gaussians", "accuracy") if naming else ("objects", "Acc@0.25", "Acc@0.5", "mean IoU", "best box")
+    columns = COLUMNS[results["protocol"]]
     for title in ("name", *columns):
         table.add_column(title, justify="left" if title == "name" else "right")
     for name, row in list(names.items())[:SHOWN_NAMES]:
-        if naming:
-            table.add_row(name, f"{row['gaussians']:,}", f"{row['accuracy']:.3f}")
-            continue
-        figures = (row["acc_25"], row["acc_50"], row["mean_iou"], row["oracle_mean_iou"])
-        table.add_row(name, str(row["objects"]), *(f"{figure:.3f}" for figure in figures))
+        figures = (row[key] for key in columns.values())
+        table.add_row(name, *(f"{figure:,}" if isinstance(figure, int) else f"{figure:.3f}" for figure in figures))
     return table

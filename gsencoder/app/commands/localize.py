@@ -15,7 +15,8 @@ from gsencoder.core.files.json_values import write_json
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
-from gsencoder.infer.localize.localize import LocalizeConfig, localization_to_json, localize
+from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
+from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
 from gsencoder.types import Localization
 
 
@@ -54,9 +55,11 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
     out = config.out or Path("outputs") / scene.name / "boxes"
     boxes = localization_to_json(localization)
     summary.results.update(boxes=boxes, thresholds=dict(zip(words, localization.thresholds.tolist(), strict=True)))
+    summary.results.update(words=words_to_json(localization))
     summary.results["metres_per_unit"] = scene.metres_per_unit
     with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
         write_json(target / "boxes.json", boxes)
+        write_json(target / "words.json", summary.results["words"])
         write_boxes_ply(target / "boxes.ply", scene, localization)
         if config.pictures and scene.views is not None:
             # Drawing needs torch, which finding boxes does without.
@@ -68,14 +71,18 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
     screen = console(config.quiet)
     for word in words:
         screen.print(f"{word}: {_first_box(localization, word)}")
-    screen.print(f"{out}: boxes.json, boxes.ply and pictures; boxes are drawn around Gaussian {config.localize.extent}")
+    written = "boxes.json, words.json, boxes.ply and pictures"
+    screen.print(f"{out}: {written}; boxes are drawn around Gaussian {config.localize.extent}")
 
 
 def _first_box(localization: Localization, word: str) -> str:
     boxes = [box for box in localization.boxes if box.query == word]
     if not boxes:
-        return "not found"
+        return describe_absent(localization.absent[word])
     best = boxes[0]
     center = ", ".join(f"{value:.3f}" for value in best.center)
     size = " × ".join(f"{value:.3f}" for value in np.asarray(best.aabb_max - best.aabb_min))
-    return f"at ({center}), {size}, score {best.score:.3f}, {len(best.rows):,} Gaussians ({len(boxes)} boxes)"
+    return (
+        f"at ({center}), {size}, probability {best.probability:.2f}, score {best.score:.3f}, "
+        f"{len(best.rows):,} Gaussians ({len(boxes)} boxes)"
+    )

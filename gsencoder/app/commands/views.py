@@ -13,7 +13,8 @@ from gsencoder.core.files.archive import write_archive
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.fusion.store.folder import load_features
-from gsencoder.infer.localize.localize import LocalizeConfig, box_to_json, localize, select_features
+from gsencoder.infer.localize.localization_json import box_to_json, words_to_json
+from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.pictures import describe_view, view_pictures
@@ -74,6 +75,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
         scene = shown_scene(folder, config.photos, config.data)
     boxes: tuple[Box, ...] = ()
     targets: tuple[Target, ...] = ()
+    absent: dict[str, str] = {}
     if config.query or config.queries or config.choose.method == "greedy":
         with summary.step("localize"):
             words = query_words(config.query, config.queries)
@@ -82,10 +84,12 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
             )
             assert scene.gaussians is not None
             targets = targets_of(scene.gaussians, localization, config.boxes)
+        absent = {word: describe_absent(value) for word, value in localization.absent.items()}
         if not targets:
-            raise InputError(f"views: none of {', '.join(words)} was found in scene {scene.name}")
+            listing = ", ".join(f"{word} {text}" for word, text in absent.items())
+            raise InputError(f"views: none of {', '.join(words)} was found in scene {scene.name}: {listing}")
         boxes = best_boxes(localization, config.boxes)
-        summary.results.update(boxes=[box_to_json(box) for box in boxes])
+        summary.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
     with summary.step("choose"):
         views = choose_views(scene, targets, config.choose)
     out = config.out or Path("outputs") / scene.name / "views"
@@ -100,6 +104,8 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
             with summary.step("tokens"):
                 write_tokens(target / TOKENS, scene, views, config)
     screen = console(config.quiet)
+    for word, text in absent.items():
+        screen.print(f"{word}: {text}")
     for number, each in enumerate(views.chosen):
         screen.print(f"{number:2d}  {describe_view(each)}")
     screen.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))

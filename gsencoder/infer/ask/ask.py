@@ -1,7 +1,7 @@
 """From a question about a scene to the prompt of a VLM: words, targets, views, pictures."""
 
 import warnings
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, get_args
 
@@ -13,7 +13,7 @@ from gsencoder.infer.ask.prompts import Task, messages, number_in, prompt_text
 from gsencoder.infer.ask.question_words import ENGLISH, WordRules, words_in
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.draw.pictures import Picture
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
@@ -80,6 +80,7 @@ class Prompt:
         targets: what they are of, in the order of their marks.
         boxes: the boxes of the targets, where words found them.
         words: that were looked for.
+        absent: those of them that are probably absent, and the probability that they are not.
         marks: the numbers that the pictures carry.
     """
 
@@ -89,7 +90,23 @@ class Prompt:
     targets: tuple[Target, ...]
     boxes: tuple[Box, ...]
     words: tuple[str, ...]
+    absent: dict[str, float]
     marks: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LookedUp:
+    """What the words of a question, or its box, lead to.
+
+    Attributes:
+        targets, boxes, absent: see `Prompt`.
+        views: chosen for the targets.
+    """
+
+    targets: tuple[Target, ...]
+    boxes: tuple[Box, ...]
+    absent: dict[str, float]
+    views: ViewSet
 
 
 class Asker:
@@ -120,7 +137,7 @@ class Asker:
         self.scene, self.table, self.space = scene, table, space
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
         self.word_rules = word_rules
-        self._looked_up: dict[Hashable, tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]] = {}
+        self._looked_up: dict[Hashable, LookedUp] = {}
         self._picture_cache: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
 
     def prompt(self, question: Question) -> Prompt:
@@ -140,9 +157,10 @@ class Asker:
         key = (words, question.aabb, question.task == "caption")
         if key not in self._looked_up:
             self._looked_up[key] = self._look_up(words, question)
-        targets, boxes, views = self._looked_up[key]
+        looked_up = self._looked_up[key]
+        targets, boxes, views = looked_up.targets, looked_up.boxes, looked_up.views
         if not targets and self.views.method == "greedy":
-            message = self._nothing(words)
+            message = self._nothing(words, looked_up.absent)
             if question.task != "answer":
                 raise InputError(f"task={question.task}: {message}; give query= or aabb=")
             warnings.warn(f"{message}: evenly spread views are shown", SceneWarning, stacklevel=2)
@@ -153,8 +171,25 @@ class Asker:
         # A thing in a box that was given has no name.
         names = [box.query for box in boxes] or ["" for _ in targets]
         kinds = picture_kinds(self.scene, views)
-        text = prompt_text(question.task, question.text, names, marks=marks, kinds=kinds)
-        return Prompt(text=text, pictures=pictures, views=views, targets=targets, boxes=boxes, words=words, marks=marks)
+        text = prompt_text(
+            question.task,
+            question.text,
+            names,
+            marks=marks,
+            kinds=kinds,
+            probabilities=[box.probability for box in boxes],
+            absent=looked_up.absent,
+        )
+        return Prompt(
+            text=text,
+            pictures=pictures,
+            views=views,
+            targets=targets,
+            boxes=boxes,
+            words=words,
+            absent=looked_up.absent,
+            marks=marks,
+        )
 
     def _pictures_of(
         self, key: Hashable, views: ViewSet, marked: Sequence[Target]
@@ -166,20 +201,25 @@ class Asker:
             del self._picture_cache[next(iter(self._picture_cache))]
         return localization
 
-    def _nothing(self, words: Sequence[str]) -> str:
-        return f"nothing was found of {', '.join(words)}" if words else "the question names nothing to look for"
+    def _nothing(self, words: Sequence[str], absent: Mapping[str, float]) -> str:
+        if not words:
+            return "the question names nothing to look for"
+        listing = (f"{word} {describe_absent(absent[word])}" if word in absent else word for word in words)
+        return f"nothing was found of {', '.join(listing)}"
 
-    def _look_up(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...], ViewSet]:
-        targets, boxes = self._targets(words, question)
+    def _look_up(self, words: Sequence[str], question: Question) -> LookedUp:
+        targets, boxes, absent = self._targets(words, question)
         config = self.views
         if not targets:
             config = replace(config, method="uniform", source="both")
         views = choose_views(self.scene, targets, config)
         # Marks are drawn on pictures of the size that is sent, or their numbers would shrink.
         small = views.cameras.resized(self.vlm.image_side, enlarge=False)
-        return targets, boxes, replace(views, cameras=small)
+        return LookedUp(targets=targets, boxes=boxes, absent=absent, views=replace(views, cameras=small))
 
-    def _targets(self, words: Sequence[str], question: Question) -> tuple[tuple[Target, ...], tuple[Box, ...]]:
+    def _targets(
+        self, words: Sequence[str], question: Question
+    ) -> tuple[tuple[Target, ...], tuple[Box, ...], dict[str, float]]:
         gaussians = self.scene.gaussians
         if gaussians is None:
             raise InputError(f"ask: scene {self.scene.name} has no Gaussians")
@@ -188,16 +228,18 @@ class Asker:
             rows = np.flatnonzero(((gaussians.means >= low) & (gaussians.means <= high)).all(axis=1))
             if not len(rows):
                 raise InputError(f"aabb: no Gaussian of scene {self.scene.name} is in the box {list(question.aabb)}")
-            return (target_of("thing in the box", gaussians, rows),), ()
+            return (target_of("thing in the box", gaussians, rows),), (), {}
         if not words:
-            return (), ()
+            return (), (), {}
         if self.table is None:
             raise InputError(f"query: no words lead into the features of {self.scene.name}; give words= or aabb=")
         localization = localize(self.scene, words, self.table, self.localization, space=self.space)
         # A caption is of one thing.
         boxes = self.config.boxes if question.task != "caption" else 1
         targets, distinct = _distinct(targets_of(gaussians, localization, boxes), best_boxes(localization, boxes))
-        return (targets[:1], distinct[:1]) if question.task == "caption" else (targets, distinct)
+        if question.task == "caption":
+            targets, distinct = targets[:1], distinct[:1]
+        return targets, distinct, localization.absent
 
 
 def _distinct(targets: Sequence[Target], boxes: Sequence[Box]) -> tuple[tuple[Target, ...], tuple[Box, ...]]:

@@ -19,7 +19,7 @@ from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt
 from gsencoder.infer.ask.questions import BatchQuestion, read_answers
 from gsencoder.infer.ask.reply import Reply, ServerError
 from gsencoder.infer.ask.server import MODEL_VARIABLE, URL_VARIABLE, VlmServer, request_body
-from gsencoder.infer.localize.localize import box_to_json
+from gsencoder.infer.localize.localization_json import box_to_json
 from gsencoder.infer.views.write import views_to_json, write_pictures
 
 ANSWER, ANSWERS, PROMPT, REQUEST = "answer.json", "answers.jsonl", "prompt.txt", "request.json"
@@ -40,8 +40,8 @@ def ask_question(
         clock: counts the seconds of the steps "views", "write" and "ask".
 
     Returns:
-        The row of the answer as JSON values: question, task, words, targets, views and, from a server, answer, model,
-        finish, tokens, seconds, and for task=ground the mark and its box.
+        The row of the answer as JSON values: question, task, words, absent, targets, views and, from a server, answer,
+        model, finish, tokens, seconds, and for task=ground the mark and its box.
 
     Raises:
         InputError: a question that cannot be asked of this scene.
@@ -64,6 +64,7 @@ def ask_question(
         "question": question.text,
         "task": question.task,
         "words": list(prompt.words),
+        "absent": [{"query": word, "probability": value} for word, value in prompt.absent.items()],
         "targets": targets_to_json(question, prompt),
         "views": views,
     }

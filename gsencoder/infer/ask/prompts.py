@@ -4,7 +4,7 @@ captioning), as messages of OpenAI's chat protocol."""
 import base64
 import io
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
 from PIL import Image
@@ -41,7 +41,14 @@ NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight
 
 
 def prompt_text(
-    task: Task, question: str, names: Sequence[str], *, marks: Collection[int], kinds: Collection[PictureKind]
+    task: Task,
+    question: str,
+    names: Sequence[str],
+    *,
+    marks: Collection[int],
+    kinds: Collection[PictureKind],
+    probabilities: Sequence[float] = (),
+    absent: Mapping[str, float] = {},
 ) -> str:
     """What is asked, in words.
 
@@ -51,6 +58,8 @@ def prompt_text(
         names: of what was looked for and found, in the order of their marks; empty where a thing has no name.
         marks: the numbers, from 1, that the pictures carry.
         kinds: of the pictures.
+        probabilities: that each of the names is right, in their order; empty where nothing says.
+        absent: words that were looked for and not found, and the probability that they are there after all.
 
     Raises:
         InputError: no question for a task that needs one; nothing to ground or caption.
@@ -70,6 +79,12 @@ def prompt_text(
     elif marks:
         legend = (f"{number} = {names[number - 1] or 'a thing'}" for number in sorted(marks))
         lines.append(f"Marks: {'; '.join(legend)}.")
+        if probabilities:
+            sure = (f"mark {number} {probabilities[number - 1]:.2f}" for number in sorted(marks))
+            lines.append(f"Probability that the name is right: {', '.join(sure)}.")
+    if absent:
+        missing = (f"{word} (probability {value:.2f})" for word, value in absent.items())
+        lines.append(f"Looked for and probably absent: {', '.join(missing)}.")
     if question:
         lines.append(f"Question: {question}" if task == "answer" else f"Meant is: {question}")
     return "\n".join(lines)

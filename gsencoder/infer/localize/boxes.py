@@ -1,6 +1,7 @@
 """Selected points to boxes: clusters, axis-aligned and oriented boxes, scores."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -8,7 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float64, Int64, Integer
 
-from gsencoder.types import Gaussians
+from gsencoder.types import Box, Gaussians
 from gsencoder.types.poses import perpendicular
 
 Extent = Literal["means", "sigma"]
@@ -25,11 +26,13 @@ class Cluster:
         score: mean relevancy, weighted by the Gaussians' weights, times the fourth root of its share of the weight of
             all that was selected for the word.
         weight: summed weight.
+        share: of this weight in that of all that was selected for the word.
     """
 
     rows: Int64[np.ndarray, " n"]
     score: float
     weight: float
+    share: float
 
 
 def score_clusters(
@@ -64,9 +67,11 @@ def score_clusters(
         weight = float(member_weights.sum())
         mean = float(relevancy[members].astype(np.float64) @ member_weights) / weight
         # A negative mean is made worse by a small share, not better.
-        share = (weight / total) ** 0.25
-        score = mean * share if mean >= 0 else mean / share
-        clusters.append(Cluster(rows=np.sort(rows[members]).astype(np.int64), score=score, weight=weight))
+        damping = (weight / total) ** 0.25
+        score = mean * damping if mean >= 0 else mean / damping
+        clusters.append(
+            Cluster(rows=np.sort(rows[members]).astype(np.int64), score=score, weight=weight, share=weight / total)
+        )
     clusters.sort(key=lambda each: (-each.score, int(each.rows[0])))
     return [each for each in clusters if each.weight >= min_share * clusters[0].weight]
 
@@ -129,6 +134,47 @@ def box_around(
         rotation=rotation,
         size=high - low,
     )
+
+
+def boxes_of_word(
+    word: str,
+    clusters: Iterable[tuple[Cluster, float]],
+    gaussians: Gaussians,
+    *,
+    origin: Float64[np.ndarray, "3"],
+    extent: Extent = "means",
+    sigmas: float = 1.0,
+    up: Float64[np.ndarray, "3"] | None = None,
+) -> list[Box]:
+    """The boxes of a word in world coordinates, ranked in the order of its clusters.
+
+    Args:
+        word: the word.
+        clusters: clusters and their probabilities, best first.
+        gaussians: the splat.
+        origin: of the scene, added to the positions.
+        extent: see `box_around`.
+        sigmas: see `box_around`.
+        up: see `box_around`.
+    """
+    boxes = []
+    for rank, (cluster, probability) in enumerate(clusters):
+        extents = box_around(gaussians, cluster.rows, extent=extent, sigmas=sigmas, up=up)
+        boxes.append(
+            Box(
+                query=word,
+                rank=rank,
+                score=cluster.score,
+                probability=probability,
+                aabb_min=extents.aabb_min + origin,
+                aabb_max=extents.aabb_max + origin,
+                obb_center=extents.center + origin,
+                obb_rotation=extents.rotation,
+                obb_size=extents.size,
+                rows=cluster.rows,
+            )
+        )
+    return boxes
 
 
 def oriented_axes(

@@ -4,18 +4,21 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.spacing import scene_spacing
-from gsencoder.infer.localize.boxes import box_around, score_clusters
+from gsencoder.infer.localize.boxes import Cluster, boxes_of_word, score_clusters
 from gsencoder.infer.localize.cluster import cluster
-from gsencoder.infer.localize.relevancy import ThresholdConfig, relevancy, threshold
+from gsencoder.infer.localize.presence import Evidence, Presence, probability
+from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
 from gsencoder.text.encoder import TextEncoder, check_space
-from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scene
+from gsencoder.text.table import TextTable
+from gsencoder.types import GaussianFeatures, Gaussians, Localization, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +33,7 @@ class LocalizeConfig:
         default=False,
         metadata={
             "help": "score by contrast with negative words and the other queries (LERF), not by cosine; use "
-            "threshold.fixed=0.9"
+            "threshold.kind=fixed threshold.fixed=0.9"
         },
     )
     negatives: tuple[str, ...] = field(
@@ -63,6 +66,10 @@ class LocalizeConfig:
         metadata={"help": "one axis of oriented boxes follows the scene's up direction, where it is known"},
     )
     max_boxes: int = field(default=10, metadata={"help": "largest number of boxes for each word"})
+    min_probability: float = field(
+        default=0.1,
+        metadata={"help": "boxes that are less probable are left out, and words without a box are absent; 0 = none"},
+    )
 
     def __post_init__(self) -> None:
         if self.mode not in ("centred", "raw"):
@@ -80,6 +87,8 @@ class LocalizeConfig:
                 raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         if not 0 <= self.min_share <= 1:
             raise InputError(f"min_share: expected a share in [0, 1], got {self.min_share}")
+        if not 0 <= self.min_probability <= 1:
+            raise InputError(f"min_probability: expected a probability in [0, 1], got {self.min_probability}")
 
 
 _DEFAULT = LocalizeConfig()
@@ -92,14 +101,16 @@ def localize(
     config: LocalizeConfig = _DEFAULT,
     *,
     space: str | None = None,
+    rivals: TextTable | None = None,
 ) -> Localization:
     """Finds words in a scene.
 
     Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
-    score that `gsencoder.infer.localize.boxes.score_clusters` defines. Axis-aligned and oriented boxes are drawn
-    around Gaussian means, unless `config.extent` says "sigma", and have
-    the scene's origin added back in float64. A word's boxes do not depend on the other queries, unless
-    `config.contrast` is on.
+    score that `gsencoder.infer.localize.boxes.score_clusters` and the probability that
+    `gsencoder.infer.localize.presence` defines. Boxes that are less probable than `config.min_probability` are left
+    out, and a word that has no box is absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless
+    `config.extent` says "sigma", and have the scene's origin added back in float64. A word's boxes do not depend on the
+    other queries, unless `config.contrast` is on.
 
     Args:
         scene: Gaussians with features.
@@ -107,9 +118,10 @@ def localize(
         text: turns words into the features' space.
         config: see there.
         space: name of the feature set; None where the scene has only one.
+        rivals: words that may fit the Gaussians better than those asked; None = those of `text`, if it is a table.
 
     Returns:
-        Relevancy, thresholds, and the boxes best first within each word.
+        Relevancy, thresholds, probabilities, and the boxes best first within each word.
 
     Warns:
         SceneWarning: words without a box (one warning that names them); negative words unknown to `text`.
@@ -117,41 +129,112 @@ def localize(
     Raises:
         InputError: no Gaussians or features, no or unknown words, words of another space.
     """
+    gaussians, _ = select_features(scene, space)
+    candidates = find_candidates(scene, queries, text, config, space=space, rivals=rivals)
+    probabilities = [[probability(each) for each in one.evidence] for one in candidates.words]
+    boxes = []
+    for word, one, values in zip(queries, candidates.words, probabilities, strict=True):
+        probable = [
+            (each, value) for each, value in zip(one.clusters, values, strict=True) if value >= config.min_probability
+        ]
+        boxes += boxes_of_word(
+            word,
+            probable,
+            gaussians,
+            origin=scene.origin,
+            extent=config.extent,
+            sigmas=config.sigmas,
+            up=scene.up if config.upright else None,
+        )
+    localization = Localization(
+        queries=tuple(queries),
+        relevancy=candidates.relevancy,
+        thresholds=np.array([one.threshold for one in candidates.words], np.float32),
+        probabilities=np.array([max(values, default=0.0) for values in probabilities], np.float32),
+        boxes=tuple(boxes),
+    )
+    _warn_about_absent(scene.name, localization)
+    return localization
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WordCandidates:
+    """The clusters of one word before they are judged.
+
+    Attributes:
+        threshold: the relevancy from which on Gaussians were taken.
+        clusters: best first.
+        evidence: for each cluster, that it is what the word says.
+    """
+
+    threshold: float
+    clusters: tuple[Cluster, ...]
+    evidence: tuple[Evidence, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidates:
+    """What words select in a scene.
+
+    Attributes:
+        relevancy: see `Localization`.
+        words: one for each word, in the order asked.
+    """
+
+    relevancy: Float32[np.ndarray, "Q N"]
+    words: tuple[WordCandidates, ...]
+
+
+def find_candidates(
+    scene: Scene,
+    queries: Sequence[str],
+    text: TextEncoder,
+    config: LocalizeConfig = _DEFAULT,
+    *,
+    space: str | None = None,
+    rivals: TextTable | None = None,
+) -> Candidates:
+    """Clusters of Gaussians for each word, with the evidence for them; arguments and errors are those of `localize`."""
     gaussians, features = select_features(scene, space)
     if isinstance(queries, str) or not queries or any(not word.strip() for word in queries):
         raise InputError(f"localize: expected a list of one or more words, got {queries!r}")
     check_space(features.space, text.space)
-    scores = relevancy(
-        features,
-        text.encode(list(queries)),
-        text.mean,
-        negatives=_negatives(text, config.negatives) if config.contrast else None,
-        temperature=config.temperature,
-        mode=config.mode,
-    )
-    spacing = scene_spacing(gaussians.means)
-    if spacing == 0:
-        spacing = float(np.median(gaussians.scales)) if len(gaussians) else 1.0
-    boxes_by_word, thresholds = [], []
-    for word, row in zip(queries, scores, strict=True):
-        cutoff = threshold(row, config.threshold)
-        thresholds.append(cutoff)
-        boxes_by_word.append(_boxes_for_word(word, row, cutoff, gaussians, features, spacing, scene, config))
-    without_box = [word for word, boxes in zip(queries, boxes_by_word, strict=True) if not boxes]
-    if without_box:
-        listing = ", ".join(map(repr, without_box[:5])) + (", …" if len(without_box) > 5 else "")
-        warnings.warn(
-            f"scene {scene.name}: {len(without_box)} of {len(queries)} words have no box ({listing}): no cluster of "
-            "Gaussians reaches the threshold",
-            SceneWarning,
-            stacklevel=2,
+    if rivals is not None:
+        check_space(features.space, rivals.space)
+    elif isinstance(text, TextTable):
+        rivals = text
+    vectors = text.encode(list(queries))
+    cosines = scores = relevancy(features, vectors, text.mean)
+    if config.contrast or config.mode == "raw":
+        scores = relevancy(
+            features,
+            vectors,
+            text.mean,
+            negatives=_negatives(text, config.negatives) if config.contrast else None,
+            temperature=config.temperature,
+            mode=config.mode,
         )
-    return Localization(
-        queries=tuple(queries),
-        relevancy=scores,
-        thresholds=np.array(thresholds, np.float32),
-        boxes=tuple(box for boxes in boxes_by_word for box in boxes),
-    )
+    presence = Presence(features, text.mean, rivals)
+    eps = config.eps if config.eps is not None else config.eps_spacings * _spacing(gaussians)
+    words = []
+    for number in range(len(queries)):
+        cutoff = threshold(scores[number], config.threshold)
+        # Comparisons with NaN are false: Gaussians never seen are never taken.
+        rows = np.flatnonzero((scores[number] >= cutoff) & (features.weights > config.min_weight))
+        labels = cluster(gaussians.means[rows], eps, config.min_samples)
+        ranked = score_clusters(labels, rows, scores[number][rows], features.weights[rows], min_share=config.min_share)[
+            : config.max_boxes
+        ]
+        evidence = presence.evidence(vectors[number], cosines[number], ranked)
+        words.append(WordCandidates(threshold=cutoff, clusters=tuple(ranked), evidence=tuple(evidence)))
+    return Candidates(relevancy=scores, words=tuple(words))
+
+
+def _spacing(gaussians: Gaussians) -> float:
+    spacing = scene_spacing(gaussians.means)
+    if spacing > 0:
+        return spacing
+    return float(np.median(gaussians.scales)) if len(gaussians) else 1.0
 
 
 def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:
@@ -198,69 +281,20 @@ def _negatives(text: TextEncoder, words: Sequence[str]) -> Float32[np.ndarray, "
     return np.concatenate(known) if known else np.zeros((0, text.space.channels), np.float32)
 
 
-def _boxes_for_word(
-    word: str,
-    scores: Float32[np.ndarray, " N"],
-    cutoff: float,
-    gaussians: Gaussians,
-    features: GaussianFeatures,
-    spacing: float,
-    scene: Scene,
-    config: LocalizeConfig,
-) -> list[Box]:
-    """The boxes of one word, best first."""
-    # Comparisons with NaN are false: Gaussians never seen are never taken.
-    rows = np.flatnonzero((scores >= cutoff) & (features.weights > config.min_weight))
-    eps = config.eps if config.eps is not None else config.eps_spacings * spacing
-    labels = cluster(gaussians.means[rows], eps, config.min_samples)
-    ranked = score_clusters(labels, rows, scores[rows], features.weights[rows], min_share=config.min_share)
-    boxes = []
-    for rank, candidate in enumerate(ranked[: config.max_boxes]):
-        extents = box_around(
-            gaussians,
-            candidate.rows,
-            extent=config.extent,
-            sigmas=config.sigmas,
-            up=scene.up if config.upright else None,
+def _warn_about_absent(scene: str, localization: Localization) -> None:
+    absent = localization.absent
+    if absent:
+        more = ", …" if len(absent) > 5 else ""
+        words = ", ".join(map(repr, list(absent)[:5])) + more
+        values = ", ".join(f"{value:.2f}" for value in list(absent.values())[:5]) + more
+        warnings.warn(
+            f"scene {scene}: {len(absent)} of {len(localization.queries)} words have no box ({words}): nothing answers "
+            f"them, or too improbably (probability {values})",
+            SceneWarning,
+            stacklevel=3,
         )
-        boxes.append(
-            Box(
-                query=word,
-                rank=rank,
-                score=candidate.score,
-                aabb_min=extents.aabb_min + scene.origin,
-                aabb_max=extents.aabb_max + scene.origin,
-                obb_center=extents.center + scene.origin,
-                obb_rotation=extents.rotation,
-                obb_size=extents.size,
-                rows=candidate.rows,
-            )
-        )
-    return boxes
 
 
-def localization_to_json(localization: Localization) -> list[dict[str, Any]]:
-    """The boxes as JSON values, best first within each word; see `box_to_json`."""
-    return [box_to_json(box) for box in localization.boxes]
-
-
-def box_to_json(box: Box) -> dict[str, Any]:
-    """A box as JSON values, in world coordinates with the origin added back.
-
-    It has query, rank, score, aabb_min, aabb_max, center, count (of its Gaussians) and obb: center, rotation (rows of
-    the matrix whose columns are the box's axes) and size.
-    """
-    return {
-        "query": box.query,
-        "rank": box.rank,
-        "score": box.score,
-        "aabb_min": box.aabb_min.tolist(),
-        "aabb_max": box.aabb_max.tolist(),
-        "center": box.center.tolist(),
-        "count": len(box.rows),
-        "obb": {
-            "center": box.obb_center.tolist(),
-            "rotation": box.obb_rotation.tolist(),
-            "size": box.obb_size.tolist(),
-        },
-    }
+def describe_absent(probability: float) -> str:
+    """How people are told of a word without a box."""
+    return f"absent (probability {probability:.2f})"

@@ -1,10 +1,10 @@
-"""How well each Gaussian's feature answers a word: cosines in basis coordinates, contrast, thresholds.
+"""How well each Gaussian's feature answers a word: cosines in basis coordinates, and contrast.
 
 Q queries, M negative words, N Gaussians, R basis rank, D channels.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -21,27 +21,55 @@ EPS = 1e-60
 """Keeps the root of a squared norm above zero; float64 holds the squares of norms down to 1e-150."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ThresholdConfig:
-    """Which relevancy a Gaussian needs to be taken, for each word on its own."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FeatureAxes:
+    """S axes in which norms and products of features, less a mean, are those of all D channels.
 
-    kind: Literal["fixed", "relative", "quantile", "otsu"] = field(
-        default="fixed",
-        metadata={"help": "fixed value, share of the word's best, quantile of the scene, or Otsu's split"},
-    )
-    fixed: float = field(default=0.5, metadata={"help": "relevancy for kind=fixed"})
-    relative: float = field(default=0.4, metadata={"help": "share of the word's highest relevancy for kind=relative"})
-    quantile: float = field(default=0.995, metadata={"help": "share of the seen Gaussians left out, kind=quantile"})
+    With the stacked rows M = [components; basis mean − removed mean] = L·Q (Q orthonormal), the feature of coordinates
+    z is [z, 1]·L in the axes Q, so that norms and products need R + 1 numbers and no decoding.
 
-    def __post_init__(self) -> None:
-        if self.kind not in ("fixed", "relative", "quantile", "otsu"):
-            raise InputError(f"kind: expected fixed, relative, quantile or otsu, got {self.kind!r}")
-        if not -1 <= self.fixed <= 1:
-            raise InputError(f"fixed: expected a relevancy in [-1, 1], got {self.fixed}")
-        if not 0 < self.relative <= 1:
-            raise InputError(f"relative: expected a share in (0, 1], got {self.relative}")
-        if not 0 <= self.quantile <= 1:
-            raise InputError(f"quantile: expected a share in [0, 1], got {self.quantile}")
+    Attributes:
+        matrix: from stored rows to the axes; None where the rows are the vectors themselves.
+        offset: added after it.
+        axes: the axes as columns; None where they are the channels.
+        floor: squared length that is added to that of a feature: one much shorter than the mean has no direction.
+    """
+
+    matrix: Float64[np.ndarray, "R S"] | None
+    offset: Float64[np.ndarray, " S"]
+    axes: Float64[np.ndarray, "D S"] | None
+    floor: float
+
+    def directions_of(self, stored: Float32[np.ndarray, "n channels"]) -> Float64[np.ndarray, "n S"]:
+        """The directions of stored rows; of length 1, or less where a feature is hardly longer than rounding."""
+        local = stored.astype(np.float64)
+        local = (local if self.matrix is None else local @ self.matrix) + self.offset
+        return local / np.sqrt((local**2).sum(axis=1, keepdims=True) + self.floor)
+
+    def project(self, directions: Float64[np.ndarray, "Q D"]) -> Float64[np.ndarray, "Q S"]:
+        """Directions of the space in these axes; what lies across them has no product with any feature."""
+        return directions if self.axes is None else directions @ self.axes
+
+
+def feature_axes(features: GaussianFeatures, mode: Mode = "centred") -> FeatureAxes:
+    """The axes of features less their mean, or of raw ones."""
+    centered = features.mean.astype(np.float64)
+    removed = centered if mode == "centred" else np.zeros_like(centered)
+    floor = EPS + MIN_RELATIVE_NORM**2 * float(removed @ removed)
+    if features.basis is None:
+        return FeatureAxes(matrix=None, offset=-removed, axes=None, floor=floor)
+    basis = features.basis
+    stacked = np.concatenate([basis.components.astype(np.float64), (basis.mean - removed)[None]])
+    axes, triangle = np.linalg.qr(stacked.T)
+    return FeatureAxes(matrix=triangle.T[:-1], offset=triangle.T[-1], axes=axes, floor=floor)
+
+
+def word_directions(
+    words: Float32[np.ndarray, "Q D"], text_mean: Float32[np.ndarray, " D"], mode: Mode = "centred"
+) -> Float64[np.ndarray, "Q D"]:
+    """Words as unit vectors, less the mean of the text side unless `mode` is "raw"."""
+    directions = words.astype(np.float64) - (text_mean if mode == "centred" else 0.0)
+    return np.asarray(directions / np.sqrt((directions**2).sum(axis=1, keepdims=True) + EPS))
 
 
 def relevancy(
@@ -55,11 +83,9 @@ def relevancy(
 ) -> Float32[np.ndarray, "Q N"]:
     """Cosine of every Gaussian's feature with every word, or its contrast with negative words.
 
-    The cosine is computed in the coordinates that are stored: with the stacked rows M = [components; basis mean −
-    removed mean] = L·Q (Q orthonormal), the feature of z is [z, 1]·L in the axes Q, so norms and products need R + 1
-    numbers and no decoding. Rows stream in chunks. In the mode "centered" the features lose `features.mean` and the
-    words `text_mean`; a centered feature shorter than 1e-3 of the mean counts as having no direction, and its cosine
-    fades to 0.
+    The cosine is computed in the coordinates that are stored (see `FeatureAxes`), and rows stream in chunks. In the
+    mode "centered" the features lose `features.mean` and the words `text_mean`; a centered feature shorter than 1e-3 of
+    the mean counts as having no direction, and its cosine fades to 0.
 
     With `negatives`, the score is LERF's (Kerr et al. 2023, https://arxiv.org/abs/2303.09553, section 3.4): the
     smallest, over the negatives and the other queries, of exp(c/t) / (exp(c/t) + exp(c_negative/t)), which lies in
@@ -91,38 +117,18 @@ def relevancy(
         raise InputError("relevancy: expected finite word vectors and text mean, got NaN or Inf")
     if mode not in ("centred", "raw") or not 0 < temperature < math.inf:
         raise InputError(f"relevancy: expected mode centered or raw, temperature > 0, got {mode!r} and {temperature}")
-    directions = words.astype(np.float64) - (text_mean if mode == "centred" else 0.0)
-    directions /= np.sqrt((directions**2).sum(axis=1, keepdims=True) + EPS)
-    removed = features.mean.astype(np.float64) if mode == "centred" else np.zeros(channels)
+    directions = word_directions(words, text_mean, mode)
+    axes = feature_axes(features, mode)
+    targets = axes.project(directions)
     scores = np.full((len(words), len(features)), np.nan, np.float32)
     rows = np.flatnonzero(features.seen)
-    matrix, offset, targets = _fold(features, removed, directions)
-    floor = EPS + MIN_RELATIVE_NORM**2 * float(removed @ removed)
-    step = max(1, CHUNK_BYTES // (8 * (len(offset) + len(words))))
+    step = max(1, CHUNK_BYTES // (8 * (len(axes.offset) + len(words))))
     for start in range(0, len(rows), step):
         chunk = rows[start : start + step]
-        local = features.features[chunk].astype(np.float64)
-        local = (local if matrix is None else local @ matrix) + offset
-        norms = np.sqrt((local**2).sum(axis=1, keepdims=True) + floor)
-        scores[:, chunk] = np.clip((local / norms) @ targets.T, -1, 1).T
+        scores[:, chunk] = np.clip(axes.directions_of(features.features[chunk]) @ targets.T, -1, 1).T
     if negatives is None:
         return scores
     return _contrast(scores, directions, len(text), temperature)
-
-
-def _fold(
-    features: GaussianFeatures, removed: Float64[np.ndarray, " D"], directions: Float64[np.ndarray, "Q D"]
-) -> tuple[Float64[np.ndarray, "R S"] | None, Float64[np.ndarray, " S"], Float64[np.ndarray, "Q S"]]:
-    """Matrix and offset from stored rows to S axes in which norms and products are those of the centered vectors.
-
-    The words in those axes come third. No matrix where the rows are the vectors themselves.
-    """
-    if features.basis is None:
-        return None, -removed, directions
-    basis = features.basis
-    stacked = np.concatenate([basis.components.astype(np.float64), (basis.mean - removed)[None]])
-    axes, triangle = np.linalg.qr(stacked.T)
-    return triangle.T[:-1], triangle.T[-1], directions @ axes
 
 
 def _contrast(
@@ -145,40 +151,3 @@ def _contrast(
         # tanh form of the logistic function: no overflow at any temperature.
         scores[row] = 0.5 * (1 + np.tanh(margin / 2))
     return scores
-
-
-def threshold(scores: Float32[np.ndarray, " N"], config: ThresholdConfig) -> float:
-    """The relevancy from which on one word's Gaussians are taken; NaN where no Gaussian was seen."""
-    seen = scores[np.isfinite(scores)]
-    if seen.size == 0:
-        return math.nan
-    if config.kind == "fixed":
-        return config.fixed
-    if config.kind == "relative":
-        return config.relative * float(seen.max())
-    if config.kind == "quantile":
-        return float(np.quantile(seen, config.quantile))
-    return otsu(seen)
-
-
-def otsu(values: Float32[np.ndarray, " n"], bins: int = 256) -> float:
-    """Otsu's threshold (IEEE Trans. SMC 9, 1979) over the values above their median, on a histogram.
-
-    An object is a small share of a scene. Over all values the split would fall between kinds of background, so the
-    lower half, which is background in any scene that this is meant for, is left out. A constant is its own threshold.
-    """
-    upper = values[values >= np.median(values)].astype(np.float64)
-    if upper.min() == upper.max():
-        return float(upper.max())
-    counts, edges = np.histogram(upper, bins)
-    centers = (edges[1:] + edges[:-1]) / 2
-    below = counts.cumsum()
-    above = below[-1] - below
-    moment = (counts * centers).cumsum()
-    splits = np.flatnonzero((below > 0) & (above > 0))
-    low = moment[splits] / below[splits]
-    high = (moment[-1] - moment[splits]) / above[splits]
-    between = below[splits] * above[splits] * (high - low) ** 2
-    # Of equally good splits (an empty gap) the middle one, as far from both classes as can be.
-    best = splits[between >= between.max() * (1 - 1e-12)]
-    return float(edges[best[len(best) // 2] + 1])

@@ -1,0 +1,279 @@
+"""The absent protocol: how well the probabilities of words tell those that are in a room from those that are not.
+
+In each scene two groups of words are asked: the names of objects that are seen well enough (small ones and furniture),
+which are present, and the names of the other scenes' objects that this one does not have, which are absent. A name of
+which the scene has only objects that are hardly seen is in neither group. The probability of a word is that of
+`gsencoder.types.Localization`.
+"""
+
+import math
+import time
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.evaluate.sources import FeatureSource, with_features
+from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.text.table import TextTable
+from gsencoder.types import GaussianFeatures, Scene, SceneObject
+
+BINS = 10
+"""Bins of probability, of equal width, of the calibration error."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AbsentProtocol:
+    """Selection of the words that are asked."""
+
+    name: Literal["absent"] = "absent"
+    vocabulary: tuple[str, ...] = field(
+        default=(), metadata={"help": "names that may be absent; empty = the names of all scenes' objects"}
+    )
+    min_views: int = field(
+        default=5, metadata={"help": "smallest number of views in which an object must be seen to be present"}
+    )
+    min_pixels: int = field(
+        default=60, metadata={"help": "smallest area in its best view that an object must have to be present, pixels"}
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("min_views", "min_pixels"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskedWord:
+    """One word asked in one scene.
+
+    Attributes:
+        scene: name of the scene.
+        word: the word.
+        present: whether the scene has an object of this name.
+        probability: that it does, as `localize` says.
+        boxed: whether it was given a box.
+    """
+
+    scene: str
+    word: str
+    present: bool
+    probability: float
+    boxed: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneWords:
+    """The words asked in one scene, and the seconds of each step."""
+
+    scene: str
+    words: tuple[AskedWord, ...]
+    seconds: dict[str, float]
+
+
+def words_to_ask(
+    objects: Sequence[SceneObject], vocabulary: Iterable[str], *, min_views: int = 5, min_pixels: int = 60
+) -> tuple[list[str], list[str]]:
+    """The present and the absent words of a scene, each in alphabetical order.
+
+    Args:
+        objects: all objects of the scene.
+        vocabulary: names that may be absent.
+        min_views: smallest number of views in which an object is seen.
+        min_pixels: smallest number of pixels that an object has in the view that shows it best.
+    """
+    named = [each for each in objects if each.name]
+    present = {each.name for each in named if each.views >= min_views and each.max_pixels >= min_pixels}
+    return sorted(name for name in present if name), sorted(set(vocabulary) - {each.name for each in named})
+
+
+def evaluate_absent(
+    scenes: Iterable[tuple[Scene, float]],
+    source: FeatureSource,
+    words: TextTable,
+    vocabulary: Sequence[str],
+    *,
+    protocol: AbsentProtocol = AbsentProtocol(),
+    seeds: SeedConfig = SeedConfig(),
+    localization: LocalizeConfig = LocalizeConfig(),
+) -> list[SceneWords]:
+    """Runs the protocol scene by scene; one scene is in memory at a time.
+
+    Args:
+        scenes: scenes with labeled objects and the seconds of loading, as `load_scenes` yields them.
+        source: computes the features of a scene.
+        words: text table of the features' space.
+        vocabulary: names that may be absent, such as those of `names_of`.
+        protocol: which objects count as present.
+        seeds: how Gaussians are made for scenes without.
+        localization: settings of `localize`.
+
+    Returns:
+        The words of each scene, in order.
+
+    Raises:
+        InputError: a scene cannot be used, or a name is unknown to `words`.
+    """
+    results = []
+    for loaded_scene, load_seconds in scenes:
+        scene, features, seconds = with_features(loaded_scene, source, seeds)
+        start = time.perf_counter()
+        asked = ask_words(scene, features, words, vocabulary, protocol, localization)
+        seconds = {"load": load_seconds, **seconds, "localize": time.perf_counter() - start}
+        results.append(SceneWords(scene=scene.name, words=tuple(asked), seconds=seconds))
+    return results
+
+
+def ask_words(
+    scene: Scene,
+    features: GaussianFeatures,
+    words: TextTable,
+    vocabulary: Sequence[str],
+    protocol: AbsentProtocol,
+    localization: LocalizeConfig,
+) -> list[AskedWord]:
+    """Localizes the present and the absent words of a scene in features of its Gaussians."""
+    present, absent = words_to_ask(
+        scene.objects, vocabulary, min_views=protocol.min_views, min_pixels=protocol.min_pixels
+    )
+    names = [*present, *absent]
+    if not names:
+        return []
+    with warnings.catch_warnings():
+        # That words have no box is the result here, not a fault.
+        warnings.filterwarnings("ignore", ".*words have no box", SceneWarning)
+        result = localize(replace(scene, features={features.space.name: features}), names, words, localization)
+    missing = result.absent
+    return [
+        AskedWord(
+            scene=scene.name,
+            word=name,
+            present=number < len(present),
+            probability=float(result.probabilities[number]),
+            boxed=name not in missing,
+        )
+        for number, name in enumerate(names)
+    ]
+
+
+def names_of(scenes: Iterable[Scene]) -> list[str]:
+    """All names of the objects of scenes, in alphabetical order."""
+    return sorted({each.name for scene in scenes for each in scene.objects if each.name})
+
+
+def auroc(present: Bool[np.ndarray, " n"], probability: Float64[np.ndarray, " n"]) -> float:
+    """Area under the ROC curve: the share of pairs (present, absent) in which the present word is more probable, ties
+    counting one half (the statistic of Mann and Whitney); NaN where one group is empty."""
+    positive, negative = int(present.sum()), int((~present).sum())
+    if not positive or not negative:
+        return math.nan
+    _, inverse, counts = np.unique(probability, return_inverse=True, return_counts=True)
+    # Equal values share the mean of their ranks, which count from 1.
+    ranks = (counts.cumsum() - (counts - 1) / 2)[inverse]
+    return float((ranks[present].sum() - positive * (positive + 1) / 2) / (positive * negative))
+
+
+def auroc_standard_error(
+    present: Bool[np.ndarray, " n"], probability: Float64[np.ndarray, " n"], scene: Int64[np.ndarray, " n"]
+) -> float:
+    """Standard error of the AUROC over scenes, by leaving out one at a time (jackknife): words of one scene are not
+    independent of each other. NaN with fewer than two scenes."""
+    scenes = np.unique(scene)
+    if len(scenes) < 2:
+        return math.nan
+    values = np.array([auroc(present[scene != each], probability[scene != each]) for each in scenes])
+    return float(np.sqrt((len(scenes) - 1) / len(scenes) * ((values - values.mean()) ** 2).sum()))
+
+
+def reliability(
+    present: Bool[np.ndarray, " n"], probability: Float64[np.ndarray, " n"], bins: int = BINS
+) -> list[dict[str, Any]]:
+    """Of each bin of probability, all of equal width: its words, their mean probability, and the share that is present.
+
+    A probability on an edge belongs to the bin above; 1 to the last one. Empty bins are left out.
+    """
+    number = np.minimum((probability * bins).astype(np.int64), bins - 1)
+    return [
+        {
+            "from": index / bins,
+            "to": (index + 1) / bins,
+            "words": int((number == index).sum()),
+            "probability": float(probability[number == index].mean()),
+            "present": float(present[number == index].mean()),
+        }
+        for index in np.unique(number).tolist()
+    ]
+
+
+def calibration_error(
+    present: Bool[np.ndarray, " n"], probability: Float64[np.ndarray, " n"], bins: int = BINS
+) -> float:
+    """Expected calibration error (Naeini et al. 2015): the distance of mean probability and share present, averaged
+    over bins of equal width by the words in them; NaN without words."""
+    if not len(present):
+        return math.nan
+    rows = reliability(present, probability, bins)
+    return sum(row["words"] * abs(row["probability"] - row["present"]) for row in rows) / len(present)
+
+
+def absent_scores(scenes: Sequence[SceneWords]) -> dict[str, Any]:
+    """The metrics of the protocol over all words of all scenes.
+
+    Returns:
+        present and absent (numbers of words), auroc and auroc_se, calibration_error, brier (mean squared difference of
+        probability and presence), boxed_present and boxed_absent (shares of the words that were given a box), and
+        reliability.
+
+    Raises:
+        InputError: no word is present, or none is absent.
+    """
+    words = [word for scene in scenes for word in scene.words]
+    present = np.array([word.present for word in words], bool)
+    probability = np.array([word.probability for word in words], np.float64)
+    boxed = np.array([word.boxed for word in words], bool)
+    scene = np.array([number for number, each in enumerate(scenes) for _ in each.words], np.int64)
+    if present.all() or not present.any():
+        raise InputError(
+            f"absent: expected words that are present and words that are absent, got {int(present.sum())} and "
+            f"{int((~present).sum())}; give more scenes, or names that they do not have as protocol.vocabulary="
+        )
+    return {
+        "present": int(present.sum()),
+        "absent": int((~present).sum()),
+        "auroc": auroc(present, probability),
+        "auroc_se": auroc_standard_error(present, probability, scene),
+        "calibration_error": calibration_error(present, probability),
+        "brier": float(((probability - present) ** 2).mean()),
+        "boxed_present": float(boxed[present].mean()),
+        "boxed_absent": float(boxed[~present].mean()),
+        "reliability": reliability(present, probability),
+    }
+
+
+def probabilities_by_word(scenes: Sequence[SceneWords]) -> dict[str, dict[str, Any]]:
+    """For each word the numbers of scenes in which it is present and absent, and its mean probability in both; the
+    words that these tell least apart come first. Means without scenes are NaN."""
+    words: dict[str, tuple[list[float], list[float]]] = {}
+    for asked in (word for scene in scenes for word in scene.words):
+        words.setdefault(asked.word, ([], []))[0 if asked.present else 1].append(asked.probability)
+    table = {
+        word: {
+            "present": len(present),
+            "absent": len(absent),
+            "probability_present": float(np.mean(present)) if present else math.nan,
+            "probability_absent": float(np.mean(absent)) if absent else math.nan,
+        }
+        for word, (present, absent) in words.items()
+    }
+
+    def gap(word: str) -> float:
+        row = table[word]
+        present = row["probability_present"] if row["present"] else 1.0
+        return float(present - (row["probability_absent"] if row["absent"] else 0.0))
+
+    return {word: table[word] for word in sorted(table, key=lambda word: (gap(word), word))}

@@ -1,0 +1,135 @@
+"""The probability that what a box holds is what its word says: a logistic model over evidence from relevancy alone.
+
+The evidence of a cluster c of the word q, with centered cosines cos and weights w normalized over the cluster:
+
+    mean        Σ wᵢ cos(fᵢ, q)
+    margin      mean − max over rivals r of Σ wᵢ cos(fᵢ, r): negative where another word of the vocabulary fits better
+    prominence  log((best cosine in c − median) / spread), of the word's cosines over the scene
+    size        log10 of the number of Gaussians
+    share       of the cluster in the weight of all that was selected for the word
+
+Words whose cosine with q is `SYNONYM` or more are no rivals: "couch" does not speak against "sofa". The coefficients
+were fitted by `bench/presence.py`; `docs/measurements.md` has the reliability of the probabilities.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from gsencoder.infer.localize.boxes import Cluster
+from gsencoder.infer.localize.relevancy import FeatureAxes, feature_axes, word_directions
+from gsencoder.infer.localize.threshold import background
+from gsencoder.text.table import TextTable
+from gsencoder.types import GaussianFeatures
+
+SYNONYM = 0.77
+"""Centered cosine of two words from which on they are no rivals. Names that are beside each other in the rooms of the
+fit go up to 0.75 (dining table and table); couch and sofa have 0.82, tv and television 0.89."""
+SMALLEST_SPREAD = 1e-3
+"""Spread of relevancy below which that of the background counts as this: a scene of one kind alone has none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """What speaks for a cluster; see the module.
+
+    Attributes:
+        mean, margin, prominence, size, share: as there; margin is None without a vocabulary.
+    """
+
+    mean: float
+    margin: float | None
+    prominence: float
+    size: float
+    share: float
+
+
+WITH_RIVALS: Mapping[str, float] = MappingProxyType(
+    {"intercept": -11.776, "mean": 10.69, "margin": 11.1, "prominence": -0.115, "size": 0.567, "share": 2.433}
+)
+"""Coefficients where the words come from a vocabulary."""
+WITHOUT_RIVALS: Mapping[str, float] = MappingProxyType(
+    {"intercept": -26.885, "mean": 30.457, "prominence": 0.079, "size": -0.045, "share": 2.634}
+)
+"""Coefficients where nothing is known but the word itself."""
+
+
+def probability(evidence: Evidence) -> float:
+    """The probability that the Gaussians of a cluster are what the word says, in [0, 1]."""
+    coefficients = WITHOUT_RIVALS if evidence.margin is None else WITH_RIVALS
+    logit = coefficients["intercept"]
+    for each in fields(evidence):
+        value = getattr(evidence, each.name)
+        if value is not None:
+            logit += coefficients[each.name] * value
+    # The tanh form of the logistic function does not overflow.
+    return 0.5 * (1 + math.tanh(logit / 2))
+
+
+class Presence:
+    """Collects evidence for clusters of one feature set."""
+
+    def __init__(
+        self,
+        features: GaussianFeatures,
+        text_mean: Float32[np.ndarray, " D"],
+        vocabulary: TextTable | None,
+    ) -> None:
+        """Args:
+        features: of the scene's Gaussians.
+        text_mean: mean of the text side.
+        vocabulary: words of the features' space that may fit better than the one asked; None where there are none.
+        """
+        self._features, self._text_mean = features, text_mean
+        self._axes: FeatureAxes = feature_axes(features)
+        self._rivals: Float64[np.ndarray, "C D"] | None = None
+        if vocabulary is not None:
+            self._rivals = word_directions(vocabulary.embeddings, text_mean)
+            self._rival_targets = self._axes.project(self._rivals)
+
+    def evidence(
+        self,
+        word: Float32[np.ndarray, " D"],
+        cosines: Float32[np.ndarray, " N"],
+        clusters: Sequence[Cluster],
+    ) -> list[Evidence]:
+        """The evidence for each cluster of one word.
+
+        Args:
+            word: its vector.
+            cosines: its centered cosine with every Gaussian, NaN where that was never seen.
+            clusters: those of the word.
+        """
+        if not clusters:
+            return []
+        direction = word_directions(word[None], self._text_mean)
+        target = self._axes.project(direction)[0]
+        rivals = None
+        if self._rivals is not None:
+            rivals = self._rival_targets[self._rivals @ direction[0] < SYNONYM]
+        median, spread = background(cosines[np.isfinite(cosines)])
+        listed = []
+        for each in clusters:
+            rows = each.rows
+            weights = self._features.weights[rows].astype(np.float64)
+            # Cosines are linear in the directions, so that those of a cluster's mean direction are the mean cosines.
+            mean_direction = (weights / weights.sum()) @ self._axes.directions_of(self._features.features[rows])
+            mean = float(target @ mean_direction)
+            margin = None
+            if rivals is not None and len(rivals):
+                margin = mean - float((rivals @ mean_direction).max())
+            height = (float(cosines[rows].max()) - median) / max(spread, SMALLEST_SPREAD)
+            listed.append(
+                Evidence(
+                    mean=mean,
+                    margin=margin,
+                    prominence=math.log(max(height, 1e-3)),
+                    size=math.log10(len(rows)),
+                    share=each.share,
+                )
+            )
+        return listed

@@ -1,0 +1,216 @@
+"""Probabilities of boxes: the evidence against a plain twin, laws of the model, and words that are absent."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jaxtyping import Float32
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.infer.localize.boxes import Cluster
+from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
+from gsencoder.infer.localize.localize import LocalizeConfig, find_candidates, localize
+from gsencoder.infer.localize.presence import SYNONYM, WITH_RIVALS, WITHOUT_RIVALS, Evidence, Presence, probability
+from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, Localization, Scene
+
+WORDS = ("mug", "cup", "chair", "lamp", "spoon")
+EVERYTHING = LocalizeConfig(min_probability=0.0)
+STEP = 0.02
+
+
+def make_table() -> TextTable:
+    """Five words about a common mean; cup is nearly mug, the others are at right angles."""
+    axes = np.eye(16)[1:6]
+    axes[1] = 0.9 * axes[0] + math.sqrt(1 - 0.81) * axes[1]
+    vectors = axes * 0.4
+    vectors[:, 0] = math.sqrt(1 - 0.16)
+    return make_text_table(WORDS, vectors, "toy")
+
+
+TABLE = make_table()
+
+
+class Phrases:
+    """A text encoder that is no table: it has no names."""
+
+    space, mean = TABLE.space, TABLE.mean
+
+    def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
+        return TABLE.encode(words)
+
+
+def make_scene(strength: float = 1.0, *, basis: bool = False) -> Scene:
+    """A floor of the mean and noise, a mug on it, and a blob that is half chair and half lamp."""
+    rng = np.random.default_rng(7)
+    floor = np.stack(np.meshgrid(np.arange(50) * STEP, np.arange(40) * STEP, [0.0]), axis=-1).reshape(-1, 3)
+    cube = np.stack(np.meshgrid(*[np.arange(5) * STEP] * 3), axis=-1).reshape(-1, 3)
+    places = np.array([[0.2, 0.2, 0.3], [0.7, 0.5, 0.3]])
+    means = np.concatenate([floor, cube + places[0], cube + places[1]]).astype(np.float32)
+    mug, chair, lamp = (TABLE.embeddings[WORDS.index(word)] - TABLE.mean for word in ("mug", "chair", "lamp"))
+    away = np.concatenate(
+        [np.zeros((len(floor), 16)), np.tile(strength * mug, (125, 1)), np.tile((chair + lamp) / 2, (125, 1))]
+    )
+    features = (TABLE.mean + away + rng.normal(0, 0.05, away.shape)).astype(np.float32)
+    weights = rng.uniform(0.5, 2, len(means)).astype(np.float32)
+    space, found = replace(TABLE.space, teacher="labels"), None
+    if basis:
+        rows = np.linalg.qr(rng.normal(size=(16, 12)))[0].T.astype(np.float32)
+        found = FeatureBasis(mean=TABLE.mean, components=rows, energy_kept=1.0, space=space)
+        features = ((features - TABLE.mean) @ rows.T).astype(np.float32)
+    fused = GaussianFeatures(features=features, weights=weights, mean=TABLE.mean, space=space, basis=found)
+    gaussians = Gaussians(
+        means=means,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (len(means), 1)),
+        scales=np.full((len(means), 3), 0.01, np.float32),
+        opacities=np.ones(len(means), np.float32),
+        sh=np.zeros((len(means), 1, 3), np.float32),
+    )
+    return Scene(name="room", gaussians=gaussians, features={"toy": fused})
+
+
+SCENE = make_scene()
+
+
+def quietly(scene: Scene, words: Sequence[str], *arguments: object, **named: object) -> Localization:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)
+        return localize(scene, words, *arguments, **named)  # type: ignore[arg-type]
+
+
+def plain_evidence(
+    features: GaussianFeatures, word: str, rows: np.ndarray, names: Sequence[str]
+) -> tuple[float, float]:
+    """Mean and margin by decoding every feature."""
+
+    def unit(vectors: np.ndarray) -> np.ndarray:
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+    fits = unit(features.decode(rows).astype(float) - features.mean) @ unit(TABLE.encode(names) - TABLE.mean).T
+    mean = np.average(fits, axis=0, weights=features.weights[rows])
+    return mean[names.index(word)], mean[names.index(word)] - max(
+        value for name, value in zip(names, mean, strict=True) if name != word
+    )
+
+
+@pytest.mark.parametrize("basis", [False, True])
+def test_the_evidence_equals_that_of_decoded_features(basis: bool) -> None:
+    features = make_scene(basis=basis).features["toy"]
+    rows = np.arange(2000, 2125)
+    cosines = relevancy(features, TABLE.encode(["mug"]), TABLE.mean)[0]
+    cluster = Cluster(rows=rows, score=1.0, weight=1.0, share=0.25)
+    (evidence,) = Presence(features, TABLE.mean, TABLE).evidence(TABLE.encode(["mug"])[0], cosines, [cluster])
+    # Cup is a synonym: it is no rival.
+    mean, margin = plain_evidence(features, "mug", rows, ["mug", "chair", "lamp", "spoon"])
+    assert evidence.mean == pytest.approx(mean, abs=1e-5)
+    assert evidence.margin == pytest.approx(margin, abs=1e-5)
+    median = np.median(cosines)
+    spread = 1.4826 * np.median(np.abs(cosines - median))
+    assert evidence.prominence == pytest.approx(math.log((cosines[rows].max() - median) / spread), abs=1e-5)
+    assert (evidence.size, evidence.share) == (pytest.approx(math.log10(125)), 0.25)
+
+
+def test_words_that_mean_nearly_the_same_are_no_rivals() -> None:
+    directions = TABLE.embeddings - TABLE.mean
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert directions[0] @ directions[1] > SYNONYM
+    for word in ("mug", "cup"):
+        assert quietly(SCENE, [word], TABLE).boxes[0].probability > 0.5
+
+
+def test_a_word_that_fits_better_than_its_rivals_is_more_probable() -> None:
+    evidence = Evidence(mean=0.5, margin=0.0, prominence=2.0, size=2.0, share=1.0)
+    values = [probability(replace(evidence, margin=margin)) for margin in (-0.5, -0.1, 0.1, 0.5)]
+    assert values == sorted(values)
+    assert values[0] < 0.1 < 0.5 < values[-1]
+
+
+def test_probabilities_stay_in_their_range_whatever_the_evidence() -> None:
+    for value in (-1e300, 1e300):
+        for margin in (None, value):
+            evidence = Evidence(mean=value, margin=margin, prominence=0.0, size=0.0, share=0.0)
+            assert 0 <= probability(evidence) <= 1
+
+
+def test_the_model_is_the_logistic_function_of_its_coefficients() -> None:
+    evidence = Evidence(mean=0.3, margin=0.1, prominence=1.0, size=1.5, share=0.7)
+    for coefficients, margin in ((WITH_RIVALS, 0.1), (WITHOUT_RIVALS, None)):
+        logit = coefficients["intercept"] + sum(
+            coefficients.get(name, 0.0) * getattr(evidence, name)
+            for name in ("mean", "margin", "prominence", "size", "share")
+        )
+        assert probability(replace(evidence, margin=margin)) == pytest.approx(1 / (1 + math.exp(-logit)))
+
+
+def test_a_word_that_another_answers_better_is_absent_and_boxed_only_when_everything_is() -> None:
+    with pytest.warns(SceneWarning, match=r"1 of 2 words have no box \('spoon'\).*\(probability 0\.0"):
+        found = localize(SCENE, ["mug", "spoon"], TABLE)
+    assert {box.query for box in found.boxes} == {"mug"}
+    assert list(found.absent) == ["spoon"]
+    assert found.absent["spoon"] == found.probabilities[1]
+    assert found.absent["spoon"] < LocalizeConfig().min_probability
+    mug, spoon = words_to_json(found)
+    assert (mug["absent"], spoon["absent"], spoon["boxes"]) == (False, True, 0)
+    everything = quietly(SCENE, ["mug", "spoon"], TABLE, EVERYTHING)
+    assert {box.query for box in everything.boxes} == {"mug", "spoon"}
+    np.testing.assert_array_equal(everything.probabilities, found.probabilities)
+
+
+def test_the_probability_of_a_word_is_that_of_its_most_probable_box() -> None:
+    found = quietly(SCENE, ["mug", "chair", "lamp"], TABLE, EVERYTHING)
+    for word, value in zip(found.queries, found.probabilities, strict=True):
+        assert value == pytest.approx(max(box.probability for box in found.boxes if box.query == word))
+    assert all(0 <= each["probability"] <= 1 for each in localization_to_json(found))
+
+
+def test_ranks_count_the_boxes_that_are_left() -> None:
+    everything = quietly(SCENE, ["chair"], TABLE, EVERYTHING)
+    values = sorted({box.probability for box in everything.boxes})
+    found = quietly(SCENE, ["chair"], TABLE, LocalizeConfig(min_probability=float(values[-1])))
+    assert [box.rank for box in found.boxes] == list(range(len(found.boxes)))
+    assert len(found.boxes) < len(everything.boxes) or len(values) == 1
+
+
+def test_a_scene_without_seen_gaussians_has_no_word() -> None:
+    fused = SCENE.features["toy"]
+    blind = replace(SCENE, features={"toy": replace(fused, weights=np.zeros_like(fused.weights))})
+    found = quietly(blind, ["mug"], TABLE, EVERYTHING)
+    assert found.absent == {"mug": 0.0}
+
+
+def test_a_text_encoder_without_names_gives_probabilities_too() -> None:
+    found = quietly(SCENE, ["mug", "spoon"], Phrases())
+    assert found.boxes[0].query == "mug"
+    assert found.probabilities[0] > 0.5 > found.probabilities[1]
+    # With words to compare with, it is as sure as the table.
+    table, phrases = (quietly(SCENE, ["mug"], text, rivals=TABLE) for text in (TABLE, Phrases()))
+    assert table.boxes[0].probability == phrases.boxes[0].probability
+
+
+def test_rivals_of_another_space_are_refused() -> None:
+    other = make_text_table(WORDS, TABLE.embeddings, "another")
+    with pytest.raises(InputError, match="another"):
+        localize(SCENE, ["mug"], TABLE, rivals=other)
+
+
+def test_evidence_is_of_cosines_however_relevancy_is_scored() -> None:
+    plain, contrast = (
+        find_candidates(SCENE, ["mug"], TABLE, LocalizeConfig(contrast=contrast)).words[0] for contrast in (False, True)
+    )
+    np.testing.assert_array_equal(plain.clusters[0].rows, contrast.clusters[0].rows)
+    assert replace(plain.evidence[0], share=0.0) == replace(contrast.evidence[0], share=0.0)
+
+
+def test_a_space_of_one_direction_has_a_spread_that_counts_as_a_thousandth() -> None:
+    space = FeatureSpace(name="s", channels=16, text_encoder="toy")
+    features = GaussianFeatures(
+        features=np.tile(TABLE.embeddings[:1], (9, 1)), weights=np.ones(9, np.float32), mean=TABLE.mean, space=space
+    )
+    cosines = relevancy(features, TABLE.encode(["mug"]), TABLE.mean)[0]
+    cluster = Cluster(rows=np.arange(9), score=1.0, weight=9.0, share=1.0)
+    (evidence,) = Presence(features, TABLE.mean, TABLE).evidence(TABLE.encode(["mug"])[0], cosines, [cluster])
+    assert math.isfinite(evidence.prominence)
