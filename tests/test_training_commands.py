@@ -199,6 +199,27 @@ def test_an_encoder_is_judged_by_either_protocol(rooms: Path, trained: Path, tmp
     assert summary_of(tmp_path / "self")["results"]["accuracy"] == 1
 
 
+def test_the_names_of_other_rooms_are_absent(rooms: Path, trained: Path, tmp_path: Path) -> None:
+    scenes = [str(rooms / "room_1"), str(rooms / "room_2")]
+    words = [f"teacher.words={rooms / 'words.safetensors'}", "protocol.min_views=1", "protocol.min_pixels=1"]
+    for name, weights in (("fused", ()), ("encoded", (f"weights={trained}",))):
+        asked = ["evaluate", *scenes, "protocol=absent", *words, *weights, f"out={tmp_path / name}", "quiet=true"]
+        assert cli.main(asked) == 0
+        results = summary_of(tmp_path / name)["results"]
+        assert (
+            len((tmp_path / name / "words.csv").read_text().splitlines()) == 1 + results["present"] + results["absent"]
+        )
+    results = summary_of(tmp_path / "fused")["results"]
+    assert results["absent"] > 0
+    assert results["auroc"] == 1
+    assert results["boxed_absent"] == 0
+    # A vocabulary that is given stands for the names of the scenes.
+    elsewhere = next(name for name, row in results["names"].items() if row["absent"])
+    asked = ["evaluate", *scenes, "protocol=absent", *words, f"protocol.vocabulary={elsewhere}"]
+    assert cli.main([*asked, f"out={tmp_path / 'one'}", "quiet=true"]) == 0
+    assert summary_of(tmp_path / "one")["results"]["absent"] == results["names"][elsewhere]["absent"]
+
+
 def test_preparing_alone_trains_nothing(rooms: Path, tmp_path: Path) -> None:
     words = f"teacher.words={rooms / 'words.safetensors'}"
     asked = ["train", str(rooms / "room_0"), words, f"out={tmp_path / 'out'}", "prepare_only=true", "quiet=true"]

@@ -49,11 +49,11 @@ class Evidence:
 
 
 WITH_RIVALS: Mapping[str, float] = MappingProxyType(
-    {"intercept": -11.776, "mean": 10.69, "margin": 11.1, "prominence": -0.115, "size": 0.567, "share": 2.433}
+    {"intercept": -14.356, "mean": 15.317, "margin": 5.906, "prominence": -0.19, "size": 0.795, "share": 1.525}
 )
 """Coefficients where the words come from a vocabulary."""
 WITHOUT_RIVALS: Mapping[str, float] = MappingProxyType(
-    {"intercept": -26.885, "mean": 30.457, "prominence": 0.079, "size": -0.045, "share": 2.634}
+    {"intercept": -18.987, "mean": 23.837, "prominence": -0.405, "size": 0.668, "share": 1.253}
 )
 """Coefficients where nothing is known but the word itself."""
 
