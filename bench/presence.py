@@ -3,16 +3,18 @@
     python bench/presence.py HOUSE [--fit 'train_0[0-3]*'] [--test 'train_04*'] [--every 1] [--weights house_cpu]
                              [--evidence FOLDER] [--plot docs/reliability.png]
 
-Every room is asked all names of the house, in fused features of the labels teacher and in those of an encoder. Each
-cluster of a word is a row of evidence (`gsencoder.infer.localize.presence`), and is right if more than half of its
-Gaussians lie in the box of an object of that name, widened by 3 cm. A logistic regression over these rows, fused and
-encoded together and with the same total weight, gives the coefficients, with and without rivals. What is printed of the
-rooms of --test is what `gsencoder evaluate protocol=absent` measures: a word's probability is that of its best box.
-Evidence in FOLDER is not gathered again.
+Every room is asked all names of the house, in fused features of the labels teacher and in those of an encoder, and in
+the latter also other words for some of them, which the encoder was not trained on. Each cluster of a word is a row of
+evidence (`gsencoder.infer.localize.presence`), and is right if more than half of its Gaussians lie in the box of an
+object that the word stands for, widened by 3 cm. A logistic regression over the three groups of rows, whose total
+weights are those of `GROUP_WEIGHTS`, gives the coefficients, with and without rivals. What is printed of the rooms of
+--test is what `gsencoder evaluate protocol=absent` measures: a word's probability is that of its best box. Evidence in
+FOLDER is not gathered again.
 """
 
 import argparse
 import fnmatch
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +39,32 @@ from gsencoder.infer.localize.localize import find_candidates
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
+OTHER_WORDS = {
+    "shears": ("scissors",),
+    "electric drill": ("drill",),
+    "mallet": ("hammer",),
+    "kitchen knife": ("knife",),
+    "soupspoon": ("spoon",),
+    "dish": ("plate",),
+    "jug": ("pitcher",),
+    "can": ("tin can",),
+    "toy": ("lego",),
+    "die": ("cube",),
+    "dishwasher detergent": ("detergent",),
+    "hot sauce": ("condiment",),
+    "mandarin orange": ("orange",),
+    "pen": ("marker",),
+    "soup bowl": ("bowl",),
+    "dessert": ("pudding",),
+    "coffee cup": ("cup", "mug"),
+    "toiletry": ("cleaning products",),
+    "pitchfork": ("fork",),
+    "prune": ("plum",),
+    "stew": ("soup",),
+    "soap": ("sponge",),
+}
+"""Words of the table that no object of the house is called, and the names of those that they may stand for."""
+GROUP_WEIGHTS = {"fused": 1.0, "encoded": 1.0, "other words, encoded": 0.3}
 WITH = ("mean", "margin", "prominence", "size", "share")
 WITHOUT = ("mean", "prominence", "size", "share")
 MARGIN = 0.03
@@ -54,23 +82,24 @@ DTYPE = np.dtype(
 row of NaN."""
 
 
-def evidence_of(scene: Scene, features: GaussianFeatures, table: TextTable, names: list[str]) -> np.ndarray:
-    """The rows of one room."""
-    scene_ = Scene(
-        name=scene.name, gaussians=scene.gaussians, features={"": features}, origin=scene.origin, up=scene.up
-    )
+def evidence_of(
+    scene: Scene, features: GaussianFeatures, table: TextTable, names: list[str], words: dict[str, tuple[str, ...]]
+) -> np.ndarray:
+    """The rows of one room; `words` are asked, each with the names of the objects that it stands for."""
     assert scene.gaussians is not None
     protocol = AbsentProtocol()
-    present, absent = words_to_ask(scene.objects, names, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
+    groups = words_to_ask(scene.objects, names, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
+    present, absent = map(set, groups)
+    candidates = find_candidates(replace(scene, features={"": features}), list(words), table)
     rows = []
-    for number, (name, word) in enumerate(zip(names, find_candidates(scene_, names, table).words, strict=True)):
-        state = 1 if name in present else 0 if name in absent else -1
+    for number, (kinds, word) in enumerate(zip(words.values(), candidates.words, strict=True)):
+        state = 1 if present & set(kinds) else 0 if set(kinds) <= absent else -1
         for cluster, evidence in zip(word.clusters, word.evidence, strict=True):
             points = scene.gaussians.means[cluster.rows] + scene.origin
             inside = [
                 ((points >= each.aabb_min - MARGIN) & (points <= each.aabb_max + MARGIN)).all(axis=1).mean()
                 for each in scene.objects
-                if each.name == name
+                if each.name in kinds
             ]
             values = (getattr(evidence, key) for key in WITH)
             rows.append((scene.name, number, state, max(inside, default=0) > 0.5, *values))
@@ -80,7 +109,12 @@ def evidence_of(scene: Scene, features: GaussianFeatures, table: TextTable, name
 
 
 def gather(
-    paths: list[Path], source: FeatureSource, table: TextTable, names: list[str], folder: Path | None
+    paths: list[Path],
+    source: FeatureSource,
+    table: TextTable,
+    names: list[str],
+    words: dict[str, tuple[str, ...]],
+    folder: Path | None,
 ) -> np.ndarray:
     """The rows of several rooms."""
     listed = []
@@ -88,7 +122,7 @@ def gather(
         file = folder / f"{path.name}.npy" if folder else None
         if file is None or not file.is_file():
             scene, features, _ = with_features(load_scene(path), source, SeedConfig())
-            rows = evidence_of(scene, features, table, names)
+            rows = evidence_of(scene, features, table, names, words)
             if file is None:
                 listed.append(rows)
                 continue
@@ -98,15 +132,17 @@ def gather(
     return np.concatenate(listed)
 
 
-def fit(parts: list[np.ndarray], keys: tuple[str, ...]) -> dict[str, float]:
-    """Coefficients of a logistic regression over all clusters; every part has the same total weight."""
+def fit(groups: dict[str, np.ndarray], keys: tuple[str, ...]) -> dict[str, float]:
+    """Coefficients of a logistic regression over all clusters of the groups."""
     from sklearn.linear_model import LogisticRegression
 
     # Rows of objects that are hardly seen teach nothing: their clusters may be right.
-    parts = [part[(part["present"] >= 0) & np.isfinite(part["mean"])] for part in parts]
+    parts = [part[(part["present"] >= 0) & np.isfinite(part["mean"])] for part in groups.values()]
     values = np.concatenate([np.stack([part[key] for key in keys], axis=1) for part in parts])
     right = np.concatenate([part["right"] for part in parts])
-    weights = np.concatenate([np.full(len(part), 1 / len(part)) for part in parts]) * len(right) / len(parts)
+    shares = [GROUP_WEIGHTS[title] / sum(GROUP_WEIGHTS[each] for each in groups) for title in groups]
+    weights = np.concatenate([np.full(len(p), share / len(p)) for p, share in zip(parts, shares, strict=True)])
+    weights *= len(right)
     scale = values.std(axis=0)
     model = LogisticRegression(C=10, max_iter=1000).fit(values / scale, right, sample_weight=weights)
     return {"intercept": float(model.intercept_[0])} | dict(zip(keys, (model.coef_[0] / scale).tolist(), strict=True))
@@ -130,7 +166,7 @@ def report(title: str, rows: np.ndarray, coefficients: dict[str, float]) -> list
     present, probability, scene = asked(rows, coefficients)
     boxed = [
         f"{level}: {(probability[present] >= level).mean():.3f} / {(probability[~present] >= level).mean():.3f}"
-        for level in (0.02, 0.05, 0.1, 0.2, 0.3, 0.5)
+        for level in (0.01, 0.02, 0.05, 0.1, 0.5)
     ]
     print(
         f"{title}: {present.sum()} present, {(~present).sum()} absent, AUROC {auroc(present, probability):.4f} ± "
@@ -147,7 +183,7 @@ def plot(path: Path, tables: dict[str, list[dict[str, float]]]) -> None:
     matplotlib.use("agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(figsize=(4.2, 3.6), dpi=100, layout="constrained")
+    figure, axes = pyplot.subplots(figsize=(4.4, 3.8), dpi=100, layout="constrained")
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
     for (title, rows), marker in zip(tables.items(), "os^v", strict=False):
         x, y = [row["probability"] for row in rows], [row["present"] for row in rows]
@@ -156,7 +192,7 @@ def plot(path: Path, tables: dict[str, list[dict[str, float]]]) -> None:
             axes.annotate(str(row["words"]), (row["probability"], row["present"]), fontsize=6, xytext=(4, -7),
                           textcoords="offset points", color="0.35")  # fmt: skip
     axes.set(xlabel="mean probability of the words of a bin", ylabel="share of them that is present")
-    axes.legend(loc="lower right", fontsize=8)
+    figure.legend(loc="outside upper center", ncols=3, fontsize=8)
     figure.savefig(path)
 
 
@@ -177,23 +213,26 @@ def main() -> None:
     names = names_of(load_scene(path) for path in rooms)
     table = text_table_of(LabelsConfig())
     assert table is not None
-    sources = {
-        "fused": fusion_source(LabelsConfig(), table),
-        "encoded": encoder_source(load_encoder(arguments.weights)),
+    named = {name: (name,) for name in names}
+    encoder = encoder_source(load_encoder(arguments.weights))
+    asked_of = {
+        "fused": (fusion_source(LabelsConfig(), table), named),
+        "encoded": (encoder, named),
+        "other words, encoded": (encoder, OTHER_WORDS),
     }
     rows = {}
-    for title, source in sources.items():
+    for title, (source, words) in asked_of.items():
         folder = arguments.evidence / title if arguments.evidence else None
-        rows[title] = [gather(paths, source, table, names, folder) for paths in (fitted, held_out)]
+        rows[title] = [gather(paths, source, table, names, words, folder) for paths in (fitted, held_out)]
     print(f"fitted on {len(fitted)} rooms, tested on {len(held_out)}")
     tables = {}
     for keys in (WITH, WITHOUT):
-        together = fit([parts[0] for parts in rows.values()], keys)
+        together = fit({title: parts[0] for title, parts in rows.items()}, keys)
         print(
             f"\n{'with' if keys is WITH else 'without'} rivals: { {key: round(v, 3) for key, v in together.items()} }"
         )
         for title, (known, unknown) in rows.items():
-            alone = fit([known], keys)
+            alone = fit({title: known}, keys)
             report(f"{title}, rooms of the fit", known, together)
             report(f"{title}, other rooms, a model of its own", unknown, alone)
             found = report(f"{title}, other rooms", unknown, together)

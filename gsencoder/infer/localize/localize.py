@@ -67,7 +67,7 @@ class LocalizeConfig:
     )
     max_boxes: int = field(default=10, metadata={"help": "largest number of boxes for each word"})
     min_probability: float = field(
-        default=0.05,
+        default=0.02,
         metadata={"help": "boxes that are less probable are left out, and words without a box are absent; 0 = none"},
     )
 

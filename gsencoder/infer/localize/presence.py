@@ -49,11 +49,11 @@ class Evidence:
 
 
 WITH_RIVALS: Mapping[str, float] = MappingProxyType(
-    {"intercept": -14.356, "mean": 15.317, "margin": 5.906, "prominence": -0.19, "size": 0.795, "share": 1.525}
+    {"intercept": -11.048, "mean": 12.38, "margin": 2.662, "prominence": -0.226, "size": 0.41, "share": 3.293}
 )
 """Coefficients where the words come from a vocabulary."""
 WITHOUT_RIVALS: Mapping[str, float] = MappingProxyType(
-    {"intercept": -18.987, "mean": 23.837, "prominence": -0.405, "size": 0.668, "share": 1.253}
+    {"intercept": -13.295, "mean": 16.358, "prominence": -0.305, "size": 0.369, "share": 2.834}
 )
 """Coefficients where nothing is known but the word itself."""
 

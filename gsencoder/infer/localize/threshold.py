@@ -27,10 +27,10 @@ class ThresholdConfig:
     )
     fixed: float = field(default=0.5, metadata={"help": "relevancy for kind=fixed, and the most for kind=adaptive"})
     relative: float = field(
-        default=0.6, metadata={"help": "share of the word's highest relevancy for kind=adaptive and kind=relative"}
+        default=0.7, metadata={"help": "share of the word's highest relevancy for kind=adaptive and kind=relative"}
     )
     noise: float = field(
-        default=4.0,
+        default=2.0,
         metadata={
             "help": "kind=adaptive takes no Gaussian below the median relevancy of the word plus so many times its "
             "spread (median absolute deviation, as a standard deviation) over the scene"
