@@ -333,6 +333,15 @@ def test_pictures_are_sent_no_larger_than_asked(kind: Any, shape: tuple[int, int
     assert np.abs(np.asarray(image).astype(int) - 200).max() < 3
 
 
+def test_prompts_say_how_sure_the_search_is_and_what_it_did_not_find() -> None:
+    sure = {"probabilities": [0.97, 0.5], "absent": {"zebra": 0.03}}
+    marked = prompt_text("ground", "the left one", ["mug", "cup"], marks=(1, 2), kinds=RENDERS, **sure)
+    assert "Probability that the name is right: mark 1 0.97, mark 2 0.50." in marked
+    plain = prompt_text("answer", "Is there a zebra?", ["mug", "cup"], marks=(), kinds=RENDERS, **sure)
+    assert "Probability" not in plain
+    assert "Looked for and probably absent: zebra (probability 0.03)." in plain
+
+
 def test_prompts_hold_the_question_and_the_names_of_the_marks() -> None:
     text = prompt_text("answer", " What's red? ", ["mug", "mug"], marks=(1, 2), kinds=RENDERS)
     assert "Question: What's red?" in text

@@ -403,6 +403,14 @@ def test_lines_take_the_task_of_the_command_unless_they_name_one(tmp_path: Path)
     assert read_questions(file)[0].question.text == "a\u2028b\u0085c"
 
 
+def test_a_word_that_is_absent_stands_in_the_prompt_and_in_the_answer(features: Path, tmp_path: Path) -> None:
+    assert ask(features, tmp_path / "dry", "question=Where?", "query=cube,pen holder", "dry_run=true") == 0
+    assert "probably absent: pen holder (probability 0.0" in (tmp_path / "dry" / "prompt.txt").read_text()
+    (absent,) = json.loads((tmp_path / "dry" / "summary.json").read_text())["results"]["absent"]
+    assert absent["query"] == "pen holder"
+    assert absent["probability"] < 0.02
+
+
 def test_words_for_one_thing_give_it_one_mark(features: Path, tmp_path: Path) -> None:
     words = ("question=the left one", "task=ground", "query=crate,crates,cube,crate", "dry_run=true")
     assert ask(features, tmp_path / "dry", *words) == 0

@@ -50,6 +50,26 @@ def test_views_are_written_with_what_they_show_and_why(features: Path, tmp_path:
     assert np.isfinite(tokens).all()
 
 
+def test_a_word_that_is_absent_is_said_to_be(
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = "query=cube,pen holder"
+    loud = [word for word in QUICK if word != "quiet=true"]
+    assert cli.main(["views", str(features), words, f"out={tmp_path / 'views'}", *loud]) == 0
+    assert "pen holder: absent (probability 0.0" in capsys.readouterr().out
+    assert cli.main(["localize", str(features), words, "pictures=0", f"out={tmp_path / 'boxes'}"]) == 0
+    told = capsys.readouterr().out
+    assert "pen holder: absent (probability 0.0" in told
+    assert "probability 1.00" in told or "probability 0.9" in told
+    listed = json.loads((tmp_path / "boxes" / "boxes.json").read_text())
+    assert {box["query"] for box in listed} == {"cube"}
+    assert all(0.9 < box["probability"] <= 1 for box in listed)
+    for folder in ("views", "boxes"):
+        results = json.loads((tmp_path / folder / "summary.json").read_text())["results"]
+        assert [row["absent"] for row in results["words"]] == [False, True]
+    assert json.loads((tmp_path / "boxes" / "words.json").read_text()) == results["words"]
+
+
 def test_several_words_and_boxes_are_looked_at_together(features: Path, tmp_path: Path) -> None:
     out = tmp_path / "views"
     assert cli.main(["views", str(features), "query=cube,crate", "boxes=2", f"out={out}", *QUICK]) == 0
