@@ -19,9 +19,10 @@ from gsencoder.data.splats import READABLE
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.orbit_views import check_orbits, with_views
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
+from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_of, words_of_scene
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.text.table import TextTable, save_text_table
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
+from gsencoder.text.table import save_text_table
 from gsencoder.types import Scene
 
 
@@ -43,6 +44,7 @@ class FuseCommandConfig(CommonConfig):
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
         check_orbits(self.orbits)
@@ -52,14 +54,15 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     """Fuses one scene into out=, or each of several into the folder OUT/NAME."""
     paths = find_scenes(config.paths)
     with summary.step("teacher"):
-        words = text_table_of(config.teacher)
+        words = words_of(config.teacher, config.text)
     screen = console(config.quiet)
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
             scene = load_fusable(path, config, one)
-            fusion = fuse_scene(scene, config.teacher, words, config, one, out)
-            write_features(folder, scene, fusion, words, config, one)
+            known = words_of_scene(config.teacher, scene, words)
+            fusion = fuse_scene(scene, config.teacher, known, config, one, out)
+            write_features(folder, scene, fusion, known, config, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
         seen, total = one.results["seen"], one.results["gaussians"]
         screen.print(
@@ -101,7 +104,7 @@ def work_folder(out: Path) -> Path:
 def fuse_scene(
     scene: Scene,
     teacher: TeacherConfig,
-    words: TextTable | None,
+    words: Words | None,
     config: FuseCommandConfig,
     summary: Summary,
     out: Path,
@@ -115,7 +118,7 @@ def fuse_scene(
 
 
 def write_features(
-    folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, config: FuseCommandConfig, summary: Summary
+    folder: Path, scene: Scene, fusion: Fusion, words: Words | None, config: FuseCommandConfig, summary: Summary
 ) -> None:
     """Writes features, scene and words, and adds the figures of the fusion to the summary."""
     features = fusion.features
@@ -123,7 +126,7 @@ def write_features(
         chosen = {"teacher": settings(config.teacher), "fusion": settings(config.fusion)}
         save_features(folder, scene, features, chosen)
         if words is not None:
-            save_text_table(folder / WORDS_FILE, words)
+            save_text_table(folder / WORDS_FILE, closed_table(words))
     summary.results.update(
         gaussians=len(features),
         seen=int(features.seen.sum()),

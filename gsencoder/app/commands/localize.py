@@ -16,6 +16,7 @@ from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localize import LocalizeConfig, localization_to_json, localize
+from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.types import Localization
 
 
@@ -32,6 +33,7 @@ class LocalizeCommandConfig(CommonConfig):
     space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
     pictures: int = field(default=4, metadata={"help": "number of views drawn for each word; 0 = none"})
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
@@ -48,7 +50,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         scene = load_features(folder)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
         scene, _ = with_up(scene)
-        table = load_words(folder, config.words)
+        table = load_words(folder, config.words, config.text)
     with summary.step("localize"):
         localization = localize(scene, words, table, config.localize, space=config.space or None)
     out = config.out or Path("outputs") / scene.name / "boxes"

@@ -1,13 +1,16 @@
-"""Teachers, and their text tables, from settings."""
+"""Teachers, and the words that lead into their spaces, from settings."""
 
 import numpy as np
 
+from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
+from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable, load_text_table, make_text_table
 from gsencoder.types import Scene
 
@@ -26,17 +29,43 @@ def text_table_of(config: TeacherConfig) -> TextTable | None:
     return load_text_table(find_file(config.words, "teacher.words")) if config.words else None
 
 
-def build_teacher(config: TeacherConfig, scene: Scene, words: TextTable | None) -> Teacher:
+def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Words | None:
+    """The words of the teacher's space: its text table, or the vocabulary of a text tower; None where there are none.
+
+    Args:
+        config: of the teacher.
+        text: a tower whose vectors the teacher's features are, or are made to be; its own table is not read then.
+
+    Raises:
+        InputError: a table or tower cannot be found or read, or the teacher's space has words of its own.
+    """
+    if isinstance(text, TableTextConfig):
+        return text_table_of(config)
+    if isinstance(config, PaletteConfig):
+        raise InputError(f"text={text.name}: teacher=palette has the words of its eleven colors; leave out text=")
+    return vocabulary_of(text)
+
+
+def words_of_scene(config: TeacherConfig, scene: Scene, words: Words | None) -> Words | None:
+    """The words with the names of the scene's objects among those that need no tower, where their teacher is asked for
+    them."""
+    if not isinstance(config, LabelsConfig) or not isinstance(words, OpenVocabulary):
+        return words
+    return words.including(sorted({o.name for o in scene.objects if o.name is not None}))
+
+
+def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> Teacher:
     """The teacher of a scene.
 
     Args:
         config: which teacher and its settings.
         scene: the labels teacher reads its objects.
-        words: from `text_table_of(config)`, which is read once for many scenes.
+        words: from `words_of(config)`, which is read once for many scenes.
 
     Raises:
         InputError: the teacher lacks something it needs.
     """
+    words = words_of_scene(config, scene, words)
     if isinstance(config, PaletteConfig):
         return PaletteTeacher(config)
     if isinstance(config, OnnxConfig):
@@ -44,6 +73,12 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: TextTable | None) 
     if isinstance(config, RadioConfig):
         return RadioTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
     assert words is not None
+    table = closed_table(words)
     return LabelsTeacher(
-        scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder, cell=config.cell
+        scene.objects,
+        table.names,
+        table.embeddings,
+        text_encoder=table.space.text_encoder,
+        mean=table.mean,
+        cell=config.cell,
     )
