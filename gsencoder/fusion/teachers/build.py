@@ -9,12 +9,13 @@ from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
 from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable, load_text_table, make_text_table
 from gsencoder.types import Scene
 
-TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig
+TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig | SegmenterConfig
 
 
 def text_table_of(config: TeacherConfig) -> TextTable | None:
@@ -72,6 +73,13 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
         return OnnxTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
     if isinstance(config, RadioConfig):
         return RadioTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
+    if isinstance(config, SegmenterConfig):
+        if words is None:
+            raise InputError(
+                "teacher segmenter: its classes need words: give a text tower (text=onnx text.model=FOLDER), or a text "
+                "table that has their names (teacher.words=)"
+            )
+        return SegmenterTeacher(config, words)
     assert words is not None
     table = closed_table(words)
     return LabelsTeacher(
