@@ -19,10 +19,11 @@ from gsencoder.data.splats import READABLE
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.orbit_views import check_orbits, with_views
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_of, words_of_scene
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
-from gsencoder.text.table import save_text_table
+from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.types import Scene
 
 
@@ -60,9 +61,10 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     def run_one(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
             scene = load_fusable(path, config, one)
-            known = words_of_scene(config.teacher, scene, words)
-            fusion = fuse_scene(scene, config.teacher, known, config, one, out)
-            write_features(folder, scene, fusion, known, config, one)
+            with one.step("teacher"):
+                teacher = build_teacher(config.teacher, scene, words)
+            fusion = fuse_scene(scene, teacher, config, one, out)
+            write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
         seen, total = one.results["seen"], one.results["gaussians"]
         screen.print(
@@ -103,22 +105,20 @@ def work_folder(out: Path) -> Path:
 
 def fuse_scene(
     scene: Scene,
-    teacher: TeacherConfig,
-    words: Words | None,
+    teacher: Teacher,
     config: FuseCommandConfig,
     summary: Summary,
     out: Path,
 ) -> Fusion:
     """Fuses, and adds the seconds of the steps to the summary."""
-    built = build_teacher(teacher, scene, words)
-    work = None if built.cheap else work_folder(out)
-    fusion = fuse(scene, built, config.fusion, work=work, track=Progress(quiet=config.quiet))
+    work = None if teacher.cheap else work_folder(out)
+    fusion = fuse(scene, teacher, config.fusion, work=work, track=Progress(quiet=config.quiet))
     summary.add_seconds(fusion.seconds)
     return fusion
 
 
 def write_features(
-    folder: Path, scene: Scene, fusion: Fusion, words: Words | None, config: FuseCommandConfig, summary: Summary
+    folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, config: FuseCommandConfig, summary: Summary
 ) -> None:
     """Writes features, scene and words, and adds the figures of the fusion to the summary."""
     features = fusion.features
@@ -126,7 +126,7 @@ def write_features(
         chosen = {"teacher": settings(config.teacher), "fusion": settings(config.fusion)}
         save_features(folder, scene, features, chosen)
         if words is not None:
-            save_text_table(folder / WORDS_FILE, closed_table(words))
+            save_text_table(folder / WORDS_FILE, words)
     summary.results.update(
         gaussians=len(features),
         seen=int(features.seen.sum()),

@@ -47,12 +47,13 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
     return vocabulary_of(text)
 
 
-def words_of_scene(config: TeacherConfig, scene: Scene, words: Words | None) -> Words | None:
-    """The words with the names of the scene's objects among those that need no tower, where their teacher is asked for
-    them."""
-    if not isinstance(config, LabelsConfig) or not isinstance(words, OpenVocabulary):
-        return words
-    return words.including(sorted({o.name for o in scene.objects if o.name is not None}))
+def words_beside(teacher: Teacher, words: Words | None) -> TextTable | None:
+    """The table that is stored with a teacher's features: of a tower, with the names that the teacher knows."""
+    if isinstance(words, OpenVocabulary) and isinstance(teacher, SegmenterTeacher):
+        words = words.including(teacher.kinds)
+    elif isinstance(words, OpenVocabulary) and isinstance(teacher, LabelsTeacher):
+        words = words.including(teacher.names[1:])
+    return closed_table(words) if words is not None else None
 
 
 def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> Teacher:
@@ -66,7 +67,6 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
     Raises:
         InputError: the teacher lacks something it needs.
     """
-    words = words_of_scene(config, scene, words)
     if isinstance(config, PaletteConfig):
         return PaletteTeacher(config)
     if isinstance(config, OnnxConfig):
@@ -81,6 +81,8 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
             )
         return SegmenterTeacher(config, words)
     assert words is not None
+    if isinstance(words, OpenVocabulary):
+        words = words.including(sorted({o.name for o in scene.objects if o.name is not None}))
     table = closed_table(words)
     return LabelsTeacher(
         scene.objects,

@@ -15,7 +15,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import find_file
-from gsencoder.fusion.teachers.segmenter_classes import read_classes, synonyms_of
+from gsencoder.fusion.teachers.segmenter_classes import read_classes, synonyms_of_classes
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenter, OnnxSegmenterOptions
 from gsencoder.fusion.teachers.segmenter_transformers import TransformersSegmenter
 from gsencoder.text.build import Words
@@ -82,7 +82,12 @@ class Segmenter(Protocol):
 
 
 class SegmenterTeacher:
-    """Posteriors of a dense classifier as shares of its class names."""
+    """Posteriors of a dense classifier as shares of its class names.
+
+    Attributes:
+        names: of the classes, in the order of the network.
+        kinds: the names that stand for kinds of things, synonyms one by one.
+    """
 
     needs_images = True
     cheap = False
@@ -118,7 +123,9 @@ class SegmenterTeacher:
                 "teacher.classes= (a .json list, or a text file with one name a line)"
             )
         self.mean = words.mean
-        self.table = _class_vectors(self.names, config.nothing, words)
+        synonyms = synonyms_of_classes(self.names, config.nothing)
+        self.kinds = tuple(dict.fromkeys(phrase for each in synonyms for phrase in each))
+        self.table = _class_vectors(synonyms, words)
         self.space = FeatureSpace(
             name=f"{self._network.name}-words",
             channels=words.space.channels,
@@ -187,20 +194,13 @@ def _checked_shares(scores: Float32[np.ndarray, "h w C"], where: str) -> Float32
     return scores
 
 
-def _class_vectors(names: Sequence[str], nothing: Sequence[str], words: Words) -> Float32[np.ndarray, "C D"]:
-    """The vector of each class: the normalized mean over its synonyms, "bookcase, bookshelf"; of a class that is no
-    kind of thing the direction of the text side's mean, as the labels teacher has it for "other"."""
-    synonyms = [
-        [] if name.strip().casefold() in {word.casefold() for word in nothing} else synonyms_of(name) for name in names
-    ]
+def _class_vectors(synonyms: Sequence[Sequence[str]], words: Words) -> Float32[np.ndarray, "C D"]:
+    """The vector of each class: the normalized mean over its synonyms; of a class without any the direction of the text
+    side's mean, as the labels teacher has it for "other"."""
     phrases = list(dict.fromkeys(phrase for each in synonyms for phrase in each))
     if not phrases:
         raise InputError("teacher segmenter: none of its classes is a kind of thing; check teacher.nothing")
-    vector_of = dict(zip(phrases, words.encode(phrases), strict=True))
+    vector_of = dict(zip(phrases, words.encode(phrases).astype(np.float64), strict=True))
     mean = words.mean.astype(np.float64)
-    rows = [
-        sum((vector_of[phrase].astype(np.float64) for phrase in each), np.zeros(len(mean))) if each else mean
-        for each in synonyms
-    ]
-    table = np.stack(rows)
+    table = np.stack([np.mean([vector_of[phrase] for phrase in each], axis=0) if each else mean for each in synonyms])
     return (table / np.sqrt((table**2).sum(axis=1, keepdims=True) + 1e-24)).astype(np.float32)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
@@ -9,7 +10,18 @@ from gsencoder.core.errors import InputError
 MAX_CLASSES_BYTES = 1 << 22
 
 
-def synonyms_of(name: str) -> list[str]:
+def synonyms_of_classes(names: Sequence[str], nothing: Sequence[str]) -> list[list[str]]:
+    """The synonyms of each class; none of a class that is no kind of thing.
+
+    Args:
+        names: of the classes.
+        nothing: names of classes that are no kind of thing.
+    """
+    no_kind = {word.strip().casefold() for word in nothing}
+    return [[] if name.strip().casefold() in no_kind else _synonyms(name) for name in names]
+
+
+def _synonyms(name: str) -> list[str]:
     """The parts of "window, windowpane" or "door;double door", with blanks for _ and -."""
     parts = [re.sub(r"[\s_\-]+", " ", part).strip() for part in re.split(r"[,;]", name)]
     return [part for part in parts if part]
