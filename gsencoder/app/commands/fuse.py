@@ -17,7 +17,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
-from gsencoder.fusion.orbit_views import check_orbits, with_views
+from gsencoder.fusion.orbit_views import INSIDE, CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
@@ -36,7 +36,11 @@ class FuseCommandConfig(CommonConfig):
         metadata={"help": "scenes, or folders of scenes: views, or a bare splat", "metavar": "SCENE", "required": True},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
-    orbits: int = field(default=24, metadata={"help": "number of cameras placed around a splat without views"})
+    orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
+    cameras: CamerasOfSplat = field(
+        default="auto",
+        metadata={"help": "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"},
+    )
     worker: int = field(
         default=0,
         metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
@@ -95,7 +99,15 @@ def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Sce
         with summary.step("seeds"):
             scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
     scene = with_reported_up(scene, summary, quiet=config.quiet)
-    return with_views(scene, config.orbits, config.fusion.blend)
+    if scene.views is not None:
+        return scene
+    with summary.step("cameras"):
+        scene = with_views(scene, config.orbits, config.fusion.blend, cameras=config.cameras)
+    assert scene.views is not None
+    where = "inside" if scene.views.names[0].startswith(INSIDE) else "around"
+    summary.results["cameras"] = where
+    console(config.quiet).print(f"{scene.name}: a bare splat; rendered from {len(scene.views)} cameras {where} it")
+    return scene
 
 
 def work_folder(out: Path) -> Path:

@@ -75,9 +75,14 @@ class Segmenter(Protocol):
     preprocessing: str
 
     def outputs(
-        self, image: UInt8[np.ndarray, "H W 3"]
+        self, image: UInt8[np.ndarray, "H W 3"], num_classes: int
     ) -> tuple[Float32[np.ndarray, "h w C"], bool, Float64[np.ndarray, "2 3"]]:
-        """Class scores, whether they are probabilities (else logits), and the affine from image pixels to cells."""
+        """Class scores, whether they are probabilities (else logits), and the affine from image pixels to cells.
+
+        Args:
+            image: any size.
+            num_classes: tells the axis of the classes from those of the grid.
+        """
         ...
 
 
@@ -144,7 +149,7 @@ class SegmenterTeacher:
         """
         if views.images is None:
             raise InputError("teacher segmenter: the scene has no pictures")
-        scores, are_probabilities, grid_from_image = self._network.outputs(views.images[view])
+        scores, are_probabilities, grid_from_image = self._network.outputs(views.images[view], len(self.names))
         where = f"teacher segmenter: {self._network.name}: view {views.names[view]!r}"
         if scores.shape[-1] != len(self.names):
             raise InputError(

@@ -108,9 +108,14 @@ class OnnxSegmenter:
         self.digest = digest_files(path)
 
     def outputs(
-        self, image: UInt8[np.ndarray, "H W 3"]
+        self, image: UInt8[np.ndarray, "H W 3"], num_classes: int
     ) -> tuple[Float32[np.ndarray, "h w C"], bool, Float64[np.ndarray, "2 3"]]:
         """Class scores of one picture.
+
+        Args:
+            image: any size.
+            num_classes: tells the axis of the classes from those of the grid; where it does not, outputs are laid out
+                as inputs are.
 
         Raises:
             InputError: the model does not run on it, or gives no grid of classes.
@@ -128,17 +133,14 @@ class OnnxSegmenter:
                 f"{where} gave {self._output!r} of {getattr(output, 'dtype', '?')}{list(np.shape(output))}; expected "
                 "scores [1, classes, rows, columns]; give teacher.onnx.output= of the logits"
             )
-        scores = output[0].transpose(1, 2, 0) if self._classes_first(output.shape) else output[0]
+        scores = output[0].transpose(1, 2, 0) if self._classes_first(output.shape, num_classes) else output[0]
         rows, columns = scores.shape[:2]
         affine = np.array([[columns / image.shape[1], 0.0, 0.0], [0.0, rows / image.shape[0], 0.0]])
         return np.ascontiguousarray(scores, np.float32), self.options.activation == "none", affine
 
-    def _classes_first(self, shape: tuple[int, ...]) -> bool:
-        """Outputs are laid out as inputs are; where the number of classes is known, it decides."""
-        count = len(self.classes)
-        if count and (shape[1] == count) != (shape[3] == count):
-            return shape[1] == count
-        return self._channels_first
+    def _classes_first(self, shape: tuple[int, ...], count: int) -> bool:
+        first, last = shape[1] == count, shape[3] == count
+        return first if first != last else self._channels_first
 
     def _fitted(self, image: UInt8[np.ndarray, "H W 3"]) -> Any:
         """The picture in the model's size and type."""

@@ -49,7 +49,9 @@ class TransformersSegmenter:
         self.digest = digest_files(*sorted(files))
 
     def outputs(
-        self, image: UInt8[np.ndarray, "H W 3"]
+        self,
+        image: UInt8[np.ndarray, "H W 3"],
+        num_classes: int,  # noqa: ARG002
     ) -> tuple[Float32[np.ndarray, "h w C"], bool, Float64[np.ndarray, "2 3"]]:
         """Class scores of one picture: logits of a semantic head, probabilities of a head of masks."""
         import torch
