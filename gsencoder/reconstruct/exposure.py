@@ -27,7 +27,8 @@ class Exposures:
     where the splat is still blurred, is left to the splat: only the difference from their mean is applied.
 
     Attributes:
-        maps: of the fitted photographs in their order, [V, 3, 4]: a matrix and an offset.
+        training: row numbers of the fitted photographs.
+        maps: of these in their order, [V, 3, 4]: a matrix and an offset.
     """
 
     def __init__(self, training: Sequence[int], maps: Float[Tensor, "V 3 4"] | None = None) -> None:
@@ -35,6 +36,7 @@ class Exposures:
         training: row numbers of the fitted photographs.
         maps: of a run that is continued; None = nothing is known yet.
         """
+        self.training = tuple(training)
         self._rows = {view: row for row, view in enumerate(training)}
         self.maps = IDENTITY.repeat(len(training), 1, 1) if maps is None else maps
 

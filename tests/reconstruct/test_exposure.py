@@ -111,7 +111,7 @@ def test_gains_of_photographs_are_found_and_the_held_out_view_gains() -> None:
     matched = [score(one, [HELD_OUT]).matched_psnr for one in (on, off)]
     assert matched[0] > matched[1] + 1
     brightness = on.exposures.brightness()
-    line = describe_exposure(float(brightness.min()), float(brightness.max()))
+    line = describe_exposure(float(brightness.min()), float(brightness.max()), "mean")
     assert line is not None
     assert "0.7" in line
 
@@ -124,8 +124,9 @@ def test_photographs_of_one_exposure_are_fitted_as_well_as_without() -> None:
     assert float((on.exposures.brightness() - 1).abs().max()) < SAME
     scores = [score(one, [HELD_OUT]) for one in (on, off)]
     assert scores[0].psnr > scores[1].psnr - 0.1
-    assert describe_exposure(1 - 0.9 * SAME, 1 + 0.9 * SAME) is None
-    assert describe_exposure(1 - 1.1 * SAME, 1.0) is not None
+    assert describe_exposure(1 - 0.9 * SAME, 1 + 0.9 * SAME, "order") is None
+    assert "before and after" in (describe_exposure(1 - 1.1 * SAME, 1.0, "order") or "")
+    assert describe_exposure(1.0, 1 + 1.1 * SAME, "cameras") is not None
 
 
 def test_a_checkpoint_from_before_exposures_is_of_another_setting(tmp_path: Path) -> None:
