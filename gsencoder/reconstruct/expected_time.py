@@ -39,7 +39,8 @@ def expected_seconds(optimizer: Optimizer, held_out: Sequence[int], validations:
         if pruned and state is optimizer:
             began = time.perf_counter()
             state = _pruned(optimizer)
-            seconds += len(prunings) * (time.perf_counter() - began)
+            left = len(state.raw["means"]) / len(optimizer.raw["means"])
+            seconds += (1 + (len(prunings) - 1) * left) * (time.perf_counter() - began)
         seconds += len([*group]) * _mean_seconds(trial_views(optimizer.training), partial(_step, state, shrink))
     if held_out and validations:
         looks = validations * len(held_out)
