@@ -14,7 +14,9 @@ STEP = 0.5
 OPAQUE = 0.5
 """Pixels of a render below this alpha show the background, and tell nothing."""
 SAME = 0.03
-"""Photographs whose brightness differs by less from the mean do not count as differing in exposure."""
+"""Photographs of which no color channel differs by more from the mean do not count as differing in exposure."""
+ROUNDS = 3
+"""After so many looks at every photograph its map has gone seven eighths of its way, and is judged."""
 
 IDENTITY = torch.eye(3, 4)
 
@@ -55,8 +57,15 @@ class Exposures:
 
     def brightness(self) -> Float[Tensor, " V"]:
         """How bright each photograph is, relative to their mean: what its map makes of a middle grey."""
+        return self._channels().mean(-1)
+
+    def differ(self) -> bool:
+        """Whether photographs differ in exposure or white balance."""
+        return float((self._channels() - 1).abs().max()) > SAME
+
+    def _channels(self) -> Float[Tensor, "V 3"]:
         relative = self.maps - self.maps.mean(0) + IDENTITY
-        return (0.5 * relative[..., :3].sum(-1) + relative[..., 3]).mean(-1) / 0.5
+        return (0.5 * relative[..., :3].sum(-1) + relative[..., 3]) / 0.5
 
 
 def fitted_colors(

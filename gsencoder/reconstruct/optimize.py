@@ -16,7 +16,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.signals import defer_signals
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.anchor import Anchor
-from gsencoder.reconstruct.exposure import Exposures, apply_colors, fitted_colors, known_pixels
+from gsencoder.reconstruct.exposure import ROUNDS, Exposures, apply_colors, fitted_colors, known_pixels
 from gsencoder.reconstruct.losses import losses_of
 from gsencoder.reconstruct.parameters import (
     Parameters,
@@ -152,7 +152,8 @@ class Optimizer:
     Attributes:
         adam: holds the parameters, and their moments.
         anchor: what holds positions near their seeds, if anything does.
-        exposures: affine colors of the photographs; None where they are fitted as they are.
+        exposures: affine colors of the photographs; None where they are fitted as they are, by wish or because they
+            turned out not to differ.
         step: steps that are done.
         is_consistent: whether the state is one between two steps.
     """
@@ -178,7 +179,7 @@ class Optimizer:
         prune: what is taken out, and when.
         raster: accuracy of rendering.
         anchor: what holds positions near their seeds; None = nothing.
-        exposures: maps [V, 3, 4] of a run that is continued; None = identities.
+        exposures: maps [V, 3, 4] of a run that is continued; None = identities at step 0, and none later.
         step: steps that are done.
 
         Raises:
@@ -187,7 +188,8 @@ class Optimizer:
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
         self.adam, self.anchor, self.step, self.is_consistent = adam, anchor, step, True
-        self.exposures = Exposures(self.training, exposures) if config.exposure else None
+        differ = config.exposure and (step == 0 or exposures is not None)
+        self.exposures = Exposures(self.training, exposures) if differ else None
         self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
         self._check_sizes()
@@ -230,6 +232,10 @@ class Optimizer:
                 if self.exposures is not None and colors is not None:
                     self.exposures.set(view, colors)
             self.step += 1
+            rounds, rest = divmod(self.step, len(self.training))
+            if self.exposures is not None and rounds >= ROUNDS and not rest and not self.exposures.differ():
+                # Where all have one exposure, maps would take from the splat what depends on the direction.
+                self.exposures = None
             if self.pruning.due(self.step, self.config.steps):
                 self.prune()
             self.is_consistent = True
