@@ -4,8 +4,9 @@ without.
     python bench/exposure.py $S/scenes/plush --image-scale 0.5
 
 Gains are drawn log-uniformly from 1/1.4 to 1.4 for each photograph, and ±10 % more for each color channel. Every
-eighth photograph is held out as it is. The last column is the PSNR after an affine map of colors was fitted to each
-held-out photograph, which is the figure that an arbitrary mean exposure does not change.
+eighth photograph is held out as it is. PSNR and SSIM are in the exposures that are predicted from the source named. The
+last column is the PSNR after an affine map of colors was fitted to each held-out photograph, which is the figure that
+an arbitrary mean exposure does not change.
 
 Where the scene is a COLMAP model, the brightness of photographs is measured a second time, from the gray levels along
 the tracks of its points and from nothing else, and compared with that of the maps.
@@ -77,7 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     scene = load_scene(chosen.scene, options=SceneConfig(image_scale=chosen.image_scale))
     holdout = ReconstructConfig().holdout
-    print("| photographs | `optimize.exposure` | PSNR | SSIM | brightness | matched PSNR |\n|---|---|---|---|---|---|")
+    print("| photographs | `optimize.exposure` | PSNR | SSIM | brightness | predicted from | matched PSNR |")
+    print("|---|---|---|---|---|---|---|")
+    fitted_as_is = None
     for name, one in (("as they are", scene), ("exposures vary", exposed(scene, holdout))):
         for fitted in (True, False):
             config = ReconstructConfig(
@@ -92,11 +95,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 fitted_as_is = np.array(result.exposure), np.array(result.training)
             print(
                 f"| {name} | {str(fitted).lower()} | {last['psnr']:.2f} | {last['ssim']:.3f} | {brightness} "
-                f"| {last['matched_psnr']:.2f} |",
+                f"| {result.exposure_source or '–'} | {last['matched_psnr']:.2f} |",
                 flush=True,
             )
     model = next((path.parent for path in sorted(chosen.scene.rglob("points3D.*"))), None)
-    if model is not None:
+    if model is not None and fitted_as_is is not None:
         brightness, training = fitted_as_is
         tracked = tracked_brightness(scene, model)[training]
         tracked = tracked / tracked.mean()

@@ -6,6 +6,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # Before torch counts the cores: small arrays are slower on two threads, and another process has the other core.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# Vectors of phrases are not cached in the user's folder.
+os.environ["GSENCODER_CACHE"] = "off"
+
 import signal
 from collections.abc import Iterator
 from pathlib import Path

@@ -12,14 +12,14 @@ from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder
-from gsencoder.text.table import TextTable
+from gsencoder.text.build import Words
 from gsencoder.types import GaussianFeatures, Scene
 
 FeatureSource = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
 """A function from a scene with Gaussians to their features and the seconds of each step."""
 
 
-def fusion_source(teacher: TeacherConfig, words: TextTable | None, config: FuseConfig = FuseConfig()) -> FeatureSource:
+def fusion_source(teacher: TeacherConfig, words: Words | None, config: FuseConfig = FuseConfig()) -> FeatureSource:
     """A source that fuses a teacher's maps.
 
     Args:

@@ -16,21 +16,27 @@ from gsencoder.types import FeatureBasis, FeatureMap, Gaussians, Views
 
 
 def map_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "P D"]:
-    """A map as rows; cells of code −1 are NaN."""
+    """A map as rows; cells without a feature are NaN."""
     if feature_map.features is not None:
         return feature_map.features.reshape(-1, feature_map.space.channels)
-    assert feature_map.codes is not None
     assert feature_map.table is not None
+    if feature_map.shares is not None:
+        shares = feature_map.shares.reshape(-1, len(feature_map.table))
+        weights = shares.sum(axis=1, keepdims=True)
+        rows = (shares @ feature_map.table) / np.where(weights > 0, weights, np.float32(np.nan))
+        return rows.astype(np.float32)
+    assert feature_map.codes is not None
     codes = feature_map.codes.ravel()
     return np.where((codes >= 0)[:, None], feature_map.table[codes], np.float32(np.nan))
 
 
 class FeatureSums:
-    """Sums over views of weighted features and of weights; for coded maps, of the weight of each code.
+    """Sums over views of weighted features and of weights; for maps with a table, of the weight of each of its rows.
 
     Attributes:
-        sums: Σ Bᵀ @ maps in coordinates of the basis (or channels); of coded maps Σ Bᵀ @ one_hot(codes).
-        weights: Σ Bᵀ @ 1; zero where maps are coded, whose weights are the row sums.
+        sums: Σ Bᵀ @ maps in coordinates of the basis (or channels); of maps with a table Σ Bᵀ @ shares, where the
+            shares of a code are one_hot(code).
+        weights: Σ Bᵀ @ 1; zero where maps have a table, since their weights are the row sums.
         views: how many views were added.
     """
 
@@ -41,7 +47,7 @@ class FeatureSums:
         gaussians: number of rows.
         columns: coordinates or channels of a row.
         basis: whose coordinates are summed; None = channels.
-        table: the vectors of coded maps; None = dense maps.
+        table: of the maps; None = dense maps.
         """
         self.basis, self.table, self.views = basis, table, 0
         # numpy, not torch, allocates what is large: its arrays lie in huge pages, which fill many times faster.
@@ -54,6 +60,12 @@ class FeatureSums:
         """Adds a view: sums += Bᵀ @ (share · maps), weights += Bᵀ @ share, with the share of each row in the mask."""
         self.views += 1
         share = row_mask(mask, b.lattice) if mask is not None else None
+        if self.table is not None and feature_map.shares is not None:
+            shares = feature_map.shares.reshape(-1, len(self.table))
+            if share is not None:
+                shares = shares * share[:, None]
+            b.lift_into(torch.from_numpy(shares), torch.from_numpy(self.sums))
+            return
         if self.table is not None:
             assert feature_map.codes is not None
             codes = feature_map.codes.ravel()

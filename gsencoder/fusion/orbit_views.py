@@ -1,14 +1,19 @@
-"""Orbit cameras and rendered views for a splat that comes without any."""
+"""Cameras and rendered views for a splat that comes without any."""
 
 from dataclasses import replace
+from typing import Literal
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.orbits import orbit_cameras
+from gsencoder.fusion.interior_views import ROOM, interior_views
 from gsencoder.render import BlendConfig
 from gsencoder.render.images import RenderedImages
 from gsencoder.types import Scene, Views
 
 MOST_ORBITS = 10_000
+CamerasOfSplat = Literal["auto", "around", "inside"]
+AROUND, INSIDE = "orbit", "inside"
+"""What the names of views begin with."""
 
 
 def check_orbits(count: int) -> None:
@@ -21,12 +26,30 @@ def check_orbits(count: int) -> None:
         raise InputError(f"orbits: expected 1 to {MOST_ORBITS} cameras, got {count}")
 
 
-def with_views(scene: Scene, count: int, config: BlendConfig = BlendConfig()) -> Scene:
-    """The scene; a bare splat is seen by `count` cameras around it, whose pictures are rendered when asked for."""
+def with_views(
+    scene: Scene, count: int, config: BlendConfig = BlendConfig(), *, cameras: CamerasOfSplat = "auto"
+) -> Scene:
+    """The scene; a bare splat is seen by up to `count` cameras, whose pictures are rendered when asked for.
+
+    Args:
+        scene: with Gaussians, where it has no views.
+        count: largest number of cameras.
+        config: accuracy of the rendering.
+        cameras: around the splat, inside it, or "auto": inside if that shows most of it, as of a room.
+
+    Raises:
+        InputError: cameras inside are wanted, and nowhere in the splat is there room for one.
+    """
     if scene.views is not None:
         return scene
     assert scene.gaussians is not None
-    cameras = orbit_cameras(scene.gaussians, count=count, up=scene.up)
-    names = tuple(f"orbit_{view:03d}" for view in range(len(cameras)))
-    images = RenderedImages(scene.gaussians, cameras, config)
-    return replace(scene, views=Views(cameras=cameras, names=names, images=images))
+    inside = None if cameras == "around" else interior_views(scene.gaussians, count, up=scene.up)
+    if inside is None and cameras == "inside":
+        raise InputError(f"cameras=inside: no camera in {scene.name} would see surfaces all over its picture")
+    if inside is not None and (cameras == "inside" or inside.covered >= ROOM):
+        placed, kind = inside.cameras, INSIDE
+    else:
+        placed, kind = orbit_cameras(scene.gaussians, count=count, up=scene.up), AROUND
+    names = tuple(f"{kind}_{view:03d}" for view in range(len(placed)))
+    images = RenderedImages(scene.gaussians, placed, config)
+    return replace(scene, views=Views(cameras=placed, names=names, images=images))

@@ -21,20 +21,21 @@ SMALLEST_SCALE = 1e-30
 
 
 def write_map(path: Path, feature_map: FeatureMap) -> None:
-    """Writes a dense map as float16, each channel divided by its largest magnitude: float16 holds values up to 65,504
-    with three digits, and backbones have channels that are a hundred times larger than others. Cells that are not
-    finite are no part of the map, and are marked as such.
+    """Writes a dense or mixed map as float16, each channel divided by its largest magnitude: float16 holds values up to
+    65,504 with three digits, and backbones have channels that are a hundred times larger than others. Cells that are
+    not finite are no part of the map, and are marked as such.
 
     Raises:
         InputError: the disk is full, or the system refuses.
     """
-    values = feature_map.features
+    mixed = feature_map.shares is not None
+    values = feature_map.shares if mixed else feature_map.features
     assert values is not None, "coded maps are as quickly made as read"
     valid = np.isfinite(values).all(axis=-1)
     values = np.where(valid[..., None], values, np.float32(0))
     scale = np.maximum(np.abs(values).max(axis=(0, 1), initial=0), np.float32(SMALLEST_SCALE))
     arrays = {
-        "features": (values / scale).astype(np.float16),
+        "shares" if mixed else "features": (values / scale).astype(np.float16),
         "channel_scale": scale,
         "valid": valid.astype(np.uint8),
         "grid": feature_map.grid_from_image,
@@ -42,17 +43,26 @@ def write_map(path: Path, feature_map: FeatureMap) -> None:
     write_archive(path, arrays, {})
 
 
-def read_map(path: Path, space: FeatureSpace) -> FeatureMap:
-    """The map of a file; cells that had none are NaN.
+def read_map(path: Path, space: FeatureSpace, table: Float32[np.ndarray, "C D"] | None = None) -> FeatureMap:
+    """The map of a file; cells of a dense map that had none are NaN.
+
+    Args:
+        path: the file.
+        space: of the map.
+        table: of a mixed map.
 
     Raises:
         InputError: the file is damaged, or of another space.
     """
     with open_archive(path) as file:
-        features = file.array("features", "float16", ("h", "w", space.channels)).astype(np.float32)
-        features *= file.array("channel_scale", "float32", (space.channels,))
-        features[file.array("valid", "uint8", ("h", "w")) == 0] = np.nan
+        name, columns = ("features", space.channels) if table is None else ("shares", len(table))
+        values = file.array(name, "float16", ("h", "w", columns)).astype(np.float32)
+        values *= file.array("channel_scale", "float32", (columns,))
         grid = file.array("grid", "float64", (2, 3))
+        if table is not None:
+            return FeatureMap(shares=values, table=table, grid_from_image=grid, space=space)
+        features = values
+        features[file.array("valid", "uint8", ("h", "w")) == 0] = np.nan
     return FeatureMap(features=features, grid_from_image=grid, space=space)
 
 
@@ -98,12 +108,12 @@ class CachedTeacher:
         path = self._folder / f"map_{view:05d}.safetensors"
         if not path.is_file():
             made = self.teacher.feature_map(views, view)
-            if made.features is None:
+            if made.codes is not None:
                 return made
             self._before_write()
             write_map(path, made)
         with advised(self._advice or f"remove {path}, and it is made again"):
-            return read_map(path, self.space)
+            return read_map(path, self.space, self.table)
 
     def settings(self) -> dict[str, Any]:
         return self.teacher.settings()

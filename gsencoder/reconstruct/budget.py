@@ -6,7 +6,6 @@ the same command on the same machine gives the same splat; the time that is anno
 
 import math
 import os
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -14,7 +13,6 @@ import numpy as np
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.reconstruct.losses import losses_of
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.types import Cameras
 
@@ -93,7 +91,7 @@ def plan_steps(optimizer: Optimizer, budget: BudgetConfig) -> int:
     config = optimizer.config
     if not budget.minutes or config.steps != OptimizeConfig().steps:
         return config.steps
-    views = _trial_views(optimizer.training)
+    views = trial_views(optimizer.training)
     gaussians = float(np.mean([optimizer.rows_seen(view) for view in views]))
     pixels = float(np.mean([optimizer.photographs.at_scale(view).image[..., 0].numel() for view in views]))
     seconds = step_seconds(pixels, gaussians, optimizer.device, config)
@@ -101,25 +99,6 @@ def plan_steps(optimizer: Optimizer, budget: BudgetConfig) -> int:
     return int(min(max(LEAST_STEPS, affordable), wanted_steps(budget.minutes, config)))
 
 
-def measured_seconds(optimizer: Optimizer) -> float:
-    """Seconds that the remaining steps will take, from some views that are rendered and differentiated now."""
-    config = optimizer.config
-    total, left = 0.0, max(0, config.steps - optimizer.step)
-    for shrink, share in zip(config.shrinks, config.shares, strict=True):
-        seconds = []
-        views = _trial_views(optimizer.training)
-        # The first look compiles and warms caches, and is not counted.
-        for view in (views[0], *views):
-            photo = optimizer.photographs.at_scale(view, shrink)
-            start = time.perf_counter()
-            losses = losses_of(
-                optimizer.look(view, photo), photo, ssim_weight=config.ssim_weight, depth_weight=config.depth_weight
-            )
-            torch.stack([*losses.values()]).sum().backward()
-            seconds.append(time.perf_counter() - start)
-        total += share * left * float(np.median(seconds[1:]))
-    return OVERHEAD * total
-
-
-def _trial_views(training: Sequence[int]) -> list[int]:
+def trial_views(training: Sequence[int]) -> list[int]:
+    """Some views, evenly spaced, that stand for all."""
     return [training[index] for index in np.linspace(0, len(training) - 1, min(TRIAL_VIEWS, len(training))).astype(int)]

@@ -28,7 +28,8 @@ class State:
     Attributes:
         adam: parameters and moments.
         anchor: what holds positions near their seeds, if anything does.
-        exposures: an affine map of colors for each fitted photograph, if they are fitted; None at step 0.
+        exposures: an affine map of colors for each fitted photograph, if they are fitted; None at step 0, and
+            where photographs do not differ in exposure.
         step: steps that are done.
         seconds: that they took.
         facts: how it began, as JSON values: number and source of the seeds, and what was added to points.

@@ -14,7 +14,9 @@ STEP = 0.5
 OPAQUE = 0.5
 """Pixels of a render below this alpha show the background, and tell nothing."""
 SAME = 0.03
-"""Photographs whose brightness differs by less from the mean do not count as differing in exposure."""
+"""Photographs of which no color channel differs by more from the mean do not count as differing in exposure."""
+ROUNDS = 3
+"""After so many looks at every photograph its map has gone seven eighths of its way, and is judged."""
 
 IDENTITY = torch.eye(3, 4)
 
@@ -27,7 +29,8 @@ class Exposures:
     where the splat is still blurred, is left to the splat: only the difference from their mean is applied.
 
     Attributes:
-        maps: of the fitted photographs in their order, [V, 3, 4]: a matrix and an offset.
+        training: row numbers of the fitted photographs.
+        maps: of these in their order, [V, 3, 4]: a matrix and an offset.
     """
 
     def __init__(self, training: Sequence[int], maps: Float[Tensor, "V 3 4"] | None = None) -> None:
@@ -35,6 +38,7 @@ class Exposures:
         training: row numbers of the fitted photographs.
         maps: of a run that is continued; None = nothing is known yet.
         """
+        self.training = tuple(training)
         self._rows = {view: row for row, view in enumerate(training)}
         self.maps = IDENTITY.repeat(len(training), 1, 1) if maps is None else maps
 
@@ -53,8 +57,15 @@ class Exposures:
 
     def brightness(self) -> Float[Tensor, " V"]:
         """How bright each photograph is, relative to their mean: what its map makes of a middle grey."""
+        return self._channels().mean(-1)
+
+    def differ(self) -> bool:
+        """Whether photographs differ in exposure or white balance."""
+        return float((self._channels() - 1).abs().max()) > SAME
+
+    def _channels(self) -> Float[Tensor, "V 3"]:
         relative = self.maps - self.maps.mean(0) + IDENTITY
-        return (0.5 * relative[..., :3].sum(-1) + relative[..., 3]).mean(-1) / 0.5
+        return (0.5 * relative[..., :3].sum(-1) + relative[..., 3]) / 0.5
 
 
 def fitted_colors(

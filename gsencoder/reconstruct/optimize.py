@@ -3,7 +3,9 @@ densification."""
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, fields
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +16,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.signals import defer_signals
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.anchor import Anchor
-from gsencoder.reconstruct.exposure import Exposures, apply_colors, fitted_colors, known_pixels
+from gsencoder.reconstruct.exposure import ROUNDS, Exposures, apply_colors, fitted_colors, known_pixels
 from gsencoder.reconstruct.losses import losses_of
 from gsencoder.reconstruct.parameters import (
     Parameters,
@@ -116,13 +118,42 @@ class OptimizeConfig:
         }
 
 
+class Slopes(NamedTuple):
+    """What one look at a photograph says.
+
+    Attributes:
+        losses: the terms of the loss by name; none where nothing is in view.
+        rows: Gaussians that may show.
+        grads: of the loss by these rows of each parameter.
+        colors: the map of colors that the photograph has after the look; None where there are none.
+    """
+
+    losses: dict[str, float]
+    rows: Int64[Tensor, " n"]
+    grads: Parameters
+    colors: Float[Tensor, "3 4"] | None
+
+
+class Pictures(NamedTuple):
+    """A render of one view in two exposures.
+
+    Attributes:
+        expected: that of the map given.
+        matched: the one that fits the photograph best, which is no fault of the splat.
+    """
+
+    expected: Float[Tensor, "H W 3"]
+    matched: Float[Tensor, "H W 3"]
+
+
 class Optimizer:
     """A splat on its way.
 
     Attributes:
         adam: holds the parameters, and their moments.
         anchor: what holds positions near their seeds, if anything does.
-        exposures: affine colors of the photographs; None where they are fitted as they are.
+        exposures: affine colors of the photographs; None where they are fitted as they are, by wish or because they
+            turned out not to differ.
         step: steps that are done.
         is_consistent: whether the state is one between two steps.
     """
@@ -148,7 +179,7 @@ class Optimizer:
         prune: what is taken out, and when.
         raster: accuracy of rendering.
         anchor: what holds positions near their seeds; None = nothing.
-        exposures: maps [V, 3, 4] of a run that is continued; None = identities.
+        exposures: maps [V, 3, 4] of a run that is continued; None = identities at step 0, and none later.
         step: steps that are done.
 
         Raises:
@@ -157,7 +188,8 @@ class Optimizer:
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
         self.adam, self.anchor, self.step, self.is_consistent = adam, anchor, step, True
-        self.exposures = Exposures(self.training, exposures) if config.exposure else None
+        differ = config.exposure and (step == 0 or exposures is not None)
+        self.exposures = Exposures(self.training, exposures) if differ else None
         self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
         self._check_sizes()
@@ -188,19 +220,7 @@ class Optimizer:
             InputError: a loss or gradient that is not finite; view and term are named.
         """
         view = self.view_at(self.step)
-        photo = self.photographs.at_scale(view, self.config.shrink_at(self.step))
-        terms: dict[str, float] = {}
-        grads: Parameters = {}
-        raster, rows, seen, colors = self._exposed(view, photo)
-        if len(rows):
-            losses = losses_of(
-                raster, photo, ssim_weight=self.config.ssim_weight, depth_weight=self.config.depth_weight
-            )
-            total = torch.stack([*losses.values()]).sum()
-            total.backward()
-            grads = {name: value.grad for name, value in seen.items() if value.grad is not None}
-            self._check(view, losses, grads)
-            terms = {name: float(value.detach()) for name, value in losses.items()}
+        terms, rows, grads, colors = self.slopes(view, self.config.shrink_at(self.step))
         # A step that is cut in two could not be gone on with.
         with defer_signals():
             self.is_consistent = False
@@ -212,10 +232,35 @@ class Optimizer:
                 if self.exposures is not None and colors is not None:
                     self.exposures.set(view, colors)
             self.step += 1
+            rounds, rest = divmod(self.step, len(self.training))
+            if self.exposures is not None and rounds >= ROUNDS and not rest and not self.exposures.differ():
+                # Where all have one exposure, maps would take from the splat what depends on the direction.
+                self.exposures = None
             if self.pruning.due(self.step, self.config.steps):
                 self.prune()
             self.is_consistent = True
         return terms
+
+    def slopes(self, view: int, shrink: int) -> Slopes:
+        """What the next step would follow if it looked at a view; nothing changes.
+
+        Args:
+            view: number of a fitted photograph.
+            shrink: how many times smaller it is looked at.
+
+        Raises:
+            InputError: a loss or gradient that is not finite; view and term are named.
+        """
+        photo = self.photographs.at_scale(view, shrink)
+        raster, rows, seen, colors = self._exposed(view, photo)
+        if not len(rows):
+            return Slopes({}, rows, {}, colors)
+        losses = losses_of(raster, photo, ssim_weight=self.config.ssim_weight, depth_weight=self.config.depth_weight)
+        total = torch.stack([*losses.values()]).sum()
+        total.backward()
+        grads = {name: value.grad for name, value in seen.items() if value.grad is not None}
+        self._check(view, losses, grads)
+        return Slopes({name: float(value.detach()) for name, value in losses.items()}, rows, grads, colors)
 
     def _look(self, view: int, photo: ScaledPhotograph, degree: int) -> tuple[Raster, Int64[Tensor, " n"], Parameters]:
         """A view over black, the rows that may show in it, and these rows as leaves that gradients go to."""
@@ -255,10 +300,24 @@ class Optimizer:
                     f"{list(self.config.shrinks)} times; make image_scale larger or shrinks smaller"
                 )
 
+    def contributing(self) -> Int64[Tensor, " n"]:
+        """Rows that pruning would leave now.
+
+        Raises:
+            InputError: none.
+        """
+        views = ((view, self.photographs.at_scale(view, 2)) for view in self.training)
+        return rows_to_keep(self.raw, self.photographs.cameras, views, self.pruning, self.raster)
+
+    def restricted(self, rows: Int64[Tensor, " n"]) -> "Optimizer":
+        """One of the same photographs that has these rows alone, for trials."""
+        other = copy(self)
+        other.adam = RowAdam({name: value[rows] for name, value in self.raw.items()})
+        return other
+
     def prune(self) -> None:
         """Takes out what does not contribute."""
-        views = ((view, self.photographs.at_scale(view, 2)) for view in self.training)
-        rows = rows_to_keep(self.raw, self.photographs.cameras, views, self.pruning, self.raster)
+        rows = self.contributing()
         self.adam.keep(rows)
         if self.anchor is not None:
             self.anchor = self.anchor.keep(rows)
@@ -272,10 +331,6 @@ class Optimizer:
                     f"reconstruct: {name} is not finite at step {self.step}, photograph "
                     f"{self.photographs.names[view]!r}; lower the learning rates, or look at this photograph"
                 )
-
-    def look(self, view: int, photo: ScaledPhotograph) -> Raster:
-        """A view as the next step would render it, differentiable; nothing changes."""
-        return self._exposed(view, photo)[0]
 
     def rows_seen(self, view: int) -> int:
         """Number of Gaussians that may show in a view."""
@@ -294,14 +349,14 @@ class Optimizer:
         return gaussians_of(self.raw)
 
     @torch.no_grad()
-    def picture(self, view: int, photo: ScaledPhotograph) -> Float[Tensor, "H W 3"]:
-        """A view as it is now, in [0, 1]."""
-        return self._look(view, photo, self.config.sh_degree)[0].rgb.clamp(0, 1).cpu()
+    def pictures(self, view: int, photo: ScaledPhotograph, colors: Float[Tensor, "3 4"]) -> Pictures:
+        """A view as it is now, in [0, 1].
 
-    @torch.no_grad()
-    def matched_picture(self, view: int, photo: ScaledPhotograph) -> Float[Tensor, "H W 3"]:
-        """A view as it is now, in the colors that fit the photograph best: the exposure of a photograph that was not
-        fitted is unknown, and no fault of the splat."""
+        Args:
+            view: number of the view.
+            photo: its photograph.
+            colors: the map of colors that it is expected to have.
+        """
         raster = self._look(view, photo, self.config.sh_degree)[0]
         fitted = self._fitted_colors(raster.rgb, raster.alpha, photo)
-        return apply_colors(raster.rgb, fitted).clamp(0, 1).cpu()
+        return Pictures(*(apply_colors(raster.rgb, one).clamp(0, 1).cpu() for one in (colors, fitted)))

@@ -9,12 +9,19 @@ from jaxtyping import UInt8
 
 from gsencoder.core.even_indices import even_indices
 from gsencoder.reconstruct.exposure import SAME
+from gsencoder.reconstruct.exposure_prediction import predict_exposures
 from gsencoder.reconstruct.optimize import Optimizer
 
 MAX_COMPARISONS = 4
 """Held-out photographs of which the result holds a render."""
 MATCHED_GAIN = 0.5
 """Smallest gain in dB by fitting the exposure of held-out photographs that is worth a word."""
+PREDICTED: dict[str, str] = {
+    "mean": "those of held-out photographs cannot be predicted from them, and are taken to be the mean",
+    "order": "those of held-out photographs are interpolated between the photographs before and after",
+    "cameras": "those of held-out photographs are taken from the nearest cameras",
+}
+"""By source of an `ExposurePrediction`."""
 LogRow = dict[str, int | float]
 """One line of the log: step, seconds, gaussians, and the fields of a Score."""
 
@@ -26,8 +33,8 @@ class Comparison:
     Attributes:
         name: of the view.
         photograph: as decoded.
-        render: of the reconstructed splat; in the colors that fit the photograph best where photographs differ in
-            exposure.
+        render: of the reconstructed splat, in the exposure that is predicted; where photographs differ in exposure and
+            nothing predicts it, in the colors that fit the photograph best.
     """
 
     name: str
@@ -47,31 +54,34 @@ def describe_plan(optimizer: Optimizer, usual: int, seconds: float) -> str:
     )
 
 
-def describe_exposure(darkest: float, brightest: float) -> str | None:
-    """How the photographs differ in brightness, relative to their mean; None where they hardly do."""
+def describe_exposure(darkest: float, brightest: float, source: str) -> str | None:
+    """How the photographs differ in brightness, relative to their mean, and what predicts that of others; None where
+    they hardly differ."""
     if 1 - darkest <= SAME and brightest - 1 <= SAME:
         return None
     return (
         f"the exposure of photographs differs: {darkest:.2f} to {brightest:.2f} times the mean brightness; a map of "
-        "colors was fitted to each (optimize.exposure=false fits them as they are)"
+        f"colors was fitted to each (optimize.exposure=false fits them as they are); {PREDICTED[source]}"
     )
 
 
 def compare(optimizer: Optimizer, held_out: Sequence[int], *, matched: bool) -> tuple[Comparison, ...]:
     """Evenly spaced held-out photographs beside renders of their views, whose exposure is matched if so wanted."""
-    picture = optimizer.matched_picture if matched else optimizer.picture
+    chosen = [held_out[index] for index in even_indices(len(held_out), MAX_COMPARISONS)]
+    predicted = predict_exposures(optimizer.exposures, optimizer.photographs.cameras, chosen)
 
     def pixels(image: torch.Tensor) -> UInt8[np.ndarray, "H W 3"]:
         return (image * 255 + 0.5).to(torch.uint8).numpy()
 
     comparisons = []
-    for view in (held_out[index] for index in even_indices(len(held_out), MAX_COMPARISONS)):
+    for view, colors in zip(chosen, predicted.maps, strict=True):
         photo = optimizer.photographs.at_scale(view)
+        pictures = optimizer.pictures(view, photo, colors)
         comparisons.append(
             Comparison(
                 name=optimizer.photographs.names[view],
                 photograph=pixels(photo.image),
-                render=pixels(picture(view, photo)),
+                render=pixels(pictures.matched if matched else pictures.expected),
             )
         )
     return tuple(comparisons)

@@ -23,8 +23,10 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.anchor import anchor_at
-from gsencoder.reconstruct.budget import BudgetConfig, measured_seconds, plan_steps, wanted_steps
+from gsencoder.reconstruct.budget import BudgetConfig, plan_steps, wanted_steps
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
+from gsencoder.reconstruct.expected_time import expected_seconds
+from gsencoder.reconstruct.exposure_prediction import predict_exposures
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
@@ -61,6 +63,10 @@ class ReconstructConfig:
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
+    def validates_at(self, step: int, steps: int) -> bool:
+        """Whether is validated after `step` of `steps`."""
+        return step in (0, steps) or bool(self.validate_every and step % self.validate_every == 0)
+
     def identity(self) -> dict[str, Any]:
         """The settings that an interrupted run must share with the run that continues it, as JSON values."""
         names = ("seeds", "dense", "optimize", "budget", "prune", "raster", "holdout")
@@ -81,6 +87,7 @@ class Reconstruction:
         comparisons: up to four held-out photographs beside renders of them.
         exposure: brightness of each fitted photograph, relative to their mean, from the affine maps of colors; None
             where photographs are fitted as they are.
+        exposure_source: what those of held-out photographs were predicted from, see `ExposurePrediction`.
         seconds: wall-clock time by step of the stage.
     """
 
@@ -92,6 +99,7 @@ class Reconstruction:
     log: tuple[LogRow, ...]
     comparisons: tuple[Comparison, ...]
     exposure: tuple[float, ...] | None
+    exposure_source: str | None
     seconds: Mapping[str, float]
 
 
@@ -164,14 +172,17 @@ def reconstruct(
         steps = int(state.facts.get("steps_planned", config.optimize.steps))
         optimizer.config = replace(config.optimize, steps=steps)
         with clock("trial"):
-            report(describe_plan(optimizer, config.optimize.steps, measured_seconds(optimizer)))
+            validations = sum(config.validates_at(step, steps) for step in range(optimizer.step, steps + 1))
+            seconds = expected_seconds(optimizer, held_out, validations)
+            report(describe_plan(optimizer, config.optimize.steps, seconds))
         with clock("optimise"):
             config = replace(config, optimize=optimizer.config)
             log = optimize(optimizer, state, held_out, config, folder, identity, track, report)
-        exposure = differing = None
+        exposure = differing = source = None
         if optimizer.exposures is not None:
             exposure = tuple(optimizer.exposures.brightness().tolist())
-            differing = describe_exposure(min(exposure), max(exposure))
+            source = predict_exposures(optimizer.exposures, photographs.cameras, held_out).source
+            differing = describe_exposure(min(exposure), max(exposure), source)
         if differing is not None:
             report(differing)
         return Reconstruction(
@@ -181,8 +192,9 @@ def reconstruct(
             training=optimizer.training,
             held_out=tuple(held_out),
             log=tuple(log),
-            comparisons=compare(optimizer, held_out, matched=differing is not None),
+            comparisons=compare(optimizer, held_out, matched=differing is not None and source == "mean"),
             exposure=exposure,
+            exposure_source=source,
             seconds=clock.seconds,
         )
 
@@ -240,8 +252,7 @@ def optimize(
     start, saved_at, saved_step = time.monotonic() - state.seconds, time.monotonic(), optimizer.step
 
     def validate() -> None:
-        every = config.validate_every
-        due = optimizer.step in (0, steps) or (every and optimizer.step % every == 0)
+        due = config.validates_at(optimizer.step, steps)
         # A continued run may begin at a step whose validation was cut off, or whose row is in the log already.
         if not held_out or not due or (rows and rows[-1]["step"] == optimizer.step):
             return

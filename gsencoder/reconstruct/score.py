@@ -12,6 +12,7 @@ from torch import Tensor
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.stereo import confirms, sample_depth, world_points
+from gsencoder.reconstruct.exposure_prediction import predict_exposures
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.render.image_metrics import inner, psnr, ssim
 
@@ -25,7 +26,7 @@ class Score(NamedTuple):
     """Means over views.
 
     Attributes:
-        psnr: in dB, of the pixels that masks leave.
+        psnr: in dB, of the pixels that masks leave, in the exposures that are predicted.
         ssim: structural similarity of the same.
         matched_psnr: in dB, as psnr, after the colors of each render were fitted to its photograph by an affine map.
         seen_psnr: in dB, of those of them that some fitted photograph shows too; None where no sensor tells.
@@ -119,7 +120,7 @@ def _pose(photographs: Photographs, view: int) -> Float[Tensor, "4 4"]:
 
 @torch.no_grad()
 def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Tensor, "H W"]] = {}) -> Score:
-    """Mean scores of a splat on some views.
+    """Mean scores of a splat on some views, in the exposures that the fitted photographs let expect.
 
     Args:
         optimizer: as it is now.
@@ -128,20 +129,19 @@ def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Te
             SSIM has its middle, counts in the whole pictures alone.
     """
     complete, covisible, shares = [], [], []
-    for view in views:
+    predicted = predict_exposures(optimizer.exposures, optimizer.photographs.cameras, views)
+    for view, colors in zip(views, predicted.maps, strict=True):
         photo = optimizer.photographs.at_scale(view)
-        picture = optimizer.picture(view, photo)
-        matched = psnr(optimizer.matched_picture(view, photo), photo.image, photo.mask)
-        complete.append(
-            (psnr(picture, photo.image, photo.mask), float(ssim(picture, photo.image, photo.mask)), matched)
-        )
+        picture, matched = optimizer.pictures(view, photo, colors)
+        scores = (psnr(picture, photo.image, photo.mask), float(ssim(picture, photo.image, photo.mask)))
+        complete.append((*scores, psnr(matched, photo.image, photo.mask)))
         if view in seen:
             mask = seen[view] if photo.mask is None else seen[view] & photo.mask
             shares.append(float(mask.float().mean()))
             if inner(mask).any():
                 covisible.append((psnr(picture, photo.image, mask), float(ssim(picture, photo.image, mask))))
-    scores = Score(*(float(mean) for mean in np.mean(complete, axis=0)))
+    means = Score(*(float(mean) for mean in np.mean(complete, axis=0)))
     if not covisible:
-        return scores
+        return means
     seen_psnr, seen_ssim = (float(mean) for mean in np.mean(covisible, axis=0))
-    return scores._replace(seen_psnr=seen_psnr, seen_ssim=seen_ssim, seen=float(np.mean(shares)))
+    return means._replace(seen_psnr=seen_psnr, seen_ssim=seen_ssim, seen=float(np.mean(shares)))

@@ -5,7 +5,7 @@ import json
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.archive import open_archive, warn_without_checksums, write_archive
 from gsencoder.core.files.npz import read_npz
+from gsencoder.text.towers import TowerRecord
 from gsencoder.types import FeatureSpace
 
 NORM_TOLERANCE = 1e-2
@@ -58,12 +59,14 @@ class TextTable:
         space: of the vectors; its `text_encoder` is the name of the encoder that made them.
         mean: the mean of the embeddings. Text and image features of a joint model have different means, so each side
             is centered by its own.
+        tower: which text tower made the embeddings, where one did that can be asked for other phrases.
     """
 
     names: tuple[str, ...]
     embeddings: Float32[np.ndarray, "C D"]
     space: FeatureSpace
     mean: Float32[np.ndarray, " D"]
+    tower: TowerRecord | None = None
     _row_of: dict[str, int] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -82,6 +85,10 @@ class TextTable:
             raise InputError(
                 f"TextTable: expected {self.space.channels} channels ({self.space.name}), got embeddings of "
                 f"{table.shape[1]} and a mean of {self.mean.shape}"
+            )
+        if self.tower is not None and self.tower.identity != self.space.text_encoder:
+            raise InputError(
+                f"TextTable: expected the tower {self.space.text_encoder!r} of its space, got {self.tower.identity!r}"
             )
         norms = np.sqrt((table.astype(np.float64) ** 2).sum(axis=1))
         bad = np.flatnonzero(~(np.abs(norms - 1) <= NORM_TOLERANCE))
@@ -193,7 +200,28 @@ def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float
     """
     space = {item.name: getattr(table.space, item.name) for item in fields(table.space)}
     arrays = {"embeddings": table.embeddings.astype(dtype), "mean": table.mean}
-    write_archive(Path(path), arrays, {"names": list(table.names), "space": space, "dtype": dtype})
+    header: dict[str, Any] = {"names": list(table.names), "space": space, "dtype": dtype}
+    if table.tower is not None:
+        header["tower"] = tower_to_json(table.tower)
+    write_archive(Path(path), arrays, header)
+
+
+def tower_to_json(tower: TowerRecord) -> dict[str, Any]:
+    """The record of a tower as JSON values."""
+    return {**asdict(tower), "templates": list(tower.templates)}
+
+
+def tower_from_json(values: Any) -> TowerRecord:
+    """The record that JSON values hold.
+
+    Raises:
+        InputError: they hold none.
+    """
+    if not isinstance(values, dict) or set(values) != {item.name for item in fields(TowerRecord)}:
+        raise InputError(f"expected the record of a text tower, got {str(values)[:60]!r}")
+    if not isinstance(values["templates"], list):
+        raise InputError("expected a list of templates in the record of a text tower")
+    return TowerRecord(**{**values, "templates": tuple(values["templates"])})
 
 
 def _read_archive(file: Path) -> TextTable:
@@ -205,7 +233,8 @@ def _read_archive(file: Path) -> TextTable:
             "embeddings": archive.array("embeddings", dtype, ("C", "D")),
             "mean": archive.array("mean", "float32", ("D",)),
         }
-        return _table(file, archive.value("names", list), archive.value("space", dict), arrays)
+        tower = tower_from_json(archive.value("tower", dict)) if "tower" in archive else None
+        return _table(file, archive.value("names", list), archive.value("space", dict), arrays, tower)
 
 
 def _is_version_1(file: Path) -> bool:
@@ -233,7 +262,9 @@ def _read_version_1(file: Path) -> TextTable:
     return _table(file, names, space, arrays)
 
 
-def _table(file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray]) -> TextTable:
+def _table(
+    file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray], tower: TowerRecord | None = None
+) -> TextTable:
     """A table of what a file holds.
 
     Raises:
@@ -251,7 +282,7 @@ def _table(file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray]) ->
     if arrays["embeddings"].dtype == np.float16:
         arrays["embeddings"] = unrounded(arrays["embeddings"].astype(np.float32))
     with about(file):
-        return TextTable(names=tuple(names), space=FeatureSpace(**space), **arrays)
+        return TextTable(names=tuple(names), space=FeatureSpace(**space), tower=tower, **arrays)
 
 
 def _read_npz(file: Path, encoder: str) -> TextTable:

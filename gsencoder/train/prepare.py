@@ -19,7 +19,7 @@ from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import capped
+from gsencoder.fusion.lift import capped, map_rows
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
@@ -293,8 +293,8 @@ def _pool_map(
         valid = shares[:, 0] == 0
         vectors = (shares[:, 1:] @ _standardize(feature_map.table, outputs)).astype(np.float32)
     else:
-        assert feature_map.features is not None
-        grid = _standardize(feature_map.features, outputs)[: height * factor, : width * factor]
+        dense = map_rows(feature_map).reshape(feature_map.height, feature_map.width, -1)
+        grid = _standardize(dense, outputs)[: height * factor, : width * factor]
         vectors = grid.reshape(height, factor, width, factor, -1).mean(axis=(1, 3)).reshape(height * width, -1)
         valid = np.isfinite(vectors).all(axis=1)
     like = FeatureMap(

@@ -14,7 +14,7 @@ from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
-from gsencoder.fusion.orbit_views import check_orbits, with_views
+from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -31,7 +31,11 @@ class SourceConfig:
     splat: str = field(
         default="", metadata={"help": f"file of the Gaussians of scenes with views; empty = make seeds. {READABLE}"}
     )
-    orbits: int = field(default=24, metadata={"help": "number of cameras placed around a splat without views"})
+    orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
+    cameras: CamerasOfSplat = field(
+        default="auto",
+        metadata={"help": "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"},
+    )
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
@@ -97,7 +101,7 @@ def prepare_scenes(
         "scenes": {path.name: str(path.resolve()) for path in training},
         "words": _text_table_digest(words),
         **sections,
-        **{"splat": config.splat, "orbits": config.orbits, "voxel": voxel},
+        **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras, "voxel": voxel},
     }
     read_views, read_scene = _scene_readers(config, words, voxel)
     with fail_together():
@@ -141,7 +145,7 @@ def _scene_readers(config: SourceConfig, words: TextTable | None, voxel: float) 
         with about(path):
             scene = load_scene(path, splat=config.splat or None, options=config.data)
             if scene.views is None:
-                scene = with_views(scene, config.orbits, config.prepare.fusion.blend)
+                scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)
             return scene, teacher_of(scene)
 
     def read_scene(path: Path) -> tuple[Scene, Teacher]:

@@ -45,12 +45,14 @@ class FeatureSpace:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FeatureMap:
-    """One view's teacher output: dense `features`, or `codes` into a `table`.
+    """One view's teacher output: dense `features`, `codes` into a `table`, or `shares` of its rows.
 
     Attributes:
-        features: one vector for each cell of the grid; None where the map is coded.
-        codes: for each cell a row of `table`, −1 = no feature here; None where the map is dense.
-        table: the vectors that codes stand for.
+        features: one vector for each cell of the grid; None where the map is coded or mixed.
+        codes: for each cell a row of `table`, −1 = no feature here.
+        shares: for each cell how much of each row of `table` it is, from 0; such as the posteriors of a classifier.
+            Their sum is the weight of the cell; all zero = no feature here.
+        table: the vectors that codes or shares stand for.
         grid_from_image: affine from image pixels to grid cells, both with centers at .5: the teacher's resize and
             crop. Diagonal: grid = (ax·x + bx, ay·y + by).
         space: what the vectors are.
@@ -60,13 +62,19 @@ class FeatureMap:
     space: FeatureSpace
     features: Float32[np.ndarray, "h w D"] | None = None
     codes: Int32[np.ndarray, "h w"] | None = None
+    shares: Float32[np.ndarray, "h w C"] | None = None
     table: Float32[np.ndarray, "C D"] | None = None
 
     def __post_init__(self) -> None:
-        dense, coded = self.features is not None, self.codes is not None and self.table is not None
-        if dense == coded:
-            fail("FeatureMap", "features", "either features, or codes with their table", "both" if dense else "neither")
-        rows = self.features if dense else self.table
+        forms = sum(form is not None for form in (self.features, self.codes, self.shares))
+        if forms != 1 or (self.features is None) != (self.table is not None):
+            fail("FeatureMap", "features", "features, or codes or shares with their table", f"{forms} of them")
+        if self.shares is not None and self.table is not None:
+            if self.shares.shape[-1] != len(self.table):
+                fail("FeatureMap", "shares", f"{len(self.table)} columns", str(self.shares.shape[-1]))
+            if not (self.shares >= 0).all() or not np.isfinite(self.shares).all():
+                fail("FeatureMap", "shares", "finite shares from 0", "others")
+        rows = self.features if self.features is not None else self.table
         assert rows is not None
         if rows.shape[-1] != self.space.channels:
             fail("FeatureMap", "features", f"{self.space.channels} channels ({self.space.name})", str(rows.shape[-1]))
@@ -80,11 +88,16 @@ class FeatureMap:
 
     @property
     def height(self) -> int:
-        return int((self.features if self.features is not None else self.codes).shape[0])  # type: ignore[union-attr]
+        return int(self._grid.shape[0])
 
     @property
     def width(self) -> int:
-        return int((self.features if self.features is not None else self.codes).shape[1])  # type: ignore[union-attr]
+        return int(self._grid.shape[1])
+
+    @property
+    def _grid(self) -> np.ndarray:
+        grid = next(form for form in (self.features, self.codes, self.shares) if form is not None)
+        return np.asarray(grid)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

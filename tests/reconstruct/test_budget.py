@@ -15,7 +15,6 @@ from gsencoder.reconstruct.budget import (
     LEAST_STEPS,
     BudgetConfig,
     choose_scale,
-    measured_seconds,
     plan_steps,
     step_seconds,
     wanted_steps,
@@ -80,22 +79,6 @@ def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time() -> 
     assert plan_steps(usual, BudgetConfig()) == USUAL.steps
     assert plan_steps(usual, BudgetConfig(minutes=0.01)) == LEAST_STEPS
     assert plan_steps(usual, BudgetConfig(minutes=80.0)) == 2 * USUAL.steps
-
-
-def test_the_trial_changes_nothing() -> None:
-    one, other = optimizer(OptimizeConfig(steps=10)), optimizer(OptimizeConfig(steps=10))
-    assert measured_seconds(one) > 0
-    for _ in range(3):
-        one.advance()
-        other.advance()
-    for name, value in one.raw.items():
-        assert torch.equal(value, other.raw[name]), name
-    assert measured_seconds(replaced_step(one, 10)) == 0
-
-
-def replaced_step(made: Optimizer, step: int) -> Optimizer:
-    made.step = step
-    return made
 
 
 def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(

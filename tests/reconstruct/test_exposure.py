@@ -12,7 +12,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.exposure import IDENTITY, SAME, Exposures, apply_colors, fitted_colors, known_pixels
+from gsencoder.reconstruct.exposure import IDENTITY, ROUNDS, SAME, Exposures, apply_colors, fitted_colors, known_pixels
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
@@ -100,6 +100,41 @@ def test_what_all_maps_have_in_common_is_not_applied() -> None:
     assert torch.equal(shared.maps[:2], before[:2])
 
 
+def test_photographs_differ_where_one_channel_of_one_does() -> None:
+    maps = IDENTITY.repeat(50, 1, 1)
+    assert not Exposures(range(50), maps).differ()
+    for gain, expected in ((1 + 0.9 * SAME, False), (1 + 1.1 * SAME, True), (1 - 1.1 * SAME, True)):
+        for channel in range(3):
+            one = maps.clone()
+            one[7, channel] *= gain
+            assert Exposures(range(50), one).differ() == expected
+    # Warmer, and as bright.
+    maps[7, 0] *= 1.1
+    maps[7, 2] *= 0.9
+    warm = Exposures(range(50), maps)
+    assert warm.differ()
+    torch.testing.assert_close(warm.brightness(), torch.ones(50), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("gains", "kept"), [(np.ones(6), False), (GAINS, True)])
+def test_maps_are_given_up_after_three_looks_at_each_photograph_if_they_do_not_differ(
+    gains: np.ndarray, kept: bool
+) -> None:
+    rounds = len(TRAINING) * ROUNDS
+    early, late = (fitted(exposed_views(gains), replace(CONFIG, steps=steps)) for steps in (rounds - 1, rounds))
+    assert early.exposures is not None
+    assert (late.exposures is not None) == kept
+    again = Optimizer(late.adam, late.photographs, TRAINING, CONFIG, prune=PruneConfig(), step=rounds)
+    assert again.exposures is None
+    if late.exposures is not None:
+        maps = late.exposures.maps
+        again = Optimizer(
+            late.adam, late.photographs, TRAINING, CONFIG, prune=PruneConfig(), exposures=maps, step=rounds
+        )
+        assert again.exposures is not None
+        assert again.exposures.maps is maps
+
+
 @pytest.mark.slow
 def test_gains_of_photographs_are_found_and_the_held_out_view_gains() -> None:
     views = exposed_views(GAINS)
@@ -111,7 +146,7 @@ def test_gains_of_photographs_are_found_and_the_held_out_view_gains() -> None:
     matched = [score(one, [HELD_OUT]).matched_psnr for one in (on, off)]
     assert matched[0] > matched[1] + 1
     brightness = on.exposures.brightness()
-    line = describe_exposure(float(brightness.min()), float(brightness.max()))
+    line = describe_exposure(float(brightness.min()), float(brightness.max()), "mean")
     assert line is not None
     assert "0.7" in line
 
@@ -120,12 +155,15 @@ def test_gains_of_photographs_are_found_and_the_held_out_view_gains() -> None:
 def test_photographs_of_one_exposure_are_fitted_as_well_as_without() -> None:
     views = exposed_views(np.ones(6))
     on, off = fitted(views), fitted(views, replace(CONFIG, exposure=False))
-    assert on.exposures is not None
-    assert float((on.exposures.brightness() - 1).abs().max()) < SAME
+    assert on.exposures is None
     scores = [score(one, [HELD_OUT]) for one in (on, off)]
     assert scores[0].psnr > scores[1].psnr - 0.1
-    assert describe_exposure(1 - 0.9 * SAME, 1 + 0.9 * SAME) is None
-    assert describe_exposure(1 - 1.1 * SAME, 1.0) is not None
+
+
+def test_brightness_within_the_limit_is_no_difference() -> None:
+    assert describe_exposure(1 - 0.9 * SAME, 1 + 0.9 * SAME, "order") is None
+    assert "before and after" in (describe_exposure(1 - 1.1 * SAME, 1.0, "order") or "")
+    assert describe_exposure(1.0, 1 + 1.1 * SAME, "cameras") is not None
 
 
 def test_a_checkpoint_from_before_exposures_is_of_another_setting(tmp_path: Path) -> None:

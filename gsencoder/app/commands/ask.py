@@ -24,6 +24,7 @@ from gsencoder.infer.ask.questions import BatchQuestion, read_questions
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.text.build import TableTextConfig, TextConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +65,7 @@ class AskCommandConfig(CommonConfig):
     choose: ViewsConfig = field(default_factory=ViewsConfig)
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
@@ -88,10 +90,12 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         check_question(config.task, config.question)
     with summary.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
-        table = load_words(folder, config.words) if config.words or (folder / WORDS_FILE).is_file() else None
+        words = (
+            load_words(folder, config.words, config.text) if config.words or (folder / WORDS_FILE).is_file() else None
+        )
     asker = Asker(
         scene,
-        table,
+        words,
         space=config.space or None,
         config=config.ask,
         localization=config.localize,

@@ -34,12 +34,12 @@ from gsencoder.evaluate.protocols.localization import (
 from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming, naming_scores
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, load_scenes
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
+from gsencoder.fusion.teachers.build import TeacherConfig, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.text.table import TextTable
+from gsencoder.text.build import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene
 
 SHOWN_NAMES = 15
@@ -82,16 +82,17 @@ class EvaluateConfig(CommonConfig):
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
     encode: EncodeConfig = field(default_factory=EncodeConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
 
 def run(config: EvaluateConfig, summary: Summary) -> None:
     """Evaluates, prints the scores, and writes them with one row for each object or name."""
-    words = text_table_of(config.teacher)
+    words = words_of(config.teacher, config.text)
     if words is None:
         raise InputError(
-            f"evaluate: there is no text table for the space of teacher {config.teacher.name}; give teacher.words="
+            f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words= or text="
         )
     if config.weights:
         retain_freed_memory()
@@ -119,7 +120,7 @@ def _localization(
     config: EvaluateConfig,
     protocol: LocalizationProtocol,
     source: FeatureSource,
-    words: TextTable,
+    words: Words,
     folder: Path,
     summary: Summary,
 ) -> None:
@@ -138,7 +139,7 @@ def _naming(
     config: EvaluateConfig,
     protocol: NamingProtocol,
     source: FeatureSource,
-    words: TextTable,
+    words: Words,
     folder: Path,
     summary: Summary,
 ) -> None:
@@ -160,7 +161,7 @@ def _absent(
     config: EvaluateConfig,
     protocol: AbsentProtocol,
     source: FeatureSource,
-    words: TextTable,
+    words: Words,
     folder: Path,
     summary: Summary,
 ) -> None:

@@ -17,10 +17,12 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
-from gsencoder.fusion.orbit_views import check_orbits, with_views
+from gsencoder.fusion.orbit_views import INSIDE, CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.types import Scene
 
@@ -34,7 +36,11 @@ class FuseCommandConfig(CommonConfig):
         metadata={"help": "scenes, or folders of scenes: views, or a bare splat", "metavar": "SCENE", "required": True},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
-    orbits: int = field(default=24, metadata={"help": "number of cameras placed around a splat without views"})
+    orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
+    cameras: CamerasOfSplat = field(
+        default="auto",
+        metadata={"help": "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"},
+    )
     worker: int = field(
         default=0,
         metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
@@ -43,6 +49,7 @@ class FuseCommandConfig(CommonConfig):
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
         check_orbits(self.orbits)
@@ -52,14 +59,16 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     """Fuses one scene into out=, or each of several into the folder OUT/NAME."""
     paths = find_scenes(config.paths)
     with summary.step("teacher"):
-        words = text_table_of(config.teacher)
+        words = words_of(config.teacher, config.text)
     screen = console(config.quiet)
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
             scene = load_fusable(path, config, one)
-            fusion = fuse_scene(scene, config.teacher, words, config, one, out)
-            write_features(folder, scene, fusion, words, config, one)
+            with one.step("teacher"):
+                teacher = build_teacher(config.teacher, scene, words)
+            fusion = fuse_scene(scene, teacher, config, one, out)
+            write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
         seen, total = one.results["seen"], one.results["gaussians"]
         screen.print(
@@ -90,7 +99,15 @@ def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Sce
         with summary.step("seeds"):
             scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
     scene = with_reported_up(scene, summary, quiet=config.quiet)
-    return with_views(scene, config.orbits, config.fusion.blend)
+    if scene.views is not None:
+        return scene
+    with summary.step("cameras"):
+        scene = with_views(scene, config.orbits, config.fusion.blend, cameras=config.cameras)
+    assert scene.views is not None
+    where = "inside" if scene.views.names[0].startswith(INSIDE) else "around"
+    summary.results["cameras"] = where
+    console(config.quiet).print(f"{scene.name}: a bare splat; rendered from {len(scene.views)} cameras {where} it")
+    return scene
 
 
 def work_folder(out: Path) -> Path:
@@ -100,16 +117,14 @@ def work_folder(out: Path) -> Path:
 
 def fuse_scene(
     scene: Scene,
-    teacher: TeacherConfig,
-    words: TextTable | None,
+    teacher: Teacher,
     config: FuseCommandConfig,
     summary: Summary,
     out: Path,
 ) -> Fusion:
     """Fuses, and adds the seconds of the steps to the summary."""
-    built = build_teacher(teacher, scene, words)
-    work = None if built.cheap else work_folder(out)
-    fusion = fuse(scene, built, config.fusion, work=work, track=Progress(quiet=config.quiet))
+    work = None if teacher.cheap else work_folder(out)
+    fusion = fuse(scene, teacher, config.fusion, work=work, track=Progress(quiet=config.quiet))
     summary.add_seconds(fusion.seconds)
     return fusion
 

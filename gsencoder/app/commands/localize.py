@@ -17,6 +17,7 @@ from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
+from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.types import Localization
 
 
@@ -33,6 +34,7 @@ class LocalizeCommandConfig(CommonConfig):
     space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
     pictures: int = field(default=4, metadata={"help": "number of views drawn for each word; 0 = none"})
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
@@ -49,7 +51,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         scene = load_features(folder)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
         scene, _ = with_up(scene)
-        table = load_words(folder, config.words)
+        table = load_words(folder, config.words, config.text)
     with summary.step("localize"):
         localization = localize(scene, words, table, config.localize, space=config.space or None)
     out = config.out or Path("outputs") / scene.name / "boxes"

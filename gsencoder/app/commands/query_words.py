@@ -1,11 +1,12 @@
-"""The words of query= and queries=, and the text table that maps them into the feature space."""
+"""The words of query= and queries=, and what turns them into vectors of the feature space."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE
-from gsencoder.text.table import TextTable, load_text_table
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, words_of_table
+from gsencoder.text.table import load_text_table
 
 MAX_QUERIES_BYTES = 1 << 20
 """Largest size of a file of queries, bytes."""
@@ -40,14 +41,23 @@ def _lines_of(file: Path) -> list[str]:
         raise InputError(f"queries: {file} cannot be read as text: {error}") from error
 
 
-def load_words(folder: Path, given: str) -> TextTable:
-    """The text table that was given, or the one in the folder of the features."""
+def load_words(folder: Path, given: str, text: TextConfig = TableTextConfig()) -> Words:
+    """The text table that was given, or the one in the folder of the features, with the tower that made it.
+
+    Args:
+        folder: of the features.
+        given: a file of words; empty = the one in the folder.
+        text: a tower that is given; otherwise it is searched for when a phrase needs it.
+
+    Raises:
+        InputError: there are no words, or the tower is another than the one that made them.
+    """
     if given:
-        return load_text_table(given)
+        return words_of_table(load_text_table(given), text)
     path = folder / WORDS_FILE
     if not path.is_file():
         raise InputError(
             f"{folder}: the folder holds no text table for these features; fuse with a teacher that has words, or "
             "give words="
         )
-    return load_text_table(path)
+    return words_of_table(load_text_table(path), text)

@@ -128,6 +128,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             views=len(result.training),
             held_out=len(result.held_out),
             exposure=None if result.exposure is None else [min(result.exposure), max(result.exposure)],
+            exposure_source=result.exposure_source,
             **{name: last.get(name) for name in Score._fields},
             splat=PLY_FILE,
             log=LOG_FILE,

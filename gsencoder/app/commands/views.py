@@ -23,6 +23,7 @@ from gsencoder.infer.views.targets import Target, best_boxes, targets_of
 from gsencoder.infer.views.tokens import Fit, feature_tokens, token_blends, tower_grid
 from gsencoder.infer.views.write import SHEET, views_to_json, write_pictures
 from gsencoder.render import BlendConfig
+from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.types import Box, Scene
 
 VIEWS, TOKENS = "views.json", "tokens.safetensors"
@@ -56,6 +57,7 @@ class ViewsCommandConfig(CommonConfig):
     choose: ViewsConfig = field(default_factory=ViewsConfig)
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
@@ -80,7 +82,7 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
         with summary.step("localize"):
             words = query_words(config.query, config.queries)
             localization = localize(
-                scene, words, load_words(folder, config.words), config.localize, space=config.space or None
+                scene, words, load_words(folder, config.words, config.text), config.localize, space=config.space or None
             )
             assert scene.gaussians is not None
             targets = targets_of(scene.gaussians, localization, config.boxes)

@@ -20,7 +20,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.text.table import TextTable
+from gsencoder.text.encoder import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene, SceneObject
 
 BINS = 10
@@ -95,7 +95,7 @@ def words_to_ask(
 def evaluate_absent(
     scenes: Iterable[tuple[Scene, float]],
     source: FeatureSource,
-    words: TextTable,
+    words: TextEncoder,
     vocabulary: Sequence[str],
     *,
     protocol: AbsentProtocol = AbsentProtocol(),
@@ -107,7 +107,7 @@ def evaluate_absent(
     Args:
         scenes: scenes with labeled objects and the seconds of loading, as `load_scenes` yields them.
         source: computes the features of a scene.
-        words: text table of the features' space.
+        words: turns words into the features' space.
         vocabulary: names that may be absent, such as those of `names_of`.
         protocol: which objects count as present.
         seeds: how Gaussians are made for scenes without.
@@ -132,7 +132,7 @@ def evaluate_absent(
 def ask_words(
     scene: Scene,
     features: GaussianFeatures,
-    words: TextTable,
+    words: TextEncoder,
     vocabulary: Sequence[str],
     protocol: AbsentProtocol,
     localization: LocalizeConfig,

@@ -19,7 +19,7 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import Hit, accuracy, queryable_objects, score_boxes
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.text.table import TextTable
+from gsencoder.text.build import Words
 from gsencoder.types import GaussianFeatures, Scene
 
 IOU_THRESHOLDS = (0.25, 0.5)
@@ -70,7 +70,7 @@ class SceneOutcome:
 def evaluate_localization(
     scenes: Iterable[tuple[Scene, float]],
     source: FeatureSource,
-    words: TextTable,
+    words: Words,
     *,
     protocol: LocalizationProtocol = LocalizationProtocol(),
     seeds: SeedConfig = SeedConfig(),
@@ -106,7 +106,7 @@ def evaluate_localization(
 def evaluate_scene(
     scene: Scene,
     source: FeatureSource,
-    words: TextTable,
+    words: Words,
     *,
     protocol: LocalizationProtocol = LocalizationProtocol(),
     seeds: SeedConfig = SeedConfig(),
@@ -136,7 +136,7 @@ def evaluate_scene(
 def score_queries(
     scene: Scene,
     features: GaussianFeatures,
-    words: TextTable,
+    words: Words,
     protocol: LocalizationProtocol,
     localization: LocalizeConfig,
 ) -> tuple[list[Hit], int]:

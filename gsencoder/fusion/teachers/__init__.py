@@ -14,7 +14,8 @@ class Teacher(Protocol):
 
     Attributes:
         space: what its vectors are.
-        table: the vectors that all its maps are codes into; None where maps are dense or each has its own table.
+        table: the vectors that all its maps are codes into or shares of; None where maps are dense or each has its own
+            table.
         mean: the space's mean, where it is known without looking at the scene.
         needs_images: whether it looks at photographs (a splat without views is then rendered for it).
         cheap: whether making a map twice costs less than keeping it on disk.

@@ -1,17 +1,21 @@
-"""Teachers, and their text tables, from settings."""
+"""Teachers, and the words that lead into their spaces, from settings."""
 
 import numpy as np
 
+from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
+from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable, load_text_table, make_text_table
 from gsencoder.types import Scene
 
-TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig
+TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig | SegmenterConfig
 
 
 def text_table_of(config: TeacherConfig) -> TextTable | None:
@@ -26,13 +30,39 @@ def text_table_of(config: TeacherConfig) -> TextTable | None:
     return load_text_table(find_file(config.words, "teacher.words")) if config.words else None
 
 
-def build_teacher(config: TeacherConfig, scene: Scene, words: TextTable | None) -> Teacher:
+def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Words | None:
+    """The words of the teacher's space: its text table, or the vocabulary of a text tower; None where there are none.
+
+    Args:
+        config: of the teacher.
+        text: a tower whose vectors the teacher's features are, or are made to be; its own table is not read then.
+
+    Raises:
+        InputError: a table or tower cannot be found or read, or the teacher's space has words of its own.
+    """
+    if isinstance(text, TableTextConfig):
+        return text_table_of(config)
+    if isinstance(config, PaletteConfig):
+        raise InputError(f"text={text.name}: teacher=palette has the words of its eleven colors; leave out text=")
+    return vocabulary_of(text)
+
+
+def words_beside(teacher: Teacher, words: Words | None) -> TextTable | None:
+    """The table that is stored with a teacher's features: of a tower, with the names that the teacher knows."""
+    if isinstance(words, OpenVocabulary) and isinstance(teacher, SegmenterTeacher):
+        words = words.including(teacher.kinds)
+    elif isinstance(words, OpenVocabulary) and isinstance(teacher, LabelsTeacher):
+        words = words.including(teacher.names[1:])
+    return closed_table(words) if words is not None else None
+
+
+def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> Teacher:
     """The teacher of a scene.
 
     Args:
         config: which teacher and its settings.
         scene: the labels teacher reads its objects.
-        words: from `text_table_of(config)`, which is read once for many scenes.
+        words: from `words_of(config)`, which is read once for many scenes.
 
     Raises:
         InputError: the teacher lacks something it needs.
@@ -43,7 +73,22 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: TextTable | None) 
         return OnnxTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
     if isinstance(config, RadioConfig):
         return RadioTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
+    if isinstance(config, SegmenterConfig):
+        if words is None:
+            raise InputError(
+                "teacher segmenter: its classes need words: give a text tower (text=onnx text.model=FOLDER), or a text "
+                "table that has their names (teacher.words=)"
+            )
+        return SegmenterTeacher(config, words)
     assert words is not None
+    if isinstance(words, OpenVocabulary):
+        words = words.including(sorted({o.name for o in scene.objects if o.name is not None}))
+    table = closed_table(words)
     return LabelsTeacher(
-        scene.objects, words.names, words.embeddings, text_encoder=words.space.text_encoder, cell=config.cell
+        scene.objects,
+        table.names,
+        table.embeddings,
+        text_encoder=table.space.text_encoder,
+        mean=table.mean,
+        cell=config.cell,
     )

@@ -52,6 +52,7 @@ class LabelsTeacher:
         embeddings: Float32[np.ndarray, "C D"],
         *,
         text_encoder: str,
+        mean: Float32[np.ndarray, " D"] | None = None,
         cell: int = 1,
     ) -> None:
         """Makes the scene's table.
@@ -61,6 +62,7 @@ class LabelsTeacher:
             names: the words of the table.
             embeddings: their unit vectors.
             text_encoder: what made these.
+            mean: of the text side, which "other" points along; None = that of the table.
             cell: pixels along the side of a cell of the maps.
 
         Raises:
@@ -77,7 +79,7 @@ class LabelsTeacher:
                 f"first {missing[0]!r}; change them or set them to null in objects.json, or give a table that has them "
                 "(teacher.words=)"
             )
-        mean = embeddings.mean(axis=0, dtype=np.float64)
+        mean = embeddings.mean(axis=0, dtype=np.float64) if mean is None else mean.astype(np.float64)
         other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)
         self.names = ("other", *used)
         self.vectors = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)

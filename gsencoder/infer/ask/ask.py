@@ -18,7 +18,7 @@ from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
 from gsencoder.infer.views.targets import Target, best_boxes, target_of, targets_of
-from gsencoder.text.table import TextTable
+from gsencoder.text.build import Words, closed_table
 from gsencoder.types import Box, Scene
 
 MAX_CACHED_PICTURES = 8
@@ -115,7 +115,7 @@ class Asker:
     def __init__(
         self,
         scene: Scene,
-        table: TextTable | None,
+        words: Words | None,
         *,
         space: str | None = None,
         config: AskConfig = AskConfig(),
@@ -126,7 +126,7 @@ class Asker:
     ) -> None:
         """Args:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
-        table: words that lead into the features; None where there are none.
+        words: what leads into the features; None where nothing does.
         space: which features are asked.
         config: see there.
         localization: how words become boxes.
@@ -134,7 +134,8 @@ class Asker:
         vlm: how requests are made; pictures are made smaller than its `image_side`.
         word_rules: which words of a question make a name a verb or a color.
         """
-        self.scene, self.table, self.space = scene, table, space
+        self.scene, self.words, self.space = scene, words, space
+        self.table = closed_table(words) if words is not None else None
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
         self.word_rules = word_rules
         self._looked_up: dict[Hashable, LookedUp] = {}
@@ -231,9 +232,9 @@ class Asker:
             return (target_of("thing in the box", gaussians, rows),), (), {}
         if not words:
             return (), (), {}
-        if self.table is None:
+        if self.words is None:
             raise InputError(f"query: no words lead into the features of {self.scene.name}; give words= or aabb=")
-        localization = localize(self.scene, words, self.table, self.localization, space=self.space)
+        localization = localize(self.scene, words, self.words, self.localization, space=self.space)
         # A caption is of one thing.
         boxes = self.config.boxes if question.task != "caption" else 1
         targets, distinct = _distinct(targets_of(gaussians, localization, boxes), best_boxes(localization, boxes))

@@ -17,6 +17,7 @@ from gsencoder.infer.localize.presence import Evidence, Presence, probability
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
 from gsencoder.text.encoder import TextEncoder, check_space
+from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Gaussians, Localization, Scene
 
@@ -71,6 +72,14 @@ class LocalizeConfig:
         metadata={"help": "boxes that are less probable are left out, and words without a box are absent; 0 = none"},
     )
 
+    min_phrase_probability: float = field(
+        default=0.001,
+        metadata={
+            "help": "the same for phrases that are no names of the text table, whose probabilities are lower; the "
+            "smaller of both counts"
+        },
+    )
+
     def __post_init__(self) -> None:
         if self.mode not in ("centred", "raw"):
             raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
@@ -87,8 +96,9 @@ class LocalizeConfig:
                 raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         if not 0 <= self.min_share <= 1:
             raise InputError(f"min_share: expected a share in [0, 1], got {self.min_share}")
-        if not 0 <= self.min_probability <= 1:
-            raise InputError(f"min_probability: expected a probability in [0, 1], got {self.min_probability}")
+        for name in ("min_probability", "min_phrase_probability"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name}: expected a probability in [0, 1], got {getattr(self, name)}")
 
 
 _DEFAULT = LocalizeConfig()
@@ -107,10 +117,10 @@ def localize(
 
     Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
     score that `gsencoder.infer.localize.boxes.score_clusters` and the probability that
-    `gsencoder.infer.localize.presence` defines. Boxes that are less probable than `config.min_probability` are left
-    out, and a word that has no box is absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless
-    `config.extent` says "sigma", and have the scene's origin added back in float64. A word's boxes do not depend on the
-    other queries, unless `config.contrast` is on.
+    `gsencoder.infer.localize.presence` defines. Boxes that are less probable than `config.min_probability`, for phrases
+    `config.min_phrase_probability`, are left out, and a word that has no box is absent. Axis-aligned and oriented boxes
+    are drawn around Gaussian means, unless `config.extent` says "sigma", and have the scene's origin added back in
+    float64. A word's boxes do not depend on the other queries, unless `config.contrast` is on.
 
     Args:
         scene: Gaussians with features.
@@ -134,9 +144,10 @@ def localize(
     probabilities = [[probability(each) for each in one.evidence] for one in candidates.words]
     boxes = []
     for word, one, values in zip(queries, candidates.words, probabilities, strict=True):
-        probable = [
-            (each, value) for each, value in zip(one.clusters, values, strict=True) if value >= config.min_probability
-        ]
+        level = config.min_probability
+        if not _is_name(word, text):
+            level = min(level, config.min_phrase_probability)
+        probable = [(each, value) for each, value in zip(one.clusters, values, strict=True) if value >= level]
         boxes += boxes_of_word(
             word,
             probable,
@@ -279,6 +290,11 @@ def _negatives(text: TextEncoder, words: Sequence[str]) -> Float32[np.ndarray, "
     if unknown and not known:
         known = [(text.mean / max(float(np.linalg.norm(text.mean)), 1e-12))[None].astype(np.float32)]
     return np.concatenate(known) if known else np.zeros((0, text.space.channels), np.float32)
+
+
+def _is_name(word: str, text: TextEncoder) -> bool:
+    table = text.table if isinstance(text, OpenVocabulary) else text
+    return isinstance(table, TextTable) and table.find(word) is not None
 
 
 def _warn_about_absent(scene: str, localization: Localization) -> None:

@@ -22,7 +22,7 @@ from gsencoder.core.int8 import round_columns
 from gsencoder.core.runtime.device_names import Stored
 from gsencoder.models.grid.serialize import ALIGN, Order
 from gsencoder.models.output_space import OutputSpace, output_space_parts
-from gsencoder.text.table import TextTable, unrounded
+from gsencoder.text.table import TextTable, tower_from_json, tower_to_json, unrounded
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 KEY = "gsencoder"
@@ -99,6 +99,8 @@ def to_metadata(header: OnnxHeader) -> dict[str, str]:
         else:
             arrays["words"] = words.embeddings.astype(np.float16)
         values["words"] = {"names": list(words.names), "space": asdict(words.space)}
+        if words.tower is not None:
+            values["words"]["tower"] = tower_to_json(words.tower)
     values["arrays"] = {name: {"dtype": value.dtype.name, "shape": value.shape} for name, value in arrays.items()}
     entries = {KEY: json.dumps(values, ensure_ascii=False)}
     for name, value in arrays.items():
@@ -142,6 +144,7 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
                 embeddings=unrounded(arrays["words"].astype(np.float32) * arrays.get("words_scale", np.float32(1))),
                 space=FeatureSpace(**values["words"]["space"]),
                 mean=arrays["words_mean"],
+                tower=tower_from_json(values["words"]["tower"]) if "tower" in values["words"] else None,
             )
         return OnnxHeader(
             voxel=float(values["voxel"]),

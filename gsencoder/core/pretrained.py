@@ -1,0 +1,124 @@
+"""Models of transformers in folders on disk: loaded without a network, without pickles, and without a folder's code."""
+
+import hashlib
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from gsencoder.core.errors import InputError, SceneWarning, listed
+
+EXTRA = "pip install 'gsencoder[teachers]'"
+BLOCK_BYTES = 1 << 24
+
+
+def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = "warn") -> Any:
+    """A model with exactly the weights of a folder, in evaluation mode.
+
+    Args:
+        loader: a class of transformers with `from_pretrained`.
+        folder: with `config.json` and safetensors files.
+        what: who loads it, for messages.
+        other_parts: what is done about weights of modules that the class does not have, such as the other tower of a
+            joint model: "warn" or "ignore".
+
+    Raises:
+        InputError: the folder holds no model of that class, or weights that do not fit its configuration.
+
+    Warns:
+        SceneWarning: weights of other modules are not used, with `other_parts="warn"`.
+    """
+    try:
+        from safetensors import SafetensorError
+    except ImportError as error:
+        raise InputError(f"{what}: needs the package transformers ({EXTRA})") from error
+    if not list(folder.glob("*.safetensors")):
+        raise InputError(f"{what}: {folder} has no weights as safetensors, and files of pickles are not opened")
+    try:
+        with quiet_transformers():
+            # Sizes that do not match are reported with the keys that do not, instead of an error that names none.
+            model, report = loader.from_pretrained(
+                str(folder),
+                local_files_only=True,
+                trust_remote_code=False,
+                use_safetensors=True,
+                output_loading_info=True,
+                ignore_mismatched_sizes=True,
+            )
+    except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError, SafetensorError) as error:
+        message = " ".join(str(error).split())[:160]
+        raise InputError(f"{what}: {folder} holds no model that transformers reads: {message}") from error
+    _check_keys(folder, model, report, what, other_parts)
+    return model.eval()
+
+
+def read_config(folder: Path, what: str) -> Any:
+    """The configuration of the model in a folder.
+
+    Raises:
+        InputError: transformers is missing, or does not know the model without the folder's own code.
+    """
+    try:
+        from transformers import AutoConfig
+    except ImportError as error:
+        raise InputError(f"{what}: needs the package transformers ({EXTRA})") from error
+    try:
+        with quiet_transformers():
+            return AutoConfig.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
+    except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError) as error:
+        message = " ".join(str(error).split())[:160]
+        raise InputError(f"{what}: {folder} holds no model that transformers reads: {message}") from error
+
+
+@contextmanager
+def quiet_transformers() -> Iterator[None]:
+    """Without the progress bar and the table of keys that transformers prints while it loads: `load_pretrained` reports
+    what matters of it."""
+    from transformers.utils import logging
+
+    level, bar = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if bar:
+            logging.enable_progress_bar()
+
+
+def _check_keys(folder: Path, model: Any, report: Mapping[str, Any], what: str, other_parts: str) -> None:
+    """Whether the files hold exactly the weights of the model: transformers fills what is missing with random ones, and
+    drops layers that the configuration does not have."""
+    modules = {name.partition(".")[0] for name in model.state_dict()}
+    unused = sorted(report["unexpected_keys"])
+    surplus = [name for name in unused if name.partition(".")[0] in modules]
+    reshaped = sorted(str(entry[0]) for entry in report["mismatched_keys"])
+    for names, problem in (
+        (sorted(report["missing_keys"]), "are missing"),
+        (reshaped, "have other shapes than the configuration says"),
+        (surplus, "belong to layers that the configuration does not have"),
+    ):
+        if names:
+            raise InputError(
+                f"{what}: {folder}: the weights do not fit the configuration: {len(names)} {problem} "
+                f"({listed(names, 3)}); expected config.json and weights of one model"
+            )
+    if unused and other_parts == "warn":
+        warnings.warn(
+            f"{what}: {folder}: {len(unused)} weights that are no part of the backbone are not used: "
+            f"{listed(unused, 3)}",
+            SceneWarning,
+            stacklevel=4,
+        )
+
+
+def digest_files(*files: Path, settings: object = None) -> str:
+    """A fingerprint of the contents of files, in this order, and of settings; 16 hexadecimal digits."""
+    digest = hashlib.sha256(b"" if settings is None else repr(settings).encode("utf-8", "backslashreplace"))
+    for path in files:
+        with path.open("rb") as stream:
+            while block := stream.read(BLOCK_BYTES):
+                digest.update(block)
+    return digest.hexdigest()[:16]

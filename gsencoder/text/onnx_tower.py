@@ -1,0 +1,273 @@
+"""Text towers as ONNX files, as optimum and sentence-transformers export them. Runs without torch."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.model_files import find_file
+from gsencoder.core.pretrained import digest_files
+from gsencoder.text.towers import NO_TEMPLATES, check_templates, unit
+
+Pooling = Literal["mean", "cls", "eos", "output"]
+GRAPHS = ("model.onnx", "onnx/model.onnx", "text_model.onnx")
+POOLED_OUTPUTS = ("sentence_embedding", "text_embeds", "text_features")
+"""Outputs that are one vector a phrase already, in the space that is compared; a pooler's output is not."""
+TOKEN_OUTPUTS = ("last_hidden_state", "token_embeddings")
+KNOWN_INPUTS = ("input_ids", "attention_mask", "token_type_ids", "position_ids")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnnxTextConfig:
+    """A text tower in a folder with an ONNX graph and `tokenizer.json`."""
+
+    name: Literal["onnx"] = "onnx"
+    model: str = field(
+        default="",
+        metadata={"help": "folder with model.onnx and tokenizer.json; also looked for in GSENCODER_MODELS"},
+    )
+    pooling: Literal["auto"] | Pooling = field(
+        default="auto",
+        metadata={
+            "help": "how token vectors become one: mean, cls = the first, eos = the last, output = the model does it; "
+            "auto = as the folder says"
+        },
+    )
+    templates: tuple[str, ...] = field(
+        default=NO_TEMPLATES,
+        metadata={"help": "sentences with {} for the phrase, whose vectors are averaged"},
+    )
+    threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
+
+    def __post_init__(self) -> None:
+        if self.pooling not in ("auto", "mean", "cls", "eos", "output"):
+            raise InputError(f"pooling: expected auto, mean, cls, eos or output, got {self.pooling!r}")
+        if not 0 <= self.threads <= 1024:
+            raise InputError(f"threads: expected 0 to 1024, got {self.threads}")
+        check_templates(self.templates)
+
+
+class OnnxTower:
+    """A tokenizer and an ONNX graph. Phrases run one at a time and without padding: a graph with dynamic int8 scales
+    gives a phrase another vector beside others, or with padding behind it.
+
+    Attributes:
+        name: of the folder.
+        identity: "onnx:" and a digest of graph, tokenizer and pooling.
+        channels: of its vectors.
+        pooling: of token vectors.
+    """
+
+    def __init__(self, config: OnnxTextConfig) -> None:
+        """Reads the folder, and runs the tokenizer's last token through the graph.
+
+        Args:
+            config: which folder, and how.
+
+        Raises:
+            InputError: no such folder, files that cannot be read or do not fit each other, or an unknown pooling.
+        """
+        if not config.model:
+            raise InputError("text.model= is missing: the folder of a text tower (model.onnx and tokenizer.json)")
+        folder = find_file(config.model, "text.model", folder=True)
+        graph = next((folder / name for name in GRAPHS if (folder / name).is_file()), None)
+        tokenizer = folder / "tokenizer.json"
+        if graph is None or not tokenizer.is_file():
+            missing = "tokenizer.json" if graph is not None else "model.onnx"
+            raise InputError(f"{folder}: {missing} is missing; expected a text tower as optimum exports it")
+        self.name, self._folder = folder.resolve().name, folder
+        self._tokenizer = _load_tokenizer(tokenizer)
+        self._session = _load_graph(graph, config.threads)
+        self._inputs = {tensor.name: tensor.shape for tensor in self._session.get_inputs()}
+        unknown = sorted(set(self._inputs) - set(KNOWN_INPUTS))
+        if "input_ids" not in self._inputs or unknown:
+            raise InputError(
+                f"{graph}: takes {', '.join(self._inputs)}; expected a text model that takes input_ids, and of "
+                f"{', '.join(KNOWN_INPUTS[1:])} at most"
+            )
+        self.pooling, self._output = self._choose_pooling(config.pooling)
+        self._set_length()
+        files = [graph, *sorted(graph.parent.glob(f"{graph.name}_data*")), tokenizer]
+        self.identity = f"onnx:{digest_files(*files, settings=(self.pooling, self._output))}"
+        self.channels = len(self._probe())
+
+    def embed(self, phrases: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
+        """A unit vector for each phrase.
+
+        Raises:
+            InputError: a phrase of which the tokenizer knows nothing, or more tokens than the model takes.
+        """
+        return unit(np.stack([self._pool(*self._run(self._tokens(phrase))) for phrase in phrases]))
+
+    def _tokens(self, phrase: str) -> Int64[np.ndarray, " T"]:
+        encoded = self._tokenizer.encode(phrase)
+        inside = [token for token, special in zip(encoded.ids, encoded.special_tokens_mask, strict=True) if not special]
+        if not inside or all(token == self._unknown for token in inside):
+            raise InputError(f"query {phrase[:60]!r}: holds no word that its tokenizer knows")
+        if self._longest and len(encoded.ids) > self._longest:
+            raise InputError(
+                f"query {phrase[:60]!r}…: has {len(encoded.ids)} tokens; the tower takes at most {self._longest}"
+            )
+        return np.array(encoded.ids, np.int64)
+
+    def _run(self, tokens: Int64[np.ndarray, " T"]) -> tuple[np.ndarray, int]:
+        """The output for one phrase, and how many of its tokens are no padding."""
+        count, length = len(tokens), max(self._fixed, len(tokens))
+        padded = np.full(length, self._padding, np.int64)
+        padded[:count] = tokens
+        feed = {
+            "input_ids": padded[None],
+            "attention_mask": (np.arange(length) < count).astype(np.int64)[None],
+            "token_type_ids": np.zeros((1, length), np.int64),
+            "position_ids": np.arange(length)[None],
+        }
+        try:
+            output = self._session.run([self._output], {name: feed[name] for name in self._inputs})[0]
+        except Exception as error:  # onnxruntime raises its own classes, which share only this base
+            message = " ".join(str(error).split())[:160]
+            raise InputError(
+                f"the graph does not run on tokens of tokenizer.json ({message}); expected both of one model"
+            ) from error
+        return np.asarray(output), count
+
+    def _pool(self, output: np.ndarray, count: int) -> Float32[np.ndarray, " D"]:
+        axes = 2 if self.pooling == "output" else 3
+        if output.ndim != axes or len(output) != 1:
+            wanted = "[1, channels]" if axes == 2 else "[1, tokens, channels]"
+            raise InputError(
+                f"its output {self._output!r} has shape {list(output.shape)}, expected {wanted} for pooling="
+                f"{self.pooling}"
+            )
+        if self.pooling == "output":
+            return output[0].astype(np.float32)
+        if self.pooling == "mean":
+            return output[0, :count].mean(axis=0, dtype=np.float64).astype(np.float32)
+        return output[0, 0 if self.pooling == "cls" else count - 1].astype(np.float32)
+
+    def _choose_pooling(self, asked: str) -> tuple[Pooling, str]:
+        """The pooling, and the output that it takes."""
+        outputs = [tensor.name for tensor in self._session.get_outputs()]
+        pooled = next((name for name in POOLED_OUTPUTS if name in outputs), None)
+        tokens = next((name for name in TOKEN_OUTPUTS if name in outputs), outputs[0])
+        if asked == "auto" and pooled is not None:
+            return "output", pooled
+        pooling = stated_pooling(self._folder) if asked == "auto" else asked
+        if pooling == "output":
+            return "output", pooled or outputs[0]
+        if pooling in ("mean", "cls", "eos"):
+            return pooling, tokens  # type: ignore[return-value]
+        raise InputError(
+            f"{self._folder}: no file says how token vectors become one (1_Pooling/config.json, or an output "
+            f"{' or '.join(POOLED_OUTPUTS)}); give text.pooling=mean, cls or eos as the model's card says"
+        )
+
+    def _set_length(self) -> None:
+        """Lengths: what a graph of fixed size, or one without a mask that its tokenizer pads for, must be given."""
+        stated = self._inputs["input_ids"][-1]
+        self._fixed = stated if isinstance(stated, int) else 0
+        padding, truncation = self._tokenizer.padding or {}, self._tokenizer.truncation or {}
+        self._padding = int(padding.get("pad_id") or 0)
+        if not self._fixed and "attention_mask" not in self._inputs:
+            self._fixed = int(padding.get("length") or 0)
+        settings = _read_json(self._folder / "tokenizer_config.json").get("model_max_length")
+        positions = _read_json(self._folder / "config.json").get("max_position_embeddings")
+        limits = [self._fixed, truncation.get("max_length"), settings, positions]
+        self._longest = min((limit for limit in limits if isinstance(limit, int) and 0 < limit < 1 << 20), default=0)
+        # Neither in silence: a phrase that is cut is another phrase.
+        self._tokenizer.no_truncation()
+        self._tokenizer.no_padding()
+        self._unknown = _unknown_token(self._tokenizer)
+
+    def _probe(self) -> Float32[np.ndarray, " D"]:
+        """The vector of the tokenizer's last token, which a graph with fewer rows in its embedding does not have."""
+        last = self._tokenizer.get_vocab_size(with_added_tokens=True) - 1
+        stated = _read_json(self._folder / "config.json").get("vocab_size")
+        if isinstance(stated, int) and stated <= last:
+            raise InputError(
+                f"{self._folder}: tokenizer.json has {last + 1} tokens and config.json says {stated}; expected both of "
+                "one model"
+            )
+        try:
+            return self._pool(*self._run(np.array([last], np.int64)))
+        except InputError as error:
+            raise InputError(f"{self._folder}: {error}") from error
+
+
+def _load_tokenizer(path: Path) -> Any:
+    try:
+        from tokenizers import Tokenizer
+    except ImportError as error:
+        raise InputError("text towers need the package tokenizers (pip install tokenizers)") from error
+    try:
+        return Tokenizer.from_file(str(path))
+    except Exception as error:  # tokenizers raises plain Exceptions
+        raise InputError(f"{path}: is no tokenizer: {' '.join(str(error).split())[:120]}") from error
+
+
+def _load_graph(path: Path, threads: int) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    # Errors of runs become ours, in one line.
+    options.log_severity_level = 4
+    if threads:
+        options.intra_op_num_threads = threads
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises its own classes, which share only this base
+        message = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: is no model that onnxruntime reads: {message}") from error
+
+
+def stated_pooling(folder: Path) -> str:
+    """The pooling that sentence-transformers' files state, or nothing.
+
+    Raises:
+        InputError: they state one that is not supported, or a layer behind it.
+    """
+    for module in _read_json(folder / "modules.json", list):
+        kind = str(module.get("type", "")).rpartition(".")[2] if isinstance(module, dict) else ""
+        if kind not in ("Transformer", "Pooling", "Normalize"):
+            raise InputError(
+                f"{folder}: modules.json lists {kind[:40]!r}, which is not supported; export it into the "
+                "graph, as an output sentence_embedding"
+            )
+    stated = _read_json(folder / "1_Pooling" / "config.json")
+    names = {"pooling_mode_mean_tokens": "mean", "pooling_mode_cls_token": "cls", "pooling_mode_lasttoken": "eos"}
+    modes = [key for key, value in stated.items() if key.startswith("pooling_mode") and value is True]
+    if not modes:
+        return ""
+    if len(modes) > 1 or modes[0] not in names:
+        raise InputError(
+            f"{folder}: 1_Pooling/config.json asks for {', '.join(modes)}; expected one of {', '.join(names)}"
+        )
+    return names[modes[0]]
+
+
+def _unknown_token(tokenizer: Any) -> int | None:
+    """The number of the token for what the tokenizer does not know, where it has one."""
+    state = json.loads(tokenizer.to_str()).get("model") or {}
+    token = state.get("unk_token")
+    return tokenizer.token_to_id(token) if isinstance(token, str) else None
+
+
+def _read_json(path: Path, kind: type = dict) -> Any:
+    """A JSON file of the folder; empty where there is none.
+
+    Raises:
+        InputError: it is no JSON of that kind.
+    """
+    if not path.is_file():
+        return kind()
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as JSON: {str(error)[:80]}") from error
+    if not isinstance(value, kind):
+        raise InputError(f"{path}: expected a JSON {'object' if kind is dict else 'list'}")
+    return value

@@ -1,0 +1,91 @@
+"""Cameras inside a bare splat: in the room of a room, and nowhere in an object."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.interior_views import interior_views
+from gsencoder.fusion.orbit_views import with_views
+from gsencoder.types import Gaussians, Scene
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def box_of_discs(rng: np.random.Generator, size: tuple[float, float, float], count: int = 6000) -> Gaussians:
+    """Flat Gaussians on the six sides of a box around the origin."""
+    half = np.array(size) / 2
+    axis = rng.choice(
+        3,
+        count,
+        p=np.array([half[1] * half[2], half[0] * half[2], half[0] * half[1]])
+        / (half[1] * half[2] + half[0] * half[2] + half[0] * half[1]),
+    )
+    means = rng.uniform(-half, half, (count, 3))
+    rows = np.arange(count)
+    means[rows, axis] = half[axis] * rng.choice([-1, 1], count)
+    scales = np.full((count, 3), 0.08)
+    scales[rows, axis] = 0.002
+    return Gaussians(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=scales.astype(np.float32),
+        opacities=np.full(count, 0.9, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+    )
+
+
+@pytest.mark.parametrize("up", [None, UP])
+def test_a_room_is_seen_from_inside(rng: np.random.Generator, up: np.ndarray | None) -> None:
+    room = box_of_discs(rng, (5.0, 4.0, 2.5))
+    made = interior_views(room, 12, up=up)
+    assert made is not None
+    assert made.covered > 0.9
+    assert made.filled > 0.9
+    assert (np.abs(made.cameras.centers) < [2.5, 2.0, 1.25]).all()
+    if up is not None:
+        # Level: the right axis of each camera is horizontal.
+        np.testing.assert_allclose(made.cameras.cam_from_world[:, 0, 2], 0, atol=1e-6)
+
+
+def test_an_object_is_seen_from_around(rng: np.random.Generator) -> None:
+    """A ball of Gaussians, which leaves no room inside."""
+    count = 4000
+    ball = rng.normal(size=(count, 3))
+    ball *= rng.uniform(0, 1, (count, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
+    gaussians = replace(box_of_discs(rng, (1, 1, 1), count), means=ball.astype(np.float32))
+    made = interior_views(gaussians, 8)
+    assert made is None or made.covered < 0.2
+    scene = Scene(name="ball", gaussians=gaussians)
+    views = with_views(scene, 8).views
+    assert views is not None
+    assert views.names[0] == "orbit_000"
+
+
+def test_a_splat_without_any_room_refuses_cameras_inside(rng: np.random.Generator) -> None:
+    point = Scene(name="point", gaussians=box_of_discs(rng, (1, 1, 1)).select(np.array([0])))
+    with pytest.raises(InputError, match="cameras=inside: no camera in point"):
+        with_views(point, 8, cameras="inside")
+
+
+def test_where_cameras_stand_can_be_stated(rng: np.random.Generator) -> None:
+    scene = Scene(name="room", gaussians=box_of_discs(rng, (5.0, 4.0, 2.5)), up=UP)
+    for cameras, begin in (("auto", "inside_000"), ("inside", "inside_000"), ("around", "orbit_000")):
+        views = with_views(scene, 6, cameras=cameras).views  # type: ignore[arg-type]
+        assert views is not None
+        assert views.names[0] == begin
+        assert len(views) <= 6
+
+
+def test_the_same_splat_gives_the_same_cameras(rng: np.random.Generator) -> None:
+    room = box_of_discs(rng, (5.0, 4.0, 2.5))
+    first, second = interior_views(room, 5), interior_views(room, 5)
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(first.cameras.cam_from_world, second.cameras.cam_from_world)
+
+
+def test_nothing_opaque_has_no_inside(rng: np.random.Generator) -> None:
+    room = box_of_discs(rng, (5.0, 4.0, 2.5))
+    assert interior_views(replace(room, opacities=np.zeros(len(room), np.float32)), 5) is None

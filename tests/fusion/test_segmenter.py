@@ -1,0 +1,308 @@
+"""Segmenters as teachers: posteriors as shares of class names, from small ONNX graphs and models of transformers."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+import transformers
+from onnx import TensorProto, helper, numpy_helper
+from splats import front_camera, random_gaussians
+
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.fusion.lift import map_rows
+from gsencoder.fusion.teacher_maps import read_map, write_map
+from gsencoder.fusion.teachers.build import words_beside
+from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher, softmax
+from gsencoder.fusion.teachers.segmenter_classes import read_classes, synonyms_of_classes
+from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
+from gsencoder.text.open_vocabulary import OpenVocabulary, make_vocabulary
+from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.towers import unit
+from gsencoder.types import FeatureMap, Scene, Views
+
+NAMES = ("other", "wall", "chair, seat", "table")
+PLAIN = OnnxSegmenterOptions(scale=1.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+
+
+def words(rng: np.random.Generator, names: Sequence[str] = ("wall", "chair", "seat", "table", "lamp")) -> TextTable:
+    return make_text_table(names, unit(rng.normal(size=(len(names), 8))), "toy")
+
+
+def save_graph(
+    path: Path, *, input_type: int = TensorProto.FLOAT, shape: Sequence[Any] = (1, 3, 8, 12), last: bool = False
+) -> None:
+    """A graph that gives for class c the mean of channel c of cells of 2×2 pixels; the fourth class is 1.5."""
+    pick = np.zeros((4, 3, 2, 2), np.float32)
+    for channel in range(3):
+        pick[channel, channel] = 0.25
+    nodes = [helper.make_node("Cast", ["image"], ["float"], to=TensorProto.FLOAT)]
+    nodes += [helper.make_node("Transpose", ["float"], ["first"], perm=[0, 3, 1, 2])] * last
+    nodes += [helper.make_node("Conv", ["first" if last else "float", "pick", "bias"], ["scores"], strides=[2, 2])]
+    output = helper.make_tensor_value_info("scores", TensorProto.FLOAT, None)
+    weights = [
+        numpy_helper.from_array(pick, "pick"),
+        numpy_helper.from_array(np.array([0, 0, 0, 1.5], np.float32), "bias"),
+    ]
+    graph = helper.make_graph(
+        nodes, "net", [helper.make_tensor_value_info("image", input_type, shape)], [output], weights
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), path)
+
+
+def views_of(image: np.ndarray) -> Views:
+    return Views(cameras=front_camera(image.shape[1], image.shape[0]), names=("a",), images=[image])
+
+
+def teacher_of(
+    path: Path, table: TextTable | OpenVocabulary, options: OnnxSegmenterOptions = PLAIN
+) -> SegmenterTeacher:
+    classes = path.with_name("classes.json")
+    if not classes.exists():
+        classes.write_text(json.dumps(NAMES))
+    return SegmenterTeacher(SegmenterConfig(model=str(path), classes=str(classes), onnx=options), table)
+
+
+@pytest.fixture
+def image(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 4, (8, 12, 3)).astype(np.uint8)
+
+
+def expected_shares(image: np.ndarray) -> np.ndarray:
+    cells = image.reshape(4, 2, 6, 2, 3).mean(axis=(1, 3))
+    logits = np.concatenate([cells, np.full((4, 6, 1), 1.5)], axis=-1)
+    return np.exp(logits) / np.exp(logits).sum(-1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("input_type", "shape", "last"),
+    [
+        (TensorProto.FLOAT, (1, 3, 8, 12), False),
+        (TensorProto.FLOAT, ("n", 3, "h", "w"), False),
+        (TensorProto.UINT8, (1, 8, 12, 3), True),
+        (TensorProto.UINT8, (1, 3, 8, 12), False),
+    ],
+)
+def test_shares_are_the_posteriors_in_every_layout(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray, input_type: int, shape: Any, last: bool
+) -> None:
+    save_graph(tmp_path / "net.onnx", input_type=input_type, shape=shape, last=last)
+    teacher = teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, size=12, multiple=4))
+    made = teacher.feature_map(views_of(image), 0)
+    assert made.shares is not None
+    np.testing.assert_allclose(made.shares, expected_shares(image), atol=1e-5)
+    np.testing.assert_allclose(made.grid_from_image, [[0.5, 0, 0], [0, 0.5, 0]])
+
+
+def test_a_picture_of_another_size_is_squeezed_into_a_fixed_one(tmp_path: Path, rng: np.random.Generator) -> None:
+    save_graph(tmp_path / "net.onnx")
+    made = teacher_of(tmp_path / "net.onnx", words(rng)).feature_map(views_of(np.zeros((20, 24, 3), np.uint8)), 0)
+    np.testing.assert_allclose(made.grid_from_image, [[6 / 24, 0, 0], [0, 4 / 20, 0]])
+
+
+def test_classes_are_means_of_their_synonyms_and_nothing_is_the_mean_direction(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    save_graph(tmp_path / "net.onnx")
+    table = words(rng)
+    teacher = teacher_of(tmp_path / "net.onnx", table)
+    row = dict(zip(table.names, table.embeddings, strict=True))
+    expected = [table.mean, row["wall"], row["chair"] + row["seat"], row["table"]]
+    np.testing.assert_allclose(teacher.table, unit(np.stack(expected)), atol=1e-6)
+    assert teacher.kinds == ("wall", "chair", "seat", "table")
+    assert synonyms_of_classes(["door;double door", "side_walk", "Void "], ["void"]) == [
+        ["door", "double door"],
+        ["side walk"],
+        [],
+    ]
+
+
+def test_fusing_shares_equals_fusing_the_vectors_that_they_stand_for(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+) -> None:
+    save_graph(tmp_path / "net.onnx")
+    teacher = teacher_of(tmp_path / "net.onnx", words(rng))
+    scene = Scene(name="s", gaussians=random_gaussians(200), views=views_of(image))
+
+    class Dense:
+        table, mean, needs_images, cheap, space = None, teacher.mean, True, True, teacher.space
+
+        def feature_map(self, views: Views, view: int) -> FeatureMap:
+            made = teacher.feature_map(views, view)
+            vectors = map_rows(made).reshape(made.height, made.width, -1)
+            return FeatureMap(features=vectors, grid_from_image=made.grid_from_image, space=made.space)
+
+        def settings(self) -> dict[str, Any]:
+            return {}
+
+    mixed, dense = (fuse(scene, each, FuseConfig()).features for each in (teacher, Dense()))
+    np.testing.assert_allclose(mixed.weights, dense.weights, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(mixed.decode(), dense.decode(), atol=1e-5)
+
+
+def test_a_mixed_map_comes_back_from_its_file(tmp_path: Path, rng: np.random.Generator, image: np.ndarray) -> None:
+    save_graph(tmp_path / "net.onnx")
+    made = teacher_of(tmp_path / "net.onnx", words(rng)).feature_map(views_of(image), 0)
+    write_map(tmp_path / "map.safetensors", made)
+    again = read_map(tmp_path / "map.safetensors", made.space, made.table)
+    np.testing.assert_allclose(again.shares, made.shares, atol=1e-3)
+    np.testing.assert_array_equal(again.grid_from_image, made.grid_from_image)
+
+
+def test_words_beside_the_features_hold_the_classes(tmp_path: Path) -> None:
+    class Tower:
+        name, identity, pooling, channels = "t", "onnx:0", "mean", 8
+
+        def embed(self, phrases: Sequence[str]) -> np.ndarray:
+            return unit(np.stack([np.random.default_rng(list(p.encode())).normal(size=8) for p in phrases]))
+
+    save_graph(tmp_path / "net.onnx")
+    vocabulary = make_vocabulary(Tower(), "onnx", templates=("{}",))
+    (tmp_path / "classes.json").write_text(json.dumps(["other", "wall", "zebra crossing", "table"]))
+    beside = words_beside(teacher_of(tmp_path / "net.onnx", vocabulary), vocabulary)
+    assert beside is not None
+    assert beside.find("zebra crossing") is not None
+    assert beside.find("other") is None
+
+
+def test_probabilities_are_taken_as_they_are_and_logits_are_recognized(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+) -> None:
+    save_graph(tmp_path / "net.onnx")
+    with pytest.raises(InputError, match=r"expected probabilities.*are these logits"):
+        teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, activation="none")).feature_map(views_of(image), 0)
+
+
+def test_softmax_holds_at_the_extremes() -> None:
+    logits = np.array([[[1e30, 0.0, -1e30]], [[-3e38, -3e38, -3e38]]], np.float32)
+    np.testing.assert_allclose(softmax(logits, 1e-3), [[[1, 0, 0]], [[1 / 3] * 3]], atol=1e-6)
+
+
+def test_what_does_not_fit_is_one_line(tmp_path: Path, rng: np.random.Generator, image: np.ndarray) -> None:
+    path, table = tmp_path / "net.onnx", words(rng)
+    save_graph(path)
+    with pytest.raises(InputError, match="1 of 96 outputs are not finite"):
+        _nan_teacher(path, table).feature_map(views_of(image), 0)
+    (tmp_path / "classes.json").write_text('["wall", "chair"]')
+    with pytest.raises(InputError, match="gives 4 classes, and there are 2 names for them"):
+        teacher_of(path, table).feature_map(views_of(image), 0)
+    (tmp_path / "classes.json").write_text('["wall", "zeppelin", "chair", "table"]')
+    with pytest.raises(InputError, match="'zeppelin'"):
+        teacher_of(path, table)
+    (tmp_path / "classes.json").write_text('{"0": "wall", "2": "chair"}')
+    with pytest.raises(InputError, match="expected a list of names, in the order of the network's classes"):
+        teacher_of(path, table)
+    with pytest.raises(InputError, match="no file says what its classes are called"):
+        SegmenterTeacher(SegmenterConfig(model=str(path)), table)
+    with pytest.raises(InputError, match=r"net.onnx has inputs \['image'\] and outputs \['scores'\], not 'x'"):
+        SegmenterTeacher(SegmenterConfig(model=str(path), onnx=replace(PLAIN, input="x")), table)
+    path.write_bytes(b"no model")
+    with pytest.raises(InputError, match="is no model that onnxruntime reads"):
+        teacher_of(path, table)
+
+
+def _nan_teacher(path: Path, table: TextTable) -> SegmenterTeacher:
+    teacher = teacher_of(path, table)
+    network = teacher._network
+    outputs = network.outputs
+
+    def broken(image: np.ndarray, num_classes: int) -> Any:
+        scores, probable, affine = outputs(image, num_classes)
+        scores[0, 0, 0] = np.nan
+        return scores, probable, affine
+
+    network.outputs = broken  # type: ignore[method-assign]
+    return teacher
+
+
+def test_names_are_read_from_lists_objects_and_lines(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"1": "b", "0": "a"}')
+    (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbfa\r\nb\r\n\r\n")
+    assert read_classes(tmp_path / "a.json") == read_classes(tmp_path / "b.txt") == ("a", "b")
+
+
+def small_segformer() -> Any:
+    config = transformers.SegformerConfig(
+        hidden_sizes=[8, 8, 8, 8],
+        depths=[1, 1, 1, 1],
+        num_attention_heads=[1, 1, 1, 1],
+        decoder_hidden_size=8,
+        id2label=dict(enumerate(NAMES)),
+        label2id={name: row for row, name in enumerate(NAMES)},
+    )
+    return transformers.SegformerForSemanticSegmentation(config)
+
+
+def small_mask2former() -> Any:
+    backbone = transformers.SwinConfig(
+        embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 1, 1], window_size=4, image_size=64,
+        out_features=["stage1", "stage2", "stage3", "stage4"],
+    )  # fmt: skip
+    config = transformers.Mask2FormerConfig(
+        backbone_config=backbone,
+        hidden_dim=32,
+        feature_size=32,
+        mask_feature_size=32,
+        encoder_layers=1,
+        decoder_layers=2,
+        encoder_feedforward_dim=16,
+        dim_feedforward=16,
+        num_attention_heads=2,
+        num_queries=5,
+        id2label=dict(enumerate(NAMES)),
+        label2id={name: row for row, name in enumerate(NAMES)},
+    )
+    return transformers.Mask2FormerForUniversalSegmentation(config)
+
+
+@pytest.mark.parametrize("size", [(40, 64), (64, 48)])
+def test_a_segformer_equals_a_direct_call_of_its_library(
+    tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]
+) -> None:
+    torch.manual_seed(0)
+    model = small_segformer().eval()
+    model.save_pretrained(tmp_path)
+    processor = transformers.SegformerImageProcessorPil(size={"height": 64, "width": 96})
+    processor.save_pretrained(tmp_path)
+    image = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
+    teacher = SegmenterTeacher(SegmenterConfig(model=str(tmp_path)), words(rng))
+    made = teacher.feature_map(views_of(image), 0)
+    with torch.inference_mode():
+        logits = model(**processor(images=image, return_tensors="pt")).logits[0]
+    np.testing.assert_allclose(made.shares, logits.softmax(0).permute(1, 2, 0).numpy(), atol=1e-5)
+    rows, columns = logits.shape[1:]
+    np.testing.assert_allclose(made.grid_from_image, [[columns / size[1], 0, 0], [0, rows / size[0], 0]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(40, 64), (64, 48)])
+def test_a_mask2former_gives_the_semantic_map_of_its_library_without_the_padding(
+    tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]
+) -> None:
+    torch.manual_seed(0)
+    model = small_mask2former().eval()
+    model.save_pretrained(tmp_path)
+    processor = transformers.Mask2FormerImageProcessorPil(size={"shortest_edge": 40, "longest_edge": 80})
+    processor.save_pretrained(tmp_path)
+    image = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
+    made = SegmenterTeacher(SegmenterConfig(model=str(tmp_path)), words(rng)).feature_map(views_of(image), 0)
+    assert made.shares is not None
+    inputs = processor(images=image, return_tensors="pt")
+    with torch.inference_mode():
+        outputs = model(**inputs)
+    classes = outputs.class_queries_logits[0].softmax(-1)[:, :-1]
+    semantic = torch.einsum("qc,qhw->hwc", classes, outputs.masks_queries_logits[0].sigmoid())
+    expected = semantic / semantic.sum(-1, keepdim=True).clamp(min=1)
+    np.testing.assert_allclose(made.shares, expected.numpy(), atol=1e-5)
+    mask = inputs["pixel_mask"][0]
+    height, width = int(mask[:, 0].sum()), int(mask[0].sum())
+    corner = made.grid_from_image @ [size[1], size[0], 1]
+    np.testing.assert_allclose(
+        corner, [width / mask.shape[1] * made.width, height / mask.shape[0] * made.height], rtol=1e-6
+    )

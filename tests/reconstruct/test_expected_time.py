@@ -1,0 +1,117 @@
+"""The time that is announced: the sum of all that is left to do, on the Gaussians that pruning will leave."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from splats import random_gaussians
+from walls import wall_views
+
+from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.seed import seed_from_depth
+from gsencoder.reconstruct import expected_time
+from gsencoder.reconstruct.expected_time import expected_seconds
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, Slopes
+from gsencoder.reconstruct.parameters import parameters_from
+from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.run import ReconstructConfig
+from gsencoder.reconstruct.score import Score, score
+from gsencoder.types import Gaussians
+
+CONFIG = OptimizeConfig(steps=20, sh_degree=0)
+TRAINING, HELD_OUT = [0, 1, 3, 4, 5], [2]
+
+
+def splat() -> Gaussians:
+    """A wall, and as many Gaussians again behind it."""
+    wall = seed_from_depth(wall_views(6, depth=True), voxel=0.2)
+    wall = replace(wall, opacities=np.full(len(wall), 0.99, np.float32), scales=2 * wall.scales)
+    behind = replace(wall, means=wall.means * np.float32(1.3))
+    fields = ("means", "quats", "scales", "opacities", "sh")
+    return Gaussians(**{name: np.concatenate([getattr(wall, name), getattr(behind, name)]) for name in fields})
+
+
+def optimizer(gaussians: Gaussians, at: tuple[float, ...] = (0.3, 0.6, 0.9)) -> Optimizer:
+    photographs = Photographs(wall_views(6, depth=True))
+    adam = RowAdam(parameters_from(gaussians, 0))
+    return Optimizer(adam, photographs, TRAINING, CONFIG, prune=PruneConfig(at=at))
+
+
+class Work:
+    """A clock that counts work instead of seconds."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        slopes, contributing = Optimizer.slopes, Optimizer.contributing
+
+        def timed_slopes(one: Optimizer, view: int, shrink: int) -> Slopes:
+            found = slopes(one, view, shrink)
+            self.now += len(found.rows) / shrink**2
+            return found
+
+        def timed_contributing(one: Optimizer) -> torch.Tensor:
+            self.now += 3 * len(one.raw["means"])
+            return contributing(one)
+
+        def timed_score(one: Optimizer, views: list[int]) -> Score:
+            self.now += 500 * len(views)
+            return score(one, views)
+
+        monkeypatch.setattr(Optimizer, "slopes", timed_slopes)
+        monkeypatch.setattr(Optimizer, "contributing", timed_contributing)
+        monkeypatch.setattr(expected_time, "score", timed_score)
+        monkeypatch.setattr(expected_time.time, "perf_counter", lambda: self.now)
+
+
+def test_what_is_announced_is_the_work_that_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    work, one = Work(monkeypatch), optimizer(splat())
+    announced = expected_seconds(one, HELD_OUT, 3)
+    begun, before = work.now, len(one.raw["means"])
+    while one.step < CONFIG.steps:
+        one.advance()
+    assert len(one.raw["means"]) < 0.7 * before
+    assert announced == pytest.approx(work.now - begun + 3 * 500, rel=0.15)
+
+
+def test_each_kind_of_work_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    work = Work(monkeypatch)
+    one = optimizer(splat(), at=())
+    steps = expected_seconds(one, [], 0)
+    rows = [len(one.slopes(view, 1).rows) for view in TRAINING[:4]]
+    # Two stages: 6 steps of photographs of half the size, and 14 of the full size.
+    assert steps == pytest.approx(np.mean(rows) * (6 / 4 + 14), rel=0.1)
+    assert expected_seconds(one, HELD_OUT, 2) == pytest.approx(steps + 2 * 500)
+    assert expected_seconds(one, HELD_OUT, 0) == pytest.approx(steps)
+    one.step = 10
+    assert expected_seconds(one, [], 0) == pytest.approx(np.mean(rows) * 10, rel=0.1)
+    one.step = 20
+    assert expected_seconds(one, HELD_OUT, 2) == 0
+    assert work.now > 0
+
+
+def test_a_pruning_that_would_leave_nothing_now_is_no_error_before_its_time() -> None:
+    nothing = replace(random_gaussians(50), opacities=np.full(50, 0.003, np.float32))
+    made = np.random.default_rng(0)
+    means = np.column_stack((made.uniform(-1, 1, 50), made.uniform(-1, 1, 50), np.full(50, 3.0)))
+    assert expected_seconds(optimizer(replace(nothing, means=means.astype(np.float32))), HELD_OUT, 2) > 0
+
+
+def test_the_trial_changes_nothing() -> None:
+    one, other = optimizer(splat()), optimizer(splat())
+    assert expected_seconds(one, HELD_OUT, 2) > 0
+    for _ in range(3):
+        one.advance()
+        other.advance()
+    for name, value in one.raw.items():
+        assert torch.equal(value, other.raw[name]), name
+    assert one.exposures is not None
+    assert other.exposures is not None
+    assert torch.equal(one.exposures.maps, other.exposures.maps)
+
+
+def test_validations_are_at_the_ends_and_in_between() -> None:
+    every, ends = ReconstructConfig(validate_every=4), ReconstructConfig(validate_every=0)
+    assert [step for step in range(11) if every.validates_at(step, 10)] == [0, 4, 8, 10]
+    assert [step for step in range(11) if ends.validates_at(step, 10)] == [0, 10]

@@ -1,0 +1,122 @@
+"""Exposures of held-out photographs: predicted where they drift, the mean where they do not, and never looked up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from walls import cameras, wall_views
+
+from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.seed import seed_from_depth
+from gsencoder.reconstruct.exposure import IDENTITY, Exposures, apply_colors
+from gsencoder.reconstruct.exposure_prediction import (
+    camera_weights,
+    map_error,
+    mean_weights,
+    order_weights,
+    predict_exposures,
+)
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.parameters import parameters_from
+from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.report import compare
+from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.score import score
+
+COUNT = 25
+HELD_OUT = np.arange(0, COUNT, 8)
+TRAINING = np.setdiff1d(np.arange(COUNT), HELD_OUT)
+
+
+def exposures(gains: np.ndarray, training: np.ndarray = TRAINING) -> Exposures:
+    """Maps of photographs that are so many times as bright."""
+    maps = torch.from_numpy(gains[training]).float().reshape(-1, 1, 1) * IDENTITY
+    return Exposures(training.tolist(), maps)
+
+
+def test_a_photograph_between_two_is_interpolated_and_one_beyond_them_is_as_the_nearest() -> None:
+    fitted = np.array([2, 3, 7])
+    expected = [[1, 0, 0], [0, 0.75, 0.25], [0, 0.25, 0.75], [0, 0, 1]]
+    np.testing.assert_allclose(order_weights(np.array([0, 4, 6, 9]), fitted), expected)
+    # Those that were fitted are predicted from the others.
+    np.testing.assert_allclose(order_weights(fitted, fitted), [[0, 1, 0], [0.8, 0, 0.2], [0, 1, 0]])
+
+
+def test_no_source_looks_at_the_photograph_that_it_predicts() -> None:
+    centers = np.random.default_rng(0).normal(size=(COUNT, 3))
+    for weights in (
+        mean_weights(TRAINING, TRAINING),
+        order_weights(TRAINING, TRAINING),
+        camera_weights(TRAINING, TRAINING, centers),
+    ):
+        assert not np.diagonal(weights).any()
+        np.testing.assert_allclose(weights.sum(axis=1), 1)
+    centers[5] = centers[4]
+    nearest = camera_weights(np.array([5]), np.array([1, 4, 5]), centers)
+    np.testing.assert_allclose(nearest, [[0.5, 0.5, 0]])
+
+
+def test_the_error_of_maps_is_that_of_colors() -> None:
+    made = torch.Generator().manual_seed(0)
+    one, other = IDENTITY + 0.2 * torch.randn(2, 3, 4, generator=made)
+    colors = torch.rand(100_000, 1, 3, generator=made)
+    expected = (apply_colors(colors, one) - apply_colors(colors, other)).square().mean().sqrt()
+    assert map_error((one - other).unsqueeze(0)) == pytest.approx(float(expected), rel=0.01)
+    assert map_error(torch.stack((one - other, torch.zeros(3, 4)))) == pytest.approx(float(expected) / 2**0.5, rel=0.01)
+
+
+def test_exposures_that_drift_along_the_recording_are_interpolated() -> None:
+    gains = 1 + 0.3 * np.sin(np.arange(COUNT) / 4)
+    found = predict_exposures(exposures(gains), cameras(COUNT), HELD_OUT.tolist())
+    assert found.source == "order"
+    assert found.errors["order"] < 0.3 * found.errors["mean"]
+    relative = gains[HELD_OUT] - gains[TRAINING].mean() + 1
+    # The first and the last photograph have a neighbor on one side alone.
+    np.testing.assert_allclose(found.maps[1:-1, 0, 0], relative[1:-1], atol=0.01)
+    np.testing.assert_allclose(found.maps[:, 0, 0], relative, atol=0.08)
+    assert not found.maps[:, 0, 1:].any()
+
+
+def test_exposures_that_follow_nothing_are_taken_to_be_the_mean() -> None:
+    gains = np.random.default_rng(0).uniform(0.7, 1.4, COUNT)
+    for one in (exposures(gains), exposures(np.ones(COUNT)), exposures(gains, np.array([1, 2]))):
+        found = predict_exposures(one, cameras(COUNT), HELD_OUT.tolist())
+        assert found.source == "mean"
+        torch.testing.assert_close(found.maps, IDENTITY.repeat(len(HELD_OUT), 1, 1))
+    assert predict_exposures(None, cameras(COUNT), [3, 4]).maps.shape == (2, 3, 4)
+    assert predict_exposures(exposures(gains, np.array([1])), cameras(COUNT), []).maps.shape == (0, 3, 4)
+
+
+def test_where_the_order_is_none_the_nearest_cameras_tell() -> None:
+    shuffled = np.random.default_rng(0).permutation(COUNT)
+    gains = (1 + 0.3 * np.sin(np.arange(COUNT) / 4))[shuffled]
+    found = predict_exposures(exposures(gains), cameras(COUNT).select(shuffled), HELD_OUT.tolist())
+    assert found.source == "cameras"
+    np.testing.assert_allclose(found.maps[:, 0, 0], gains[HELD_OUT] - gains[TRAINING].mean() + 1, atol=0.12)
+
+
+def test_scores_and_pictures_are_in_the_exposure_that_is_predicted() -> None:
+    held_out, training = [1, 8], np.array([0, 2, 3, 4, 5, 6, 7, 9])
+    views = wall_views(10, depth=True)
+    assert views.images is not None
+    gains = np.linspace(0.7, 1.3, 10)
+    relative = gains - gains[training].mean() + 1
+    images = [(np.asarray(image) / 1.5).astype(np.uint8) for image in views.images]
+    seeds = seed_from_depth(replace(views, images=images), voxel=0.1)
+    images = [(image * gain).astype(np.uint8) for image, gain in zip(images, relative, strict=True)]
+    photographs = Photographs(replace(views, images=images))
+
+    def fitted(gain: np.ndarray) -> Optimizer:
+        adam = RowAdam(parameters_from(seeds, 0))
+        maps, config = exposures(gain, training).maps, OptimizeConfig(steps=4, sh_degree=0)
+        return Optimizer(adam, photographs, training.tolist(), config, prune=PruneConfig(at=()), exposures=maps)
+
+    drifting, none = fitted(gains), fitted(np.ones(10))
+    scores = [score(one, held_out) for one in (drifting, none)]
+    assert scores[0].psnr > scores[1].psnr + 1
+    assert scores[0].matched_psnr == scores[1].matched_psnr
+    shown = compare(drifting, held_out, matched=False)
+    for each, view in zip(shown, held_out, strict=True):
+        bare = drifting.pictures(view, photographs.at_scale(view), IDENTITY).expected
+        assert each.render.mean() / 255 / float(bare.mean()) == pytest.approx(relative[view], abs=0.01)

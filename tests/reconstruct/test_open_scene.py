@@ -1,0 +1,134 @@
+"""What a reconstruction starts from: poses are taken where there are some, and photographs are placed where not."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from textured_box import box_cameras, box_views, write_box
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.reconstruct import open_scene as opening
+from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
+from gsencoder.reconstruct.open_scene import FRAMES_FOLDER, find_photographed, open_scene
+from gsencoder.reconstruct.sfm import PLACED_FILE, Placed, SfmConfig
+from gsencoder.types import Scene
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for name in ("a.jpg", "b.jpg", ".hidden.jpg"):
+        Image.new("RGB", (8, 6)).save(folder / name)
+    return folder
+
+
+@pytest.fixture
+def posed(tmp_path: Path) -> Path:
+    write_box(tmp_path / "posed", box_views(box_cameras(2, width=32, height=24, focal=22.0)))
+    return tmp_path / "posed"
+
+
+@pytest.fixture
+def work(tmp_path: Path) -> Path:
+    (tmp_path / "work").mkdir()
+    return tmp_path / "work"
+
+
+class Placing:
+    """Stands in for structure from motion, and for the reader of its model."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, missing: tuple[str, ...] = ()) -> None:
+        self.calls: list[tuple[Path, bool]] = []
+        self.images = ""
+        self.earlier: Placed | None = None
+        self.placed = Placed(model=Path("model"), placed=("a.jpg", "b.jpg"), missing=missing, points=9, error=0.5)
+        monkeypatch.setattr(opening, "place_photographs", self.place)
+        monkeypatch.setattr(opening, "load_placement", lambda *_: self.earlier)
+        monkeypatch.setattr(opening, "load_scene", self.load)
+
+    def place(self, pictures: Path, work: Path, sfm: SfmConfig, *, single_camera: bool) -> Placed:
+        self.calls.append((pictures, single_camera))
+        return self.placed
+
+    def load(self, path: Path, *, options: opening.SceneConfig) -> Scene:
+        self.images = options.images
+        return Scene(name=path.name)
+
+
+def test_poses_of_a_scene_are_taken_as_they_are(posed: Path, work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opening, "place_photographs", None)
+    opened = open_scene(posed, work)
+    assert (opened.sfm, opened.photographs, opened.is_video) == (None, None, False)
+    assert opened.scene.views is not None
+    assert len(opened.scene.views) == 2
+    assert opened.seconds == {}
+
+
+def test_photographs_are_placed_by_several_cameras_and_frames_of_a_video_by_one(
+    photographs: Path, work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placing = Placing(monkeypatch)
+    opened = open_scene(photographs, work)
+    assert (opened.sfm, opened.photographs, opened.is_video) == (placing.placed, photographs, False)
+    assert placing.images == str(photographs)
+    assert set(opened.seconds) == {"place"}
+    video = tmp_path / "walk.mp4"
+    video.write_bytes(b"")
+    monkeypatch.setattr(opening, "take_frames", lambda *_, **__: ())
+    opened = open_scene(video, work)
+    assert (opened.sfm, opened.photographs, opened.is_video) == (placing.placed, work / FRAMES_FOLDER, True)
+    assert set(opened.seconds) == {"frames", "place"}
+    assert placing.calls == [(photographs, False), (work / FRAMES_FOLDER, True)]
+
+
+def test_photographs_that_were_placed_before_are_not_placed_again(
+    photographs: Path, work: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placing = Placing(monkeypatch, missing=("c.jpg",))
+    placing.earlier = placing.placed
+    with pytest.warns(SceneWarning, match="1 of 3 photographs could not be placed and are not used: c.jpg"):
+        assert open_scene(photographs, work).seconds == {}
+    assert placing.calls == []
+
+
+def test_a_run_that_was_cut_off_is_not_continued_with_other_poses(
+    photographs: Path, work: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placing = Placing(monkeypatch)
+    (work / CHECKPOINT_FILE).symlink_to("gone")
+    with pytest.raises(
+        InputError, match=f"a run was cut off here, and where its photographs were placed .{PLACED_FILE}"
+    ):
+        open_scene(photographs, work)
+    assert placing.calls == []
+
+
+def test_a_splat_belongs_to_a_world_with_poses(photographs: Path, work: Path) -> None:
+    with pytest.raises(InputError, match=r"photographs: splat=my.ply lies in a world of its own"):
+        open_scene(photographs, work, splat="my.ply")
+
+
+def test_one_scene_at_a_time_is_opened(posed: Path, work: Path, tmp_path: Path) -> None:
+    both = tmp_path / "both"
+    for name in ("one", "two"):
+        shutil.copytree(posed, both / name)
+    with pytest.raises(InputError, match=r"both: holds 2 scenes \(one, two\); give one of them"):
+        open_scene(both, work)
+
+
+def test_videos_and_photographs_are_found_in_folders_and_nothing_that_is_hidden(
+    photographs: Path, posed: Path, tmp_path: Path
+) -> None:
+    for name in ("walk.mp4", ".walk.mp4", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    posed.rename(tmp_path / ".posed")
+    found = find_photographed([str(tmp_path)])
+    assert [path.name for path in found] == ["photographs", "walk.mp4"]
+    # What is given twice is reconstructed once, and a folder of photographs is not looked into.
+    again = find_photographed([str(photographs), str(photographs / ".." / "photographs"), str(tmp_path / "walk.mp4")])
+    assert again == (photographs, tmp_path / "walk.mp4")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="empty"):
+        find_photographed([str(tmp_path / "empty")])
