@@ -4,6 +4,8 @@ numba's parallel loops are not used, since an OpenMP pool aborts a process that 
 loaders do. Work is cut into a fixed number of pieces, so that results do not depend on the number of threads.
 """
 
+import contextlib
+import importlib
 import os
 import sys
 import threading
@@ -65,6 +67,16 @@ def ahead(work: Callable[[int], Result], items: Iterable[int]) -> Iterator[Resul
                 yield current.result()
         if following is not None:
             yield following.result()
+
+
+def import_ahead(module: str) -> None:
+    """Starts to import a module in a thread. Whoever imports it later waits for that, and meets its errors."""
+
+    def load() -> None:
+        with contextlib.suppress(Exception):
+            importlib.import_module(module)
+
+    threading.Thread(target=load).start()
 
 
 def even_cuts(starts: Int64[np.ndarray, " n_plus_1"]) -> Int64[np.ndarray, " pieces_plus_1"]:
