@@ -31,6 +31,7 @@ class Score(NamedTuple):
         seen_psnr: in dB, of those of them that some fitted photograph shows too; None where no sensor tells.
         seen_ssim: structural similarity of the same.
         seen: share of the pixels that are such.
+        floating: mean opacity where held-out photographs show that nothing is there; None where none shows that.
     """
 
     psnr: float
@@ -39,6 +40,7 @@ class Score(NamedTuple):
     seen_psnr: float | None = None
     seen_ssim: float | None = None
     seen: float | None = None
+    floating: float | None = None
 
 
 def split(count: int, every: int) -> tuple[list[int], list[int]]:
@@ -127,7 +129,7 @@ def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Te
         seen: what `covisible_pixels` found; a view of which nothing is seen, or its edges alone, in which no window of
             SSIM has its middle, counts in the whole pictures alone.
     """
-    complete, covisible, shares = [], [], []
+    complete, covisible, shares, floating = [], [], [], []
     for view in views:
         photo = optimizer.photographs.at_scale(view)
         picture = optimizer.picture(view, photo)
@@ -135,12 +137,16 @@ def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Te
         complete.append(
             (psnr(picture, photo.image, photo.mask), float(ssim(picture, photo.image, photo.mask)), matched)
         )
+        if photo.empty is not None and photo.empty.any():
+            floating.append(float(optimizer.opacity(view, photo)[photo.empty].mean()))
         if view in seen:
             mask = seen[view] if photo.mask is None else seen[view] & photo.mask
             shares.append(float(mask.float().mean()))
             if inner(mask).any():
                 covisible.append((psnr(picture, photo.image, mask), float(ssim(picture, photo.image, mask))))
-    scores = Score(*(float(mean) for mean in np.mean(complete, axis=0)))
+    scores = Score(
+        *(float(mean) for mean in np.mean(complete, axis=0)), floating=float(np.mean(floating)) if floating else None
+    )
     if not covisible:
         return scores
     seen_psnr, seen_ssim = (float(mean) for mean in np.mean(covisible, axis=0))

@@ -48,7 +48,8 @@ def scene_table(facts: SceneFacts) -> Table:
         if depth.sensor:
             table.add_row("depth sensor", f"not registered in the files: {depth.sensor}; carried over on load")
     if facts.masks:
-        table.add_row("masks", "yes")
+        empty = "" if facts.empty is None else f"; {facts.empty:.0%} of the pixels show that nothing is there"
+        table.add_row("masks", f"yes{empty}")
     if facts.points:
         table.add_row("points", f"{facts.points:,} of structure from motion")
     if facts.objects:

@@ -80,7 +80,7 @@ def seeds_of_photographs(
     points = triangulation.points
     cameras = views.cameras
     rough = np.empty((0, 3), np.float32)
-    if covered_share(cameras, range(len(cameras)), points) < MIN_COVERAGE:
+    if covered_share(photographs, rows, points) < MIN_COVERAGE:
         rough = _rough_points(photographs, rows, cameras, track)
     dense = densify(
         photographs,
