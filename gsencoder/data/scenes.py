@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -21,8 +22,10 @@ from gsencoder.data.readers.images import (
     ImageFiles,
     InstanceFiles,
     PixelGrid,
+    is_deep_grey,
     picture_info,
     picture_size,
+    read_integers,
 )
 from gsencoder.data.readers.layouts import ReadOptions, describe_layouts, layout_of, read_transforms_file
 from gsencoder.data.readers.masks import EmptyFiles, MaskFiles
@@ -42,6 +45,8 @@ from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.poses import invert_rigid, move_origin
 
 FEW_CAMERAS = 8
+FEWEST_STEPS = 64
+"""Integer depth images whose largest value is smaller have lost most of what was measured."""
 MEASURED = 0.05
 """Where depth was measured on a larger share of it, what looks like a background is a wall."""
 
@@ -404,6 +409,7 @@ def make_views(
         empty=EmptyFiles(masks, grids, remaps, outlined, background) if has_outlines else None,
         instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
     )
+    _warn_of_odd_files(posed.source, chosen)
     if background is not None:
         if _is_measured(views):
             return make_views(posed, max_views=max_views, image_scale=image_scale)
@@ -412,6 +418,29 @@ def make_views(
             "and taken for empty space (data.background=none uses it)"
         )
     return views, origin
+
+
+def _warn_of_odd_files(source: str, images: Sequence[PosedImage]) -> None:
+    """Warns if photographs look like depth images, or depth images like meters in integers; one file of each is
+    looked at."""
+    middle = images[len(images) // 2]
+    if is_deep_grey(middle.image):
+        _warn(
+            f"{source}: {middle.image.name} has one channel of 16 bits, as depth images have; is it listed as a "
+            "photograph by mistake?"
+        )
+    depths = [image.depth for image in images if image.depth is not None and image.depth.suffix.lower() != ".npy"]
+    if depths:
+        file = depths[len(depths) // 2]
+        largest = 0
+        # A file that cannot be read is an error when the depth of its view is.
+        with suppress(InputError):
+            largest = int(read_integers(file, "depth", wide=True).max(initial=0))
+        if 0 < largest < FEWEST_STEPS:
+            _warn(
+                f"{source}: {file.name} holds depths of at most {largest} steps; if these are meters, the rest was "
+                "lost when they were saved as integers: save millimeters in 16 bits, or floating-point numbers as .npy"
+            )
 
 
 def _is_fisheye(image: PosedImage) -> bool:

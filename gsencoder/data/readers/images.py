@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 PIXEL_LIMIT = 80_000_000
 """Pictures of more pixels are refused before they are decoded (Pillow's own warning starts a little above this)."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
+DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")
+"""Pillow's modes of pictures with one channel of more than 8 bits."""
 Array = TypeVar("Array", bound=np.ndarray)
 
 
@@ -119,6 +121,16 @@ def picture_info(path: Path) -> tuple[tuple[int, int], bool]:
             raise InputError(f"{path}: not a readable picture ({_brief(error)})") from error
 
 
+def is_deep_grey(path: Path) -> bool:
+    """Whether a picture has one channel of 16 bits, as depth images have, from the header alone.
+
+    Raises:
+        InputError: unreadable.
+    """
+    with _open(path) as picture:
+        return picture.mode in DEEP_GREY
+
+
 def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
     """Color (composited over black) and alpha, None where the file has none.
 
@@ -181,7 +193,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
 def read_integers(path: Path, what: str, *, wide: bool) -> np.ndarray:
     """A single-channel integer PNG [H, W], int32; `wide` asks for more than 8 bits, as depth in millimetres has."""
     with _open(path) as opened:
-        allowed = ("I;16", "I;16B", "I;16L", "I") + (() if wide else ("L", "P", "1"))
+        allowed = DEEP_GREY + (() if wide else ("L", "P", "1"))
         if opened.mode not in allowed:
             kind = "16-bit" if wide else "8- or 16-bit"
             raise InputError(f"{path}: {what} must be a {kind} picture with one channel, got mode {opened.mode}")
