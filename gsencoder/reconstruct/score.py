@@ -144,9 +144,9 @@ def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Te
             shares.append(float(mask.float().mean()))
             if inner(mask).any():
                 covisible.append((psnr(picture, photo.image, mask), float(ssim(picture, photo.image, mask))))
-    scores = Score(
-        *(float(mean) for mean in np.mean(complete, axis=0)), floating=float(np.mean(floating)) if floating else None
-    )
+    overall, ssims, matched = (float(mean) for mean in np.mean(complete, axis=0))
+    empty = float(np.mean(floating)) if floating else None
+    scores = Score(psnr=overall, ssim=ssims, matched_psnr=matched, floating=empty)
     if not covisible:
         return scores
     seen_psnr, seen_ssim = (float(mean) for mean in np.mean(covisible, axis=0))

@@ -54,7 +54,7 @@ def test_the_loss_is_the_opacity_over_empty_pixels() -> None:
     assert not alpha.grad[EMPTY_ABOVE:].any()
     assert "empty" not in losses_of(raster, photo, ssim_weight=0.0, depth_weight=0.0, empty_weight=0.0)
     assert "empty" not in losses_of(
-        raster, replace(photo, empty=None), ssim_weight=0.0, depth_weight=0.0, empty_weight=1
+        raster, replace(photo, empty=None), ssim_weight=0.0, depth_weight=0.0, empty_weight=1.0
     )
 
 
