@@ -1,6 +1,7 @@
 """The photographs that a reconstruction is fitted to, in memory, downscaled on demand."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha1
 
@@ -59,7 +60,10 @@ class Photographs:
             raise InputError("the scene has cameras but no photographs")
         self.cameras: Cameras = views.cameras
         self.names = views.names
-        self._images, self._masks, self._empty, self._depths = [], [], [], []
+        self._images: list[Tensor] = []
+        self._masks: list[Tensor | None] = []
+        self._empty: list[Tensor | None] = []
+        self._depths: list[Tensor | None] = []
         for view in track(range(len(views)), "reading photographs"):
             self._images.append(torch.from_numpy(np.ascontiguousarray(views.images[view])))
             mask = None if views.masks is None else torch.from_numpy(np.ascontiguousarray(views.masks[view]))
@@ -75,7 +79,7 @@ class Photographs:
         """A digest of photographs, masks, depths and poses."""
         digest = sha1()
         arrays = [getattr(self.cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights")]
-        lists = [self._images, self._masks, self._depths]
+        lists: list[Sequence[Tensor | None]] = [self._images, self._masks, self._depths]
         if any(empty is not None for empty in self._empty):
             lists.append(self._empty)
         for part in itertools.chain(*lists):
