@@ -1,5 +1,7 @@
 """The photographs that a reconstruction is fitted to, in memory, downscaled on demand."""
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha1
 
@@ -20,6 +22,7 @@ class ScaledPhotograph:
     Attributes:
         image: RGB in [0, 1].
         mask: pixels to look at; None = all.
+        empty: pixels in which nothing is to be seen; None = nothing is known to be empty.
         depth: z in world units, 0 = unknown; None where there is no sensor.
         K: intrinsics at this size, in pixels.
     """
@@ -28,6 +31,7 @@ class ScaledPhotograph:
     mask: Bool[Tensor, "H W"] | None
     depth: Float[Tensor, "H W"] | None
     K: Float[Tensor, "3 3"]
+    empty: Bool[Tensor, "H W"] | None = None
 
     @property
     def width(self) -> int:
@@ -56,11 +60,16 @@ class Photographs:
             raise InputError("the scene has cameras but no photographs")
         self.cameras: Cameras = views.cameras
         self.names = views.names
-        self._images, self._masks, self._depths = [], [], []
+        self._images: list[Tensor] = []
+        self._masks: list[Tensor | None] = []
+        self._empty: list[Tensor | None] = []
+        self._depths: list[Tensor | None] = []
         for view in track(range(len(views)), "reading photographs"):
             self._images.append(torch.from_numpy(np.ascontiguousarray(views.images[view])))
             mask = None if views.masks is None else torch.from_numpy(np.ascontiguousarray(views.masks[view]))
             self._masks.append(None if mask is None or bool(mask.all()) else mask)
+            empty = None if views.empty is None else torch.from_numpy(np.ascontiguousarray(views.empty[view]))
+            self._empty.append(None if empty is None or not bool(empty.any()) else empty)
             self._depths.append(None if views.depths is None else torch.from_numpy(views.depths[view].copy()))
 
     def __len__(self) -> int:
@@ -70,9 +79,12 @@ class Photographs:
         """A digest of photographs, masks, depths and poses."""
         digest = sha1()
         arrays = [getattr(self.cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights")]
-        for part in (*self._images, *self._masks, *self._depths):
+        lists: list[Sequence[Tensor | None]] = [self._images, self._masks, self._depths]
+        if any(empty is not None for empty in self._empty):
+            lists.append(self._empty)
+        for part in itertools.chain(*lists):
             arrays.append(np.empty(0) if part is None else part.numpy())
-        for name, array in zip((*"ptwh", *3 * self.names), arrays, strict=True):
+        for name, array in zip((*"ptwh", *len(lists) * self.names), arrays, strict=True):
             digest.update(f"{name}{array.shape}{array.dtype}".encode())
             digest.update(np.ascontiguousarray(array).data)
         return digest.hexdigest()[:16]
@@ -81,21 +93,29 @@ class Photographs:
         """Pixels of a photograph that count; None where all do."""
         return self._masks[view]
 
+    def empty(self, view: int) -> Bool[Tensor, "H W"] | None:
+        """Pixels of a photograph in which nothing is to be seen; None where nothing is known to be empty."""
+        return self._empty[view]
+
     def at_scale(self, view: int, shrink: int = 1) -> ScaledPhotograph:
         """A view; each of its pixels stands for `shrink` × `shrink` of the photograph's.
 
-        Colors are averaged. A pixel is looked at if all it covers is, and its depth is known if all it covers
-        differ by less than 5 %. Lines and columns that do not fill a pixel are left out.
+        Colors are averaged. A pixel is looked at, or empty, if all it covers is, and its depth is known if all it
+        covers differ by less than 5 %. Lines and columns that do not fill a pixel are left out.
         """
         image = self._images[view].float() / 255
-        mask, depth = self._masks[view], self._depths[view]
+        mask, empty, depth = self._masks[view], self._empty[view], self._depths[view]
         K = torch.from_numpy(self.cameras.Ks[view].copy())
         if shrink > 1:
             image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()
-            if mask is not None:
-                mask = torch.nn.functional.avg_pool2d(mask.float()[None], shrink)[0] > 1 - 1e-6
+            mask, empty = (None if part is None else _all_of(part, shrink) for part in (mask, empty))
             if depth is not None:
                 far, close = (torch.nn.functional.max_pool2d(sign * depth[None], shrink)[0] for sign in (1, -1))
                 depth = torch.where((far + close <= 0.05 * far) & (close < 0), (far - close) / 2, 0)
             K[:2] /= shrink
-        return ScaledPhotograph(image=image, mask=mask, depth=depth, K=K)
+        return ScaledPhotograph(image=image, mask=mask, empty=empty, depth=depth, K=K)
+
+
+def _all_of(pixels: Bool[Tensor, "H W"], shrink: int) -> Bool[Tensor, "h w"]:
+    """For each block of pixels whether all are True."""
+    return torch.nn.functional.avg_pool2d(pixels.float()[None], shrink)[0] > 1 - 1e-6

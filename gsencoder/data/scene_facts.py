@@ -9,10 +9,12 @@ import numpy as np
 from gsencoder.core.even_indices import even_indices
 from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.up import Up, up_of_scene
-from gsencoder.types import Scene
+from gsencoder.types import Scene, Views
 
 MAX_DEPTH_IMAGES = 24
 """So many depth images, evenly spaced, are read for their coverage and range."""
+MAX_MASKS = 8
+"""So many photographs, evenly spaced, are asked where they are empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +50,7 @@ class SceneFacts:
         spread: extent of the camera centers along the world's axes, units.
         depth: None where there is none.
         masks: whether there are any.
+        empty: share of the pixels that show that nothing is there; None where nothing says so.
         points: of structure from motion.
         objects: labeled ones.
         metres_per_unit: None where unknown.
@@ -64,6 +67,7 @@ class SceneFacts:
     spread: tuple[float, float, float]
     depth: DepthFacts | None
     masks: bool
+    empty: float | None
     points: int
     objects: int
     metres_per_unit: float | None
@@ -91,6 +95,7 @@ class SceneFacts:
                 "sensor": depth.sensor,
             },
             "masks": self.masks,
+            "empty": self.empty,
             "points": self.points,
             "objects": self.objects,
             "metres_per_unit": self.metres_per_unit,
@@ -131,12 +136,20 @@ def scene_facts(scene: Scene, posed: PosedImages, layout: str) -> SceneFacts:
         spread=(float(extent[0]), float(extent[1]), float(extent[2])),
         depth=_depth_facts(scene, posed),
         masks=views.masks is not None,
+        empty=_empty_share(views),
         points=0 if scene.sfm_points is None else len(scene.sfm_points),
         objects=len(scene.objects),
         metres_per_unit=scene.metres_per_unit,
         up=up,
         missing=_missing(scene, up),
     )
+
+
+def _empty_share(views: Views) -> float | None:
+    if views.empty is None:
+        return None
+    rows = even_indices(len(views), MAX_MASKS)
+    return float(np.mean([views.empty[int(row)].mean() for row in rows]))
 
 
 def _depth_facts(scene: Scene, posed: PosedImages) -> DepthFacts | None:

@@ -3,14 +3,17 @@
 import math
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.even_indices import even_indices
+from gsencoder.data.readers.background import find_background
 from gsencoder.data.readers.frames import pinhole_of
 from gsencoder.data.readers.images import (
     DepthFiles,
@@ -18,12 +21,14 @@ from gsencoder.data.readers.images import (
     DepthSensor,
     ImageFiles,
     InstanceFiles,
-    MaskFiles,
     PixelGrid,
+    is_deep_grey,
     picture_info,
     picture_size,
+    read_integers,
 )
 from gsencoder.data.readers.layouts import ReadOptions, describe_layouts, layout_of, read_transforms_file
+from gsencoder.data.readers.masks import EmptyFiles, MaskFiles
 from gsencoder.data.readers.objects_json import read_objects
 from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin, rigid_pose
 from gsencoder.data.readers.scene_splat import (
@@ -40,6 +45,10 @@ from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.poses import invert_rigid, move_origin
 
 FEW_CAMERAS = 8
+FEWEST_STEPS = 64
+"""Integer depth images whose largest value is smaller have lost most of what was measured."""
+MEASURED = 0.05
+"""Where depth was measured on a larger share of it, what looks like a background is a wall."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +78,13 @@ class SceneConfig:
     images: str = field(
         default="", metadata={"help": "folder of the photographs of a COLMAP model; empty = images/ beside the model"}
     )
+    background: Literal["auto", "none"] = field(
+        default="auto",
+        metadata={
+            "help": "auto = a background of one color, around the object in nearly all photographs, is masked and "
+            "taken for empty space; none = photographs are used as they are (transparency is masked in any case)"
+        },
+    )
     intrinsics: tuple[float, float, float, float] | None = field(
         default=None,
         metadata={"help": "fx, fy, cx, cy of the photographs, pixels, no distortion; empty = those of the files"},
@@ -96,6 +112,8 @@ class SceneConfig:
                 raise InputError(f"{name}: expected a positive number, got {value}")
         if self.up is not None and not 1e-6 < math.hypot(*self.up) < 1e6:
             raise InputError(f"up: expected three finite numbers that are not all zero, got {list(self.up)}")
+        if self.background not in ("auto", "none"):
+            raise InputError(f"background: expected auto or none, got {self.background!r}")
         if self.depth_from_color is not None and len(self.depth_from_color) not in (12, 16):
             raise InputError(f"depth_from_color: expected 12 or 16 numbers, got {len(self.depth_from_color)}")
 
@@ -117,10 +135,13 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
 
     Returns:
         A scene with views, or with Gaussians only, or both. `views.masks` exists if there are mask files,
-        transparency, or pinhole pixels that the distorted picture does not cover.
+        transparency, a background of one color, or pinhole pixels that the distorted picture does not cover.
 
     Raises:
         InputError: no scene is recognized, no view is left, or a file is wrong.
+
+    Warns:
+        SceneWarning: a background of one color is masked.
     """
     given = Path(path)
     try:
@@ -144,7 +165,12 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
             up=_unit(options.up),
             folder=folder,
         )
-    views, origin = make_views(posed, max_views=options.max_views, image_scale=options.image_scale)
+    views, origin = make_views(
+        posed,
+        max_views=options.max_views,
+        image_scale=options.image_scale,
+        mask_background=options.background == "auto",
+    )
     gaussians = load_splat(file_of_scene("splat", splat, folder), origin=origin) if splat is not None else None
     if splat is None:
         warn_of_unused_splat(folder)
@@ -322,9 +348,15 @@ def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
 
 
 def make_views(
-    posed: PosedImages, *, max_views: int = 0, image_scale: float = 1.0
+    posed: PosedImages, *, max_views: int = 0, image_scale: float = 1.0, mask_background: bool = False
 ) -> tuple[Views, Float64[np.ndarray, "3"]]:
     """Cameras without distortion and lazy pictures, and the origin that was subtracted from the cameras.
+
+    Args:
+        posed: views as their files describe them.
+        max_views: see SceneConfig.
+        image_scale: see SceneConfig.
+        mask_background: whether a background of one color is looked for, and masked with a warning.
 
     Raises:
         InputError: no picture, a picture or depth of the wrong size, a camera that cannot be undistorted.
@@ -361,6 +393,11 @@ def make_views(
     masks = [image.mask for image in chosen]
     instances = [image.instance for image in chosen]
     partial = _have_empty_pixels(list({(grid.pinhole, grid.source): grid for grid in grids}), remaps)
+    background = None
+    if mask_background and not _any(masks) and not _any(transparent) and not any(map(_is_fisheye, chosen)):
+        background = find_background([image.image for image in chosen])
+    outlined = transparent if background is None else [image.image for image in chosen]
+    has_outlines = _any(outlined)
     views = Views(
         cameras=cameras,
         names=tuple(image.name for image in chosen),
@@ -368,10 +405,56 @@ def make_views(
         depths=DepthFiles(depths, depth_grids, remaps, [_depth_sensor(image) for image in chosen])
         if _any(depths)
         else None,
-        masks=MaskFiles(masks, grids, remaps, transparent) if _any(masks) or _any(transparent) or partial else None,
+        masks=MaskFiles(masks, grids, remaps, outlined, background) if _any(masks) or has_outlines or partial else None,
+        empty=EmptyFiles(masks, grids, remaps, outlined, background) if has_outlines else None,
         instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
     )
+    _warn_of_odd_files(posed.source, chosen)
+    if background is not None:
+        if _is_measured(views):
+            return make_views(posed, max_views=max_views, image_scale=image_scale)
+        _warn(
+            f"{posed.source}: the photographs have a background of one color ({background.describe()}); it is masked "
+            "and taken for empty space (data.background=none uses it)"
+        )
     return views, origin
+
+
+def _warn_of_odd_files(source: str, images: Sequence[PosedImage]) -> None:
+    """Warns if photographs look like depth images, or depth images like meters in integers; one file of each is
+    looked at."""
+    middle = images[len(images) // 2]
+    if is_deep_grey(middle.image):
+        _warn(
+            f"{source}: {middle.image.name} has one channel of 16 bits, as depth images have; is it listed as a "
+            "photograph by mistake?"
+        )
+    depths = [image.depth for image in images if image.depth is not None and image.depth.suffix.lower() != ".npy"]
+    if depths:
+        file = depths[len(depths) // 2]
+        largest = 0
+        # A file that cannot be read is an error when the depth of its view is.
+        with suppress(InputError):
+            largest = int(read_integers(file, "depth", wide=True).max(initial=0))
+        if 0 < largest < FEWEST_STEPS:
+            _warn(
+                f"{source}: {file.name} holds depths of at most {largest} steps; if these are meters, the rest was "
+                "lost when they were saved as integers: save millimeters in 16 bits, or floating-point numbers as .npy"
+            )
+
+
+def _is_fisheye(image: PosedImage) -> bool:
+    """Whether the picture may be a disc in a black frame."""
+    return "FISHEYE" in image.camera.model
+
+
+def _is_measured(views: Views) -> bool:
+    """Whether a sensor saw surfaces where the background is."""
+    if views.depths is None or views.empty is None:
+        return False
+    rows = even_indices(len(views), 4)
+    shares = [float((views.depths[int(row)][views.empty[int(row)]] > 0).mean()) for row in rows]
+    return float(np.nan_to_num(shares).mean()) > MEASURED
 
 
 def _depth_sensor(image: PosedImage) -> DepthSensor:

@@ -16,7 +16,6 @@ from jaxtyping import Float, Float64
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.data.check.depth_agreement import SAMPLES, depth_views
-from gsencoder.data.seeding.depth import surface_pixels
 from gsencoder.types import Cameras, Gaussians, Scene, Views
 from gsencoder.types.cameras import unproject_points
 from gsencoder.types.poses import invert_rigid, transform
@@ -129,6 +128,9 @@ def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfac
         limit: largest number of views to look at, evenly spaced.
         seed: of the choice of samples.
     """
+    # Its kernels load numba, which a scene that states its up does without.
+    from gsencoder.data.seeding.depth import surface_pixels
+
     depth = depth_views(views, even_indices(len(views), limit), seed=seed)
     made = np.random.default_rng(seed)
     world_from_cam = invert_rigid(depth.cam_from_world)

@@ -96,6 +96,10 @@ def load_state(
         # Runs of earlier versions fitted photographs as they were.
         if "optimize" in earlier:
             earlier["optimize"] = {"exposure": False, **earlier["optimize"]}
+        # What they would have taken for empty shows in the digest of the photographs.
+        for section, option in (("optimize", "empty_weight"), ("data", "background")):
+            if section in earlier and option in settings.get(section, {}):
+                earlier[section] = {option: settings[section][option], **earlier[section]}
         if earlier != settings:
             raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
         step, adam_steps = file.value("step", int), file.value("adam_steps", int)

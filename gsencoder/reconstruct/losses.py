@@ -1,4 +1,4 @@
-"""The photometric loss of reconstruction, L1 + D-SSIM, and a depth term where depth was measured."""
+"""The photometric loss of reconstruction, L1 + D-SSIM, and terms for measured depth and for space known to be empty."""
 
 import torch
 from jaxtyping import Float
@@ -10,15 +10,17 @@ from gsencoder.render.rasterize import Raster
 
 
 def losses_of(
-    raster: Raster, photo: ScaledPhotograph, *, ssim_weight: float, depth_weight: float
+    raster: Raster, photo: ScaledPhotograph, *, ssim_weight: float, depth_weight: float, empty_weight: float = 0.0
 ) -> dict[str, Float[Tensor, ""]]:
-    """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, and the relative error of depth where it is known.
+    """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, the relative error of depth where it is known, and the
+    opacity where the photograph shows that nothing is there.
 
     Args:
         raster: a render of the view.
         photo: the photograph, with its mask and depth.
         ssim_weight: λ.
         depth_weight: of the depth term.
+        empty_weight: of the opacity, which is summed as L1 is, per pixel of the mask.
 
     Returns:
         The weighted terms by name; a term of weight 0 is left out, except L1.
@@ -36,6 +38,10 @@ def losses_of(
     losses["l1"] = (1 - ssim_weight) * (rgb - image).abs().mean() / share
     if ssim_weight:
         losses["ssim"] = ssim_weight * (1 - ssim(rgb, image)) / share
+    if empty_weight and photo.empty is not None:
+        # The mask alone would let anything float there: what is masked has no gradient.
+        empty = photo.empty.to(rgb.device)
+        losses["empty"] = empty_weight * torch.where(empty, raster.alpha, 0).mean() / share
     if depth_weight and photo.depth is not None:
         depth = photo.depth.to(rgb.device)
         known = (depth > 0) & (raster.alpha.detach() > 0.5)

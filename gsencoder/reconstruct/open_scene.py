@@ -131,7 +131,8 @@ def open_scene(
     if placed.missing:
         warnings.warn(
             f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "
-            f"and are not used: {listed(placed.missing)}",
+            f"and are not used: {listed(placed.missing)}; each should show much of what another one shows, from some "
+            "20° aside at most",
             SceneWarning,
             stacklevel=2,
         )

@@ -52,6 +52,12 @@ class OptimizeConfig:
     depth_weight: float = field(
         default=0.5, metadata={"help": "of the relative error of depth, where a sensor measured it"}
     )
+    empty_weight: float = field(
+        default=0.5,
+        metadata={
+            "help": "of the opacity where transparency, or a background of one color, says that nothing is there"
+        },
+    )
     means_rate: float = field(default=3e-4, metadata={"help": "learning rate of positions, times the scene's size"})
     means_final: float = field(default=0.01, metadata={"help": "share of that rate which is left at the end"})
     leash: float = field(
@@ -91,7 +97,7 @@ class OptimizeConfig:
             raise InputError(f"means_final: expected a share above 0, up to 1, got {self.means_final}")
         if not 0 <= self.seed < 2**63:
             raise InputError(f"seed: expected 0 or more, got {self.seed}")
-        limits = {"sh_every": 1.0, "depth_weight": 100.0, "leash": 1e6}
+        limits = {"sh_every": 1.0, "depth_weight": 100.0, "empty_weight": 100.0, "leash": 1e6}
         limits |= dict.fromkeys((field.name for field in fields(self) if field.name.endswith("_rate")), MAX_RATE)
         for name, limit in limits.items():
             if not 0 <= getattr(self, name) <= limit:
@@ -255,7 +261,8 @@ class Optimizer:
         raster, rows, seen, colors = self._exposed(view, photo)
         if not len(rows):
             return Slopes({}, rows, {}, colors)
-        losses = losses_of(raster, photo, ssim_weight=self.config.ssim_weight, depth_weight=self.config.depth_weight)
+        weights = {name: getattr(self.config, name) for name in ("ssim_weight", "depth_weight", "empty_weight")}
+        losses = losses_of(raster, photo, **weights)
         total = torch.stack([*losses.values()]).sum()
         total.backward()
         grads = {name: value.grad for name, value in seen.items() if value.grad is not None}
@@ -360,3 +367,8 @@ class Optimizer:
         raster = self._look(view, photo, self.config.sh_degree)[0]
         fitted = self._fitted_colors(raster.rgb, raster.alpha, photo)
         return Pictures(*(apply_colors(raster.rgb, one).clamp(0, 1).cpu() for one in (colors, fitted)))
+
+    @torch.no_grad()
+    def opacity(self, view: int, photo: ScaledPhotograph) -> Float[Tensor, "H W"]:
+        """How much of the background a view as it is now hides, in [0, 1]."""
+        return self._look(view, photo, 0)[0].alpha.cpu()

@@ -92,6 +92,8 @@ def describe(row: LogRow) -> str:
     overall = f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}"
     if row["matched_psnr"] - row["psnr"] > MATCHED_GAIN:
         overall = f"{row['matched_psnr']:.2f} dB with exposures matched, {overall} without"
+    if "floating" in row:
+        overall += f", opacity {row['floating']:.3f} in empty space"
     if "seen_psnr" not in row:
         return overall
     return (

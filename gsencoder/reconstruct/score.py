@@ -32,6 +32,7 @@ class Score(NamedTuple):
         seen_psnr: in dB, of those of them that some fitted photograph shows too; None where no sensor tells.
         seen_ssim: structural similarity of the same.
         seen: share of the pixels that are such.
+        floating: mean opacity where held-out photographs show that nothing is there; None where none shows that.
     """
 
     psnr: float
@@ -40,6 +41,7 @@ class Score(NamedTuple):
     seen_psnr: float | None = None
     seen_ssim: float | None = None
     seen: float | None = None
+    floating: float | None = None
 
 
 def split(count: int, every: int) -> tuple[list[int], list[int]]:
@@ -128,19 +130,23 @@ def score(optimizer: Optimizer, views: Sequence[int], seen: Mapping[int, Bool[Te
         seen: what `covisible_pixels` found; a view of which nothing is seen, or its edges alone, in which no window of
             SSIM has its middle, counts in the whole pictures alone.
     """
-    complete, covisible, shares = [], [], []
+    complete, covisible, shares, floating = [], [], [], []
     predicted = predict_exposures(optimizer.exposures, optimizer.photographs.cameras, views)
     for view, colors in zip(views, predicted.maps, strict=True):
         photo = optimizer.photographs.at_scale(view)
         picture, matched = optimizer.pictures(view, photo, colors)
         scores = (psnr(picture, photo.image, photo.mask), float(ssim(picture, photo.image, photo.mask)))
         complete.append((*scores, psnr(matched, photo.image, photo.mask)))
+        if photo.empty is not None and photo.empty.any():
+            floating.append(float(optimizer.opacity(view, photo)[photo.empty].mean()))
         if view in seen:
             mask = seen[view] if photo.mask is None else seen[view] & photo.mask
             shares.append(float(mask.float().mean()))
             if inner(mask).any():
                 covisible.append((psnr(picture, photo.image, mask), float(ssim(picture, photo.image, mask))))
-    means = Score(*(float(mean) for mean in np.mean(complete, axis=0)))
+    overall, ssims, matched_psnr = (float(mean) for mean in np.mean(complete, axis=0))
+    empty = float(np.mean(floating)) if floating else None
+    means = Score(psnr=overall, ssim=ssims, matched_psnr=matched_psnr, floating=empty)
     if not covisible:
         return means
     seen_psnr, seen_ssim = (float(mean) for mean in np.mean(covisible, axis=0))

@@ -26,6 +26,8 @@ BYTES_PER_FEATURE, TYPICAL_FEATURES = 160, 8192
 """In the database: descriptor and place. Photographs seldom have more, whatever is allowed."""
 MAX_EXHAUSTIVE = 150
 """Up to so many photographs all pairs are compared."""
+MAX_THOROUGH, ENOUGH_PLACED = 30, 0.8
+"""Up to so many photographs, of which less than this share could be placed, are looked at once more: thoroughly."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +85,8 @@ def _names_with(folder: Path, suffixes: tuple[str, ...]) -> list[str]:
 def place_photographs(
     folder: Path, work: Path, config: SfmConfig = SfmConfig(), *, single_camera: bool = False
 ) -> Placed:
-    """Finds poses and intrinsics. Every photograph is decoded before.
+    """Finds poses and intrinsics. Every photograph is decoded before. Few photographs that do not fit together are
+    looked at a second time, for features that match from farther aside.
 
     Args:
         folder: of the photographs.
@@ -109,31 +112,34 @@ def place_photographs(
     known = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
     if config.camera not in known:
         raise InputError(f"sfm.camera: expected one of {', '.join(known)}, got {config.camera!r}")
-    database, attempts, model = work / "database.db", work / "attempts", work / "sparse" / "0"
-    for stale in (work / PLACED_FILE, database, attempts, model.parent):
+    attempts, model = work / "attempts", work / "sparse" / "0"
+    for stale in (work / PLACED_FILE, work / "database.db", attempts, model.parent):
         shutil.rmtree(stale, ignore_errors=True)
         stale.unlink(missing_ok=True)
     _check_room(work, len(names), config)
-    attempts.mkdir()
-    try:
-        _find_features(pycolmap, database, folder, names, config, single_camera)
-        _match(pycolmap, database, len(names), config)
-        models = pycolmap.incremental_mapping(database, folder, attempts, options=_mapping(pycolmap))
-    except (RuntimeError, ValueError) as error:
-        said = " ".join(str(error).split())[:160]
-        raise InputError(f"{folder}: pycolmap cannot place these photographs: {said}") from error
+    models: list[Any] = []
+    for thorough in (False, True):
+        attempt = attempts / ("thorough" if thorough else "usual")
+        attempt.mkdir(parents=True)
+        try:
+            models += _map(pycolmap, attempt, folder, names, config, single_camera, thorough)
+        except (RuntimeError, ValueError) as error:
+            said = " ".join(str(error).split())[:160]
+            raise InputError(f"{folder}: pycolmap cannot place these photographs: {said}") from error
+        most = max((each.num_reg_images() for each in models), default=0)
+        if len(names) > MAX_THOROUGH or most >= ENOUGH_PLACED * len(names):
+            break
     if not models:
         raise InputError(
             f"{folder}: none of {len(names)} photographs could be placed: no two show enough of the same from places "
             "that lie apart; take more, with larger overlap, of a scene that holds still and has texture"
         )
-    best: Any = max(models.values(), key=lambda each: (each.num_reg_images(), each.num_points3D()))
+    best: Any = max(models, key=lambda each: (each.num_reg_images(), each.num_points3D()))
     partial = model.with_name("unfinished")
     partial.mkdir(parents=True)
     best.write(partial)
     os.replace(partial, model)
     shutil.rmtree(attempts, ignore_errors=True)
-    database.unlink(missing_ok=True)
     placed = sorted(best.images[number].name for number in best.reg_image_ids())
     summary = {
         "placed": placed,
@@ -225,13 +231,38 @@ def _placed(model: Path, summary: Mapping[str, Any]) -> Placed:
     )
 
 
+def _map(
+    pycolmap: Any,
+    work: Path,
+    folder: Path,
+    names: list[str],
+    config: SfmConfig,
+    single_camera: bool,
+    thorough: bool,
+) -> list[Any]:
+    """The models that COLMAP makes of the photographs, in a folder of their own."""
+    database = work / "database.db"
+    _find_features(pycolmap, database, folder, names, config, single_camera, thorough)
+    _match(pycolmap, database, len(names), config, thorough)
+    models = pycolmap.incremental_mapping(database, folder, work, options=_mapping(pycolmap, thorough))
+    return list(models.values())
+
+
 def _find_features(
-    pycolmap: Any, database: Path, folder: Path, names: list[str], config: SfmConfig, single_camera: bool
+    pycolmap: Any,
+    database: Path,
+    folder: Path,
+    names: list[str],
+    config: SfmConfig,
+    single_camera: bool,
+    thorough: bool,
 ) -> None:
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = config.size
     extraction.use_gpu = False
     extraction.sift.max_num_features = config.features
+    # Features that follow the slant of surfaces match from farther aside, and take several times as long.
+    extraction.sift.estimate_affine_shape = extraction.sift.domain_size_pooling = thorough
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = config.camera
     pycolmap.extract_features(
@@ -245,9 +276,10 @@ def _find_features(
     )
 
 
-def _match(pycolmap: Any, database: Path, count: int, config: SfmConfig) -> None:
+def _match(pycolmap: Any, database: Path, count: int, config: SfmConfig, thorough: bool) -> None:
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
+    matching.guided_matching = thorough
     every = config.pairs == "exhaustive" or (config.pairs == "auto" and count <= MAX_EXHAUSTIVE)
     if every:
         pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
@@ -259,8 +291,12 @@ def _match(pycolmap: Any, database: Path, count: int, config: SfmConfig) -> None
     pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu)
 
 
-def _mapping(pycolmap: Any) -> Any:
+def _mapping(pycolmap: Any, thorough: bool) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
     options.ba_refine_principal_point = False
+    if thorough:
+        # Half of COLMAP's own: few photographs have few matches in common.
+        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = 15, 50
+        options.mapper.abs_pose_min_inlier_ratio = 0.15
     return options

@@ -296,11 +296,11 @@ def _blend_cpu(gaussians: Gaussians, cameras: Cameras, view: int, lattice: Latti
     from gsencoder.render import blend_cpu as cpu
 
     size = int(cameras.widths[view]), int(cameras.heights[view])
-    projected, index = cpu.project(
-        gaussians, cameras.cam_from_world[view], cameras.Ks[view], *size, eps2d=config.eps2d, near=config.near
+    projected, index, z = cpu.project(
+        gaussians, cameras.cam_from_world[view], cameras.Ks[view], *size, lattice, eps2d=config.eps2d, near=config.near
     )
     keep, stop = config.min_weight, config.stop_transmittance
-    crow, col, weight = map(torch.from_numpy, cpu.blend_weights(lattice, projected, index, stop=stop, keep=keep))
+    crow, col, weight = map(torch.from_numpy, cpu.blend_weights(lattice, projected, index, z, stop=stop, keep=keep))
     depths = np.zeros(len(gaussians), np.float32)
-    depths[index] = projected[9]
+    depths[index] = z
     return Blend(crow, col, weight, torch.from_numpy(depths), lattice, config)

@@ -20,8 +20,9 @@ _SCRATCH_KEPT = 1 << 24
 
 @kernel
 @no_type_check
-def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d, near, alpha_min, out, index):
-    """geometry.project of rows [first, last) in one pass; valid rows are packed into out[first:first + count]."""
+def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d, near, lattice, out, index, depths):
+    """geometry.project of rows [first, last) in one pass; valid ones are listed from index[first] on, with depths."""
+    x0, y0, dx, dy = lattice
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     width, height = size
     slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
@@ -31,7 +32,7 @@ def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d,
         mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         z = pose[2, 0] * mx + pose[2, 1] * my + pose[2, 2] * mz + pose[2, 3]
         opacity = np.float64(opacities[i])
-        if not z > near or not opacity > alpha_min:
+        if not z > near or not opacity > ALPHA_MIN:
             continue
         x = pose[0, 0] * mx + pose[0, 1] * my + pose[0, 2] * mz + pose[0, 3]
         y = pose[1, 0] * mx + pose[1, 1] * my + pose[1, 2] * mz + pose[1, 3]
@@ -59,56 +60,67 @@ def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d,
         d1 = row_x[2] * row_y[0] - row_x[0] * row_y[2]
         d2 = row_x[0] * row_y[1] - row_x[1] * row_y[0]
         det = d0 * d0 + d1 * d1 + d2 * d2 + eps2d * (xx + yy) + eps2d * eps2d
-        r2 = 2 * math.log(opacity / alpha_min)
+        r2 = 2 * math.log(opacity / ALPHA_MIN)
         u, v = fx * x / z + cx, fy * y / z + cy
         hu, hv = math.sqrt(r2 * (xx + eps2d)), math.sqrt(r2 * (yy + eps2d))
         if not (u + hu > 0 and u - hu < width and v + hv > 0 and v - hv < height):
             continue
         at = first + count
-        out[0, at], out[1, at], out[2, at], out[3, at] = u, v, hu, hv
-        out[4, at], out[5, at], out[6, at] = (yy + eps2d) / det, -xy / det, (xx + eps2d) / det
-        out[7, at], out[8, at], out[9, at] = r2, opacity, z
-        index[at] = i
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = (u - x0) / dx, (v - y0) / dy, hu / dx, hv / dy
+        out[i, 4], out[i, 6] = (yy + eps2d) / det * (dx * dx), (xx + eps2d) / det * (dy * dy)
+        out[i, 5], out[i, 7], out[i, 8] = -xy / det * (dx * dy), r2, opacity
+        index[at], depths[at] = i, z
         count += 1
     return count
 
 
 def project(
-    gaussians: Gaussians, pose: np.ndarray, K: np.ndarray, width: int, height: int, *, eps2d: float, near: float
-) -> tuple[Float64[np.ndarray, "10 M"], Int32[np.ndarray, " M"]]:
+    gaussians: Gaussians,
+    pose: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    lattice: Lattice,
+    *,
+    eps2d: float,
+    near: float,
+) -> tuple[Float64[np.ndarray, "N 9"], Int32[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
     """geometry.project for the M Gaussians that touch the image, in float64 without temporaries.
 
     Returns:
-        Rows u, v, half width, half height, conic a, b, c, squared radius, opacity, z; and which Gaussians they are.
+        u, v, half width, half height, conic a, b, c, squared radius, opacity in units of the lattice, where rays lie on
+        whole numbers; the Gaussians that touch the image, ascending, whose rows alone are filled; and their depths.
     """
     n = len(gaussians)
-    out, index = np.empty((10, n)), np.empty(n, np.int32)
+    out, index, depths = np.empty((n, 9)), np.empty(n, np.int32), np.empty(n)
     cuts = np.linspace(0, n, PIECES + 1).astype(np.int64)
     pose, K = pose.astype(np.float64), K.astype(np.float64)
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    rays = (lattice.x0, lattice.y0, lattice.dx, lattice.dy)
 
     def work(piece: int) -> int:
-        bounds = (cuts[piece], cuts[piece + 1])
-        return _project(*bounds, *arrays, pose, K, (float(width), float(height)), eps2d, near, ALPHA_MIN, out, index)
+        bounds, size = (cuts[piece], cuts[piece + 1]), (float(width), float(height))
+        return _project(*bounds, *arrays, pose, K, size, eps2d, near, rays, out, index, depths)
 
     counts = parallel(work, range(PIECES))
     keep = [slice(start, start + count) for start, count in zip(cuts[:-1], counts, strict=True)]
-    return np.concatenate([out[:, part] for part in keep], axis=1), np.concatenate([index[part] for part in keep])
+    return out, np.concatenate([index[part] for part in keep]), np.concatenate([depths[part] for part in keep])
 
 
 @kernel
 @no_type_check
-def _bin_tiles(u, v, hu, hv, order, tile, tiles_x, tiles_y):
+def _bin_tiles(gaussians, index, order, tile, tiles_x, tiles_y):
     """Counting sort of (tile, Gaussian) pairs that keeps the depth order within a tile."""
     n = len(order)
     bounds = np.empty((n, 4), np.int32)
     starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
     last_u, last_v = tiles_x * tile - 1, tiles_y * tile - 1
     for k in range(n):
-        g = order[k]
+        line = gaussians[index[k]]
+        u, v, hu, hv = line[0], line[1], line[2], line[3]
         # Bounds are clipped as floats: a Gaussian far outside the image overflows an integer.
-        u0, u1 = max(np.ceil(u[g] - hu[g]), 0.0), min(np.floor(u[g] + hu[g]), float(last_u))
-        v0, v1 = max(np.ceil(v[g] - hv[g]), 0.0), min(np.floor(v[g] + hv[g]), float(last_v))
+        u0, u1 = max(np.ceil(u - hu), 0.0), min(np.floor(u + hu), float(last_u))
+        v0, v1 = max(np.ceil(v - hv), 0.0), min(np.floor(v + hv), float(last_v))
         if u0 > u1 or v0 > v1:
             bounds[k, 0], bounds[k, 1], bounds[k, 2], bounds[k, 3] = 0, -1, 0, -1
             continue
@@ -121,101 +133,106 @@ def _bin_tiles(u, v, hu, hv, order, tile, tiles_x, tiles_y):
         starts[t + 1] += starts[t]
     where = starts[:-1].copy()
     members = np.empty(starts[-1], np.int32)
-    for k in range(n):
+    for k in order:
         for ty in range(bounds[k, 2], bounds[k, 3] + 1):
             for tx in range(bounds[k, 0], bounds[k, 1] + 1):
                 t = ty * tiles_x + tx
-                members[where[t]] = order[k]
+                members[where[t]] = index[k]
                 where[t] += 1
     return starts, members
 
 
 @kernel
 @no_type_check
-def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, rows, cols, weights):
-    """Front-to-back compositing of tiles [first, last): entries (row, Gaussian, weight), depth-ordered in a row.
+def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, counts, rows, cols, weights):
+    """Front-to-back compositing of tiles [first, last): entries (row, Gaussian, weight), depth-ordered in a row, and
+    the number of entries of each row.
 
     Gaussians are the outer loop, so that one that several rays of a patch meet becomes a single entry at once. Along
     a line of rays exp(−quadratic) is a product of two geometric sequences: g(u+1) = g(u)·r(u), r(u+1) = r(u)·q.
     """
     height, width, side, tile, tiles_x = shape
-    all_u, all_v, all_h = gaussians[0], gaussians[1], gaussians[3]
-    all_a, all_b, all_c, all_r2, all_opacity = gaussians[4], gaussians[5], gaussians[6], gaussians[7], gaussians[8]
     cells = tile // side
     cell_of = np.arange(tile) // side
     count = 0
     transmittance = np.empty((tile, tile), np.float64)
-    sums = np.zeros((cells, cells), np.float64)
+    # The first and the last open ray of each line: a Gaussian that only meets others there is passed over.
+    open_from, open_to = np.empty(tile, np.int64), np.empty(tile, np.int64)
+    sums = np.zeros(cells, np.float64)
     share = 1.0 / (side * side)
     for t in range(first, last):
         tile_u, tile_v = (t % tiles_x) * tile, (t // tiles_x) * tile
         end_u, end_v = min(tile, width * side - tile_u), min(tile, height * side - tile_v)
         transmittance[:] = 1.0
+        open_from[:], open_to[:] = 0, end_u - 1
         open_rays = end_u * end_v
         for m in range(starts[t], starts[t + 1]):
-            g = members[m]
             # Entries of one Gaussian in one tile are at most its cells: room is checked here, not at each of them.
             if count + cells * cells > len(rows):
                 more = np.empty(len(rows) + 1024, np.int32)
                 rows, cols = np.concatenate((rows, more)), np.concatenate((cols, more))
                 weights = np.concatenate((weights, np.empty(len(more), np.float32)))
-            a, b, c = all_a[g], all_b[g], all_c[g]
-            gu, gv, limit, opacity = all_u[g] - tile_u, all_v[g] - tile_v, all_r2[g], all_opacity[g]
-            f0, f1 = max(np.ceil(gv - all_h[g]), 0.0), min(np.floor(gv + all_h[g]), float(end_v - 1))
+            g = members[m]
+            gu, gv, half_height = gaussians[g, 0] - tile_u, gaussians[g, 1] - tile_v, gaussians[g, 3]
+            a, b, c = gaussians[g, 4], gaussians[g, 5], gaussians[g, 6]
+            limit, opacity = gaussians[g, 7], gaussians[g, 8]
+            f0, f1 = max(np.ceil(gv - half_height), 0.0), min(np.floor(gv + half_height), float(end_v - 1))
             if f0 > f1:
                 continue
             v0, v1 = int(f0), int(f1)
             inv_a, q = 1.0 / a, math.exp(-a)
-            low_u, high_u = tile, -1
-            for j in range(v0, v1 + 1):
-                dv = j - gv
-                root = b * b * dv * dv - a * (c * dv * dv - limit)
-                if root < 0:
-                    continue
-                half, middle = math.sqrt(root) * inv_a, gu - b * dv * inv_a
-                f0, f1 = max(np.ceil(middle - half), 0.0), min(np.floor(middle + half), float(end_u - 1))
-                if f0 > f1:
-                    continue
-                u0, u1 = int(f0), int(f1)
-                du = u0 - gu
-                value = opacity * math.exp(-0.5 * (a * du * du + c * dv * dv) - b * du * dv)
-                ratio = math.exp(-a * (du + 0.5) - b * dv) if u1 > u0 else 0.0
-                low_u, high_u = min(low_u, u0), max(high_u, u1)
-                row_transmittance = transmittance[j]
-                line = sums[cell_of[j]]
-                row = (tile_v + j) * width + tile_u
-                for i in range(u0, u1 + 1):
-                    alpha = min(value, ALPHA_MAX)
-                    value *= ratio
-                    ratio *= q
-                    before = row_transmittance[i]
-                    # A negative transmittance marks a ray that has stopped.
-                    if alpha < ALPHA_MIN or before < 0:
+            for cj in range(cell_of[v0], cell_of[v1] + 1):
+                low_u, high_u = tile, -1
+                for j in range(max(v0, cj * side), min(v1, cj * side + side - 1) + 1):
+                    if open_from[j] > open_to[j]:
                         continue
-                    after = before * (1.0 - alpha)
-                    if after <= stop:
-                        row_transmittance[i] = -1.0
-                        open_rays -= 1
+                    dv = j - gv
+                    root = b * b * dv * dv - a * (c * dv * dv - limit)
+                    if root < 0:
                         continue
-                    row_transmittance[i] = after
-                    if side > 1:
-                        line[cell_of[i]] += alpha * before
-                    elif alpha * before >= keep:
-                        rows[count] = row + i
+                    half, middle = math.sqrt(root) * inv_a, gu - b * dv * inv_a
+                    f0, f1 = max(np.ceil(middle - half), 0.0), min(np.floor(middle + half), float(open_to[j]))
+                    if f1 < max(f0, float(open_from[j])):
+                        continue
+                    u0, u1 = int(f0), int(f1)
+                    du = u0 - gu
+                    value = opacity * math.exp(-0.5 * (a * du * du + c * dv * dv) - b * du * dv)
+                    ratio = math.exp(-a * (du + 0.5) - b * dv) if u1 > u0 else 0.0
+                    low_u, high_u = min(low_u, u0), max(high_u, u1)
+                    row_transmittance = transmittance[j]
+                    open_before = open_rays
+                    for i in range(u0, u1 + 1):
+                        alpha = min(value, ALPHA_MAX)
+                        value *= ratio
+                        ratio *= q
+                        before = row_transmittance[i]
+                        # A negative transmittance marks a ray that has stopped.
+                        if alpha < ALPHA_MIN or before < 0:
+                            continue
+                        after = before * (1.0 - alpha)
+                        if after <= stop:
+                            row_transmittance[i] = -1.0
+                            open_rays -= 1
+                            continue
+                        row_transmittance[i] = after
+                        sums[cell_of[i]] += alpha * before
+                    if open_rays < open_before:
+                        while open_from[j] <= open_to[j] and row_transmittance[open_from[j]] < 0:
+                            open_from[j] += 1
+                        while open_from[j] <= open_to[j] and row_transmittance[open_to[j]] < 0:
+                            open_to[j] -= 1
+                if high_u < 0:
+                    continue
+                row = (tile_v // side + cj) * width + tile_u // side
+                for ci in range(cell_of[low_u], cell_of[high_u] + 1):
+                    weight = sums[ci] * share
+                    sums[ci] = 0.0
+                    if weight > 0 and weight >= keep:
+                        rows[count] = row + ci
                         cols[count] = g
-                        weights[count] = alpha * before
+                        weights[count] = weight
+                        counts[row + ci] += 1
                         count += 1
-            if side > 1 and high_u >= 0:
-                for cj in range(cell_of[v0], cell_of[v1] + 1):
-                    row = (tile_v // side + cj) * width + tile_u // side
-                    for ci in range(cell_of[low_u], cell_of[high_u] + 1):
-                        weight = sums[cj, ci] * share
-                        sums[cj, ci] = 0.0
-                        if weight > 0 and weight >= keep:
-                            rows[count] = row + ci
-                            cols[count] = g
-                            weights[count] = weight
-                            count += 1
             if open_rays == 0:
                 break
     return rows[:count], cols[:count], weights[:count]
@@ -241,25 +258,29 @@ def _take_scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @kernel
 @no_type_check
-def _count(rows, crow):
-    for e in range(len(rows)):
-        crow[rows[e] + 1] += 1
-
-
-@kernel
-@no_type_check
-def _scatter(rows, cols, weights, index, where, out_cols, out_weights):
+def _scatter(rows, cols, weights, where, out_cols, out_weights):
     for e in range(len(rows)):
         at = where[rows[e]]
         where[rows[e]] = at + 1
-        out_cols[at] = index[cols[e]]
+        out_cols[at] = cols[e]
         out_weights[at] = weights[e]
+
+
+def _stable_order(depths: Float64[np.ndarray, " M"]) -> Int64[np.ndarray, " M"]:
+    """A stable argsort: numpy's unstable one is four times as fast, and then the few equal depths are put in order."""
+    order = np.argsort(depths)
+    same = np.diff(depths[order]) == 0
+    tied = np.flatnonzero(np.append(same, False) | np.append(False, same))
+    rows = np.sort(order[tied])
+    order[tied] = rows[np.argsort(depths[rows], kind="stable")]
+    return order
 
 
 def blend_weights(
     lattice: Lattice,
-    projected: Float64[np.ndarray, "10 M"],
+    gaussians: Float64[np.ndarray, "N 9"],
     index: Int32[np.ndarray, " M"],
+    depths: Float64[np.ndarray, " M"],
     *,
     stop: float,
     keep: float,
@@ -268,42 +289,32 @@ def blend_weights(
 
     Args:
         lattice: where the rays are.
-        projected: Gaussians on the image plane, from `project`.
-        index: which columns of B they are.
+        gaussians: on the image plane, from `project`.
+        index: which of them touch the image.
+        depths: of those.
         stop: transmittance at which a ray ends.
         keep: smallest weight stored.
     """
-    # In lattice units the rays lie on whole numbers, whatever the grid.
-    gaussians = projected.copy()
-    gaussians[0] = (projected[0] - lattice.x0) / lattice.dx
-    gaussians[1] = (projected[1] - lattice.y0) / lattice.dy
-    gaussians[2] /= lattice.dx
-    gaussians[3] /= lattice.dy
-    gaussians[4] *= lattice.dx**2
-    gaussians[5] *= lattice.dx * lattice.dy
-    gaussians[6] *= lattice.dy**2
     tile = lattice.tile
     tiles_x, tiles_y = -(-lattice.width * lattice.side // tile), -(-lattice.height * lattice.side // tile)
-    order = np.argsort(gaussians[9], kind="stable").astype(np.int32)
-    starts, members = _bin_tiles(*gaussians[:4], order, tile, tiles_x, tiles_y)
+    starts, members = _bin_tiles(gaussians, index, _stable_order(depths), tile, tiles_x, tiles_y)
     shape = (lattice.height, lattice.width, lattice.side, tile, tiles_x)
     cuts = even_cuts(starts)
     room = np.concatenate(([0], np.cumsum(_ENTRIES * (tile // lattice.side) ** 2 * np.diff(cuts))))
     scratch = _take_scratch(int(room[-1]))
+    crow = np.zeros(lattice.rows + 1, np.int64)
 
     def work(piece: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         space = (part[room[piece] : room[piece + 1]] for part in scratch)
         bounds = (cuts[piece], cuts[piece + 1])
-        return _blend_tiles(*bounds, starts, members, gaussians, shape, stop, keep, *space)
+        return _blend_tiles(*bounds, starts, members, gaussians, shape, stop, keep, crow[1:], *space)
 
+    # A row belongs to one tile, a tile to one piece: the pieces write to disjoint places.
     pieces = parallel(work, range(PIECES))
-    crow = np.zeros(lattice.rows + 1, np.int64)
-    parallel(lambda piece: _count(pieces[piece][0], crow), range(PIECES))
     np.cumsum(crow, out=crow)
     where = crow[:-1].copy()
     cols, weights = np.empty(crow[-1], np.int32), np.empty(crow[-1], np.float32)
-    # A row belongs to one tile, a tile to one piece: the pieces write to disjoint places.
-    parallel(lambda piece: _scatter(*pieces[piece], index, where, cols, weights), range(PIECES))
+    parallel(lambda piece: _scatter(*pieces[piece], where, cols, weights), range(PIECES))
     if len(scratch[0]) <= _SCRATCH_KEPT:
         _free_scratch.append(scratch)
     return crow, cols, weights

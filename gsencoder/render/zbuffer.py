@@ -43,7 +43,7 @@ def visible_shares(
     rows = np.flatnonzero(opaque)
     if len(rows) > MAX_HIDING:
         # Fewer, larger discs hide the same.
-        rows = np.random.default_rng(0).choice(rows, MAX_HIDING, replace=False)
+        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_HIDING, replace=False))
         growth = math.sqrt(opaque.sum() / MAX_HIDING)
     else:
         growth = 1.0

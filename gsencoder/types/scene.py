@@ -13,6 +13,9 @@ from gsencoder.types.checks import UNIT_TOLERANCE, check_array, check_unit, fail
 from gsencoder.types.features import GaussianFeatures
 from gsencoder.types.gaussians import Gaussians
 
+LAZY = ("images", "depths", "masks", "empty", "instances")
+"""Fields of Views that are sequences with one entry a camera."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Views:
@@ -24,6 +27,8 @@ class Views:
         images: uint8 [H, W, 3] each, RGB; None where there are no pictures.
         depths: float32 [H, W] each, z in world units, 0 = none; None where no sensor depth exists.
         masks: bool [H, W] each, True = use this pixel.
+        empty: bool [H, W] each, True = the photograph shows that nothing is there, as transparency does; such pixels
+            are masked, too.
         instances: int32 [H, W] each, 0 = none.
     """
 
@@ -32,6 +37,7 @@ class Views:
     images: Sequence[UInt8[np.ndarray, "_ _ 3"]] | None = None
     depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None
     masks: Sequence[Bool[np.ndarray, "_ _"]] | None = None
+    empty: Sequence[Bool[np.ndarray, "_ _"]] | None = None
     instances: Sequence[Int32[np.ndarray, "_ _"]] | None = None
 
     def __post_init__(self) -> None:
@@ -39,7 +45,7 @@ class Views:
             fail("Views", "names", f"{len(self.cameras)} names, one a camera", str(len(self.names)))
         if len(set(self.names)) != len(self.names):
             fail("Views", "names", "unique names", f"{len(self.names) - len(set(self.names))} repeated")
-        for name in ("images", "depths", "masks", "instances"):
+        for name in LAZY:
             value = getattr(self, name)
             if value is not None and len(value) != len(self.cameras):
                 fail("Views", name, f"{len(self.cameras)} entries, one a camera", str(len(value)))
@@ -50,10 +56,7 @@ class Views:
     def select(self, views: Sequence[int] | np.ndarray) -> "Views":
         """The views of these rows, in that order; files are still read on access."""
         rows = [int(view) for view in views]
-        lazy = {
-            name: None if (items := getattr(self, name)) is None else _Selected(items, rows)
-            for name in ("images", "depths", "masks", "instances")
-        }
+        lazy = {name: None if (items := getattr(self, name)) is None else _Selected(items, rows) for name in LAZY}
         return Views(cameras=self.cameras.select(rows), names=tuple(self.names[row] for row in rows), **lazy)
 
 

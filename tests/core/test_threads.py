@@ -1,11 +1,13 @@
 """Work in pieces: in order, and within work in pieces."""
 
+import subprocess
+import sys
 import threading
 
 import pytest
 import torch
 
-from gsencoder.core.runtime.threads import parallel
+from gsencoder.core.runtime.threads import ahead, parallel
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -40,3 +42,36 @@ def test_errors_of_a_piece_are_raised() -> None:
 
     with pytest.raises(ValueError, match="piece 3"):
         parallel(work, range(6))
+
+
+def test_work_ahead_comes_in_order_and_one_item_before_it_is_asked_for() -> None:
+    started = [threading.Event() for _ in range(4)]
+
+    def work(item: int) -> tuple[int, int]:
+        started[item].set()
+        return item, threading.get_ident()
+
+    for number, (item, thread) in enumerate(ahead(work, range(4))):
+        assert item == number
+        assert thread != threading.get_ident()
+        assert number == 3 or started[number + 1].wait(10)
+    assert list(ahead(work, range(0))) == []
+
+
+def test_errors_of_work_ahead_are_raised_where_its_result_is_due() -> None:
+    results = ahead(lambda item: 1 // (2 - item), range(4))
+    assert [next(results), next(results)] == [0, 1]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+@pytest.mark.parametrize(("stated", "expected"), [("1", "1"), ("1000", "cores"), ("", "cores"), ("4,2", "cores")])
+def test_without_torch_there_are_as_many_threads_as_the_environment_says(stated: str, expected: str) -> None:
+    code = (
+        "import os, sys\n"
+        f"os.environ['OMP_NUM_THREADS'] = {stated!r}\n"
+        "from gsencoder.core.runtime.threads import thread_count\n"
+        "cores = os.cpu_count()\n"
+        f"sys.exit('torch' in sys.modules or thread_count() != {expected if expected != 'cores' else 'cores'})"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -120,7 +120,7 @@ def test_few_points_on_a_wall_become_many_that_lie_on_it() -> None:
 
 def test_points_that_cover_the_pictures_are_left_alone() -> None:
     points = wall_points(20_000)
-    assert covered_share(cameras(), range(4), points) > 0.95
+    assert covered_share(Photographs(wall_views()), range(4), points) > 0.95
     assert densify(Photographs(wall_views()), range(4), points, np.zeros((len(points), 3), np.uint8), SMALL) is None
 
 

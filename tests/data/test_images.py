@@ -14,13 +14,13 @@ from gsencoder.data.readers.images import (
     DepthSensor,
     ImageFiles,
     InstanceFiles,
-    MaskFiles,
     PixelGrid,
     picture_info,
     picture_size,
     read_integers,
     read_rgba,
 )
+from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
 
 PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))

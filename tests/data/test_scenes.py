@@ -285,3 +285,16 @@ def test_each_scene_has_its_own_splat_and_mesh_before_those_from_here(
         assert seed(load_scene(name), absolute).means[:, 0].mean() == pytest.approx(2.0, abs=0.02)
     with pytest.raises(InputError, match=r"seeds\.mesh=none\.ply: no such file .looked in .*a and from here"):
         seed(load_scene("a"), replace(config, mesh="none.ply"))
+
+
+def test_depth_in_whole_meters_and_depth_for_photographs_are_said(tmp_path: Path) -> None:
+    write_transforms(tmp_path, 3, depth=True)
+    for view in range(3):
+        save(tmp_path / f"depth/{view:03d}.png", np.full((24, 32), 2 + view, np.uint16))
+    with pytest.warns(SceneWarning, match=r"001.png holds depths of at most 3 steps; if these are meters, the rest"):
+        load_scene(tmp_path)
+    for view in range(3):
+        save(tmp_path / f"depth/{view:03d}.png", np.full((24, 32), 900, np.uint16))
+        save(tmp_path / f"images/{view:03d}.png", np.full((24, 32), 900 + view, np.uint16))
+    with pytest.warns(SceneWarning, match=r"001.png has one channel of 16 bits, as depth images have; is it listed"):
+        load_scene(tmp_path)

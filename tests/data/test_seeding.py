@@ -18,7 +18,7 @@ from gsencoder.data.seeding.seed import (
     seed_from_points,
     seed_from_tsdf,
 )
-from gsencoder.data.seeding.surface_grid import SurfaceGrid
+from gsencoder.data.seeding.surface_grid import LAYER, SurfaceGrid
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.types import Cameras, Gaussians, Scene, Views
 
@@ -290,11 +290,25 @@ class TestDepth:
         with pytest.warns(SceneWarning, match=r"1 of 2 views have no usable depth \(first: 'view 1'\)"):
             seed_from_depth(views, voxel=0.05)
 
-    def test_partial_sums_that_overflow_the_buffer_change_nothing(self, monkeypatch):
-        views = make_room(2, views=4, width=80, height=60).views
-        whole = seed_from_depth(views, voxel=0.03)
-        monkeypatch.setattr("gsencoder.data.seeding.surface_grid.MAX_PARTIAL_ROWS", 100)
-        assert np.abs(seed_from_depth(views, voxel=0.03).means - whole.means).max() < 1e-5
+    def test_a_grid_that_has_to_grow_holds_the_sums_of_every_voxel_facing_and_layer(self, rng, monkeypatch):
+        monkeypatch.setattr("gsencoder.data.seeding.surface_grid.MIN_SLOTS", 2)
+        points = rng.uniform(-0.25, 0.25, (3000, 3)).astype(np.float32)
+        normals = rng.standard_normal((3000, 3)).astype(np.float32)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        colors = rng.integers(0, 256, (3000, 3)).astype(np.uint8)
+        grid = SurfaceGrid(0.1, np.zeros(3))
+        for start, stop in ((0, 1), (1, 40), (40, 700), (700, 3000)):
+            grid.add(points[start:stop], normals[start:stop], colors[start:stop])
+        expected = {}
+        for point, normal, color in zip(points, normals, colors, strict=True):
+            place = point / np.float32(0.1)
+            axis = int(np.abs(normal).argmax())
+            layer = np.clip(np.rint(float((place - np.floor(place) - 0.5) @ normal) / LAYER), -4, 3)
+            key = (*np.floor(place).astype(int).tolist(), axis, bool(normal[axis] > 0), int(layer))
+            expected.setdefault(key, []).append([*point, *normal, *color, 1])
+        rows = grid._sums[np.argsort(grid._keys[: grid._rows])]
+        sums = np.array([np.sum(expected[key], axis=0) for key in sorted(expected)])
+        np.testing.assert_allclose(rows, sums, rtol=1e-6, atol=1e-6)
 
 
 def rotation(a: float, b: float, c: float) -> np.ndarray:

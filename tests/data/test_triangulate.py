@@ -132,12 +132,21 @@ def test_a_scene_without_depth_and_points_is_seeded_from_its_photographs() -> No
 def test_grey_pictures_are_refused_with_what_may_be_wrong(no_jaxtyping: None) -> None:
     views = wall_views(4)
     grey = [np.full_like(np.asarray(image), 128) for image in views.images or ()]
-    with pytest.raises(InputError, match="no two of the 4 photographs show the same surface"):
+    with pytest.raises(InputError, match="4 of 4 photographs are of one color all over"):
         seed_from_photographs(replace(views, images=grey))
 
 
+def test_views_that_look_away_from_each_other_are_refused(no_jaxtyping: None) -> None:
+    views = wall_views(4)
+    turns = np.pi / 2 * np.arange(4)
+    outward = np.stack((np.cos(turns), np.sin(turns), np.zeros(4)), axis=1)
+    away = looking_cameras(3 * outward, outward, np.array([0.0, 0, 1]), width=96, height=72, focal=80.0)
+    with pytest.raises(InputError, match="no two of the 4 photographs show the same surface from different places"):
+        seed_from_photographs(replace(views, cameras=away))
+
+
 def test_one_photograph_is_refused() -> None:
-    with pytest.raises(InputError, match="expected two posed photographs or more, got 1"):
+    with pytest.raises(InputError, match="1 photograph without depth and points says nothing about where surfaces are"):
         seed(Scene(name="one", views=wall_views(1)), SeedConfig(source="photographs"))
 
 
@@ -146,7 +155,7 @@ def test_views_in_one_place_are_refused(no_jaxtyping: None) -> None:
     poses = np.repeat(views.cameras.cam_from_world[:1], 4, axis=0)
     image = np.asarray((views.images or ())[0])
     same = replace(views, cameras=replace(views.cameras, cam_from_world=poses), images=[image] * 4)
-    with pytest.raises(InputError, match="show the same surface from different places"):
+    with pytest.raises(InputError, match="all 4 cameras stand in one place by their poses"):
         seed_from_photographs(same)
 
 

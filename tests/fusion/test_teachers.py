@@ -9,7 +9,7 @@ from splats import front_camera
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
-from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher, lab_from_rgb
+from gsencoder.fusion.teachers.palette import _PROTOTYPES, COLOR_NAMES, PaletteConfig, PaletteTeacher, lab_from_rgb
 from gsencoder.types import SceneObject, Views
 
 
@@ -41,6 +41,19 @@ def test_the_palette_calls_css_colors_by_their_names(rgb: tuple[int, int, int], 
     assert features.shape == (3, 4, 11)
     assert COLOR_NAMES[int(features[0, 0].argmax())] == name
     np.testing.assert_allclose(features.sum(axis=-1), 1, rtol=1e-5)
+
+
+def test_shares_of_color_names_fall_with_the_squared_distance_to_the_nearest_color_of_each_name(
+    rng: np.random.Generator,
+) -> None:
+    rgb, teacher = rng.integers(0, 256, (500, 3)).astype(np.uint8), PaletteTeacher()
+    for row, shares in zip(lab_from_rgb(rgb), teacher.name_shares(rgb), strict=True):
+        squares = [
+            min(float(((lab_from_rgb(np.uint8(color)) - row) ** 2).sum()) for color in colors)
+            for colors in _PROTOTYPES.values()
+        ]
+        weights = np.exp(-np.array(squares) / (2 * teacher.softness**2))
+        np.testing.assert_allclose(shares, weights / weights.sum(), atol=1e-5)
 
 
 def test_lab_of_white_black_and_grey_is_neutral() -> None:

@@ -9,6 +9,7 @@ from splats import front_camera, one_gaussian, random_gaussians, random_rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.render.blend_cpu import _stable_order
 from gsencoder.render.images import render_image
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians
 
@@ -97,6 +98,24 @@ def test_the_fast_backend_agrees_with_its_float64_twin_on_patches(rays: int) -> 
     fast = blend(g, camera, patch=7, config=config)
     slow = blend(g, camera, patch=7, config=replace(config, backend="reference"), dtype=torch.float64)
     np.testing.assert_allclose(dense(fast), dense(slow), atol=1e-6)
+
+
+@pytest.mark.parametrize("side", [1, 2, 4])
+@pytest.mark.parametrize("stop", [1e-4, 0.1])
+def test_rays_that_stop_in_any_order_agree_with_the_twin(side: int, stop: float) -> None:
+    """Opaque Gaussians no larger than a tile: its rays end one after the other, at its borders and inside."""
+    g = random_gaussians(500, 8, log_scale=-2.0)
+    g = replace(g, opacities=np.float32(0.5) + g.opacities / 2)
+    config = BlendConfig(rays_per_patch=side * side, stop_transmittance=stop)
+    fast = blend(g, front_camera(64, 48), patch=side, config=config)
+    slow = blend(g, front_camera(64, 48), patch=side, config=replace(config, backend="reference"), dtype=torch.float64)
+    assert (fast.alpha > 1 - 2 * stop).float().mean() > 0.2
+    np.testing.assert_allclose(dense(fast), dense(slow), atol=1e-6)
+
+
+def test_depths_are_sorted_stably(rng: np.random.Generator) -> None:
+    for depths in (rng.random(1000), rng.integers(0, 30, 1000).astype(np.float64), np.ones(50), np.empty(0)):
+        np.testing.assert_array_equal(_stable_order(depths), np.argsort(depths, kind="stable"))
 
 
 def test_patches_with_a_ray_for_each_pixel_are_the_mean_of_their_pixels() -> None:

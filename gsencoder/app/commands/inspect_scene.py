@@ -48,7 +48,8 @@ def scene_table(facts: SceneFacts) -> Table:
         if depth.sensor:
             table.add_row("depth sensor", f"not registered in the files: {depth.sensor}; carried over on load")
     if facts.masks:
-        table.add_row("masks", "yes")
+        empty = "" if facts.empty is None else f"; {facts.empty:.0%} of the pixels show that nothing is there"
+        table.add_row("masks", f"yes{empty}")
     if facts.points:
         table.add_row("points", f"{facts.points:,} of structure from motion")
     if facts.objects:
@@ -157,7 +158,8 @@ def save_check_picture(path: Path, views: Views, depth: DepthCheck | None, match
                 pictures.append(views.images[view])
                 titles.append(views.names[view])
             pictures += [depth_picture(depth.depth.depths[index]), _agreement_picture(share)]
-            titles += ["depth", f"agrees with other views: {np.nanmean(share):.0%}"]
+            seen = share[np.isfinite(share)]
+            titles += ["depth", f"agrees with other views: {seen.mean():.0%}" if len(seen) else "no other view sees it"]
         sheet = contact_sheet(pictures, titles, columns=3 if views.images is not None else 2)
     elif matches is not None and matches.worst is not None and views.images is not None:
         pair, cameras = matches.worst, matches.cameras

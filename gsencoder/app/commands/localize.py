@@ -12,6 +12,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
+from gsencoder.core.runtime.threads import import_ahead
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
@@ -47,6 +48,9 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
     """Reads features, finds each word, writes boxes as JSON and .ply, and draws them."""
     folder = Path(config.paths[0])
     words = query_words(config.query, config.queries)
+    if config.pictures:
+        # Drawing needs torch, which finding boxes does without; it takes as long to load as they take to find.
+        import_ahead("gsencoder.infer.draw.relevancy_views")
     with summary.step("load"):
         scene = load_features(folder)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
@@ -64,7 +68,6 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         write_json(target / "words.json", summary.results["words"])
         write_boxes_ply(target / "boxes.ply", scene, localization)
         if config.pictures and scene.views is not None:
-            # Drawing needs torch, which finding boxes does without.
             from gsencoder.infer.draw.relevancy_views import relevancy_pictures
 
             with summary.step("pictures"):

@@ -4,22 +4,30 @@ numba's parallel loops are not used, since an OpenMP pool aborts a process that 
 loaders do. Work is cut into a fixed number of pieces, so that results do not depend on the number of threads.
 """
 
+import contextlib
+import importlib
 import os
+import sys
 import threading
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from jaxtyping import Int64
-from numba import njit
+
+Result = TypeVar("Result")
 
 PIECES = 32
 """Number of pieces that work is cut into: enough to balance a dozen cores, few enough to cost nothing on two."""
 
-kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
-"""Compiles a function for `parallel`; reassociation is off, so that sums have one order."""
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compiles a function for `parallel`; reassociation is off, so that sums have one order."""
+    # Threads are also asked for where nothing is compiled, and numba takes half a second to load.
+    from numba import njit
+
+    return njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})(function)
 
 
 _here = threading.local()
@@ -29,14 +37,46 @@ def _mark_worker() -> None:
     _here.inside = True
 
 
+def thread_count() -> int:
+    """As many threads as torch uses, or would use if it were loaded."""
+    cores = os.cpu_count() or 1
+    asked = getattr(sys.modules.get("torch"), "get_num_threads", None)
+    if asked is not None:
+        return min(int(asked()), cores)
+    stated = os.environ.get("OMP_NUM_THREADS", "")
+    return min(max(int(stated), 1), cores) if stated.isdecimal() else cores
+
+
 def parallel(work: Callable[[int], Any], pieces: Iterable[int]) -> list[Any]:
-    """Runs `work` for each piece on as many threads as torch uses, and returns the results in order. A nested call runs
-    its pieces one after the other, since all threads are busy."""
-    threads = min(torch.get_num_threads(), os.cpu_count() or 1)
+    """Runs `work` for each piece in `thread_count` threads, and returns the results in order. A nested call runs its
+    pieces one after the other, since all threads are busy."""
+    threads = thread_count()
     if threads == 1 or getattr(_here, "inside", False):
         return [work(piece) for piece in pieces]
     with ThreadPoolExecutor(threads, initializer=_mark_worker) as pool:
         return list(pool.map(work, pieces))
+
+
+def ahead(work: Callable[[int], Result], items: Iterable[int]) -> Iterator[Result]:
+    """`work` of each item, in order; the next one is computed in a thread while the caller uses the last."""
+    with ThreadPoolExecutor(1) as pool:
+        following: Future[Result] | None = None
+        for item in items:
+            current, following = following, pool.submit(work, item)
+            if current is not None:
+                yield current.result()
+        if following is not None:
+            yield following.result()
+
+
+def import_ahead(module: str) -> None:
+    """Starts to import a module in a thread. Whoever imports it later waits for that, and meets its errors."""
+
+    def load() -> None:
+        with contextlib.suppress(Exception):
+            importlib.import_module(module)
+
+    threading.Thread(target=load).start()
 
 
 def even_cuts(starts: Int64[np.ndarray, " n_plus_1"]) -> Int64[np.ndarray, " pieces_plus_1"]:

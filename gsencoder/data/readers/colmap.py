@@ -23,7 +23,9 @@ def is_colmap_model(folder: Path) -> bool:
     return (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
 
 
-def read_colmap(model: Path, images: Path, root: Path, *, allow_outside: bool = False) -> PosedImages:
+def read_colmap(
+    model: Path, images: Path, root: Path, *, allow_outside: bool = False, base_names: bool = False
+) -> PosedImages:
     """Reads a model and finds its photographs.
 
     Args:
@@ -31,6 +33,7 @@ def read_colmap(model: Path, images: Path, root: Path, *, allow_outside: bool = 
         images: folder that the names of the model are relative to.
         root: the scene folder, which names may not leave.
         allow_outside: let them.
+        base_names: photographs lie in `images` itself, whatever folders the names of the model begin with.
 
     Returns:
         The registered pictures sorted by name, in the model's own world, and its points with their colors. The unit
@@ -49,7 +52,8 @@ def read_colmap(model: Path, images: Path, root: Path, *, allow_outside: bool = 
         if not image.has_pose:
             unregistered += 1
             continue
-        path = inside(images, image.name, where, root=root, allow_outside=allow_outside)
+        name = Path(image.name).name if base_names else image.name
+        path = inside(images, name, where, root=root, allow_outside=allow_outside)
         if not path.is_file():
             missing.append(image.name)
             continue

@@ -1,4 +1,5 @@
-"""Pictures on disk as lazy sequences: photographs, sensor depth, masks and instance maps, decoded on access.
+"""Pictures on disk as lazy sequences: photographs, sensor depth and instance maps, decoded on access; masks.py has
+masks.
 
 Rules that hold for all of them:
 
@@ -7,10 +8,9 @@ Rules that hold for all of them:
   end is an InputError that names it.
 - The EXIF orientation is ignored, as COLMAP does: poses and intrinsics belong to the pixels as they are stored.
 - Grey becomes RGB by repetition, 16-bit grey keeps its upper 8 bits. An alpha channel composites the color over
-  black, which is what a splat rendered without a background gives, and pixels of alpha below one half are masked.
+  black, which is what a splat rendered without a background gives.
 - Distorted pictures are resampled once (undistort.py): color bilinearly, everything else by the nearest pixel.
-- A smaller scale averages color over areas; depth and instances take the pixel at the new center; a mask keeps a
-  pixel only if all that it covers is used.
+- A smaller scale averages color over areas; depth and instances take the pixel at the new center.
 """
 
 import operator
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 PIXEL_LIMIT = 80_000_000
 """Pictures of more pixels are refused before they are decoded (Pillow's own warning starts a little above this)."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
+DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")
+"""Pillow's modes of pictures with one channel of more than 8 bits."""
 Array = TypeVar("Array", bound=np.ndarray)
 
 
@@ -119,6 +121,16 @@ def picture_info(path: Path) -> tuple[tuple[int, int], bool]:
             raise InputError(f"{path}: not a readable picture ({_brief(error)})") from error
 
 
+def is_deep_grey(path: Path) -> bool:
+    """Whether a picture has one channel of 16 bits, as depth images have, from the header alone.
+
+    Raises:
+        InputError: unreadable.
+    """
+    with _open(path) as picture:
+        return picture.mode in DEEP_GREY
+
+
 def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
     """Color (composited over black) and alpha, None where the file has none.
 
@@ -147,10 +159,41 @@ def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray,
     return color.astype(np.uint8), alpha.copy()
 
 
+def read_small(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
+    """About side × side pixels or more of a picture, for a quick look: JPEG is decoded at a fraction of its size, of
+    other files every n-th pixel is taken.
+
+    Raises:
+        InputError: as `read_rgba`.
+    """
+    with _open(path) as opened:
+        if opened.format == "JPEG":
+            opened.draft("RGB", (side, side))
+            picture = np.asarray(_decode(path, opened).convert("RGB"))
+        else:
+            picture = read_rgba(path)[0]
+    step = max(1, min(picture.shape[:2]) // side)
+    return picture[::step, ::step]
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
+    """Where a mask file is not 0. One that was saved as RGB is white and black like any other; alpha says nothing.
+
+    Raises:
+        InputError: unreadable or damaged.
+    """
+    with _open(path) as opened:
+        picture = _decode(path, opened)
+        values, bands = np.asarray(picture), picture.getbands()
+    if values.ndim == 2:
+        return np.asarray(values != 0)
+    return np.asarray(values[..., : len(bands) - ("A" in bands)].any(axis=2))
+
+
 def read_integers(path: Path, what: str, *, wide: bool) -> np.ndarray:
     """A single-channel integer PNG [H, W], int32; `wide` asks for more than 8 bits, as depth in millimetres has."""
     with _open(path) as opened:
-        allowed = ("I;16", "I;16B", "I;16L", "I") + (() if wide else ("L", "P", "1"))
+        allowed = DEEP_GREY + (() if wide else ("L", "P", "1"))
         if opened.mode not in allowed:
             kind = "16-bit" if wide else "8- or 16-bit"
             raise InputError(f"{path}: {what} must be a {kind} picture with one channel, got mode {opened.mode}")
@@ -177,7 +220,7 @@ class PixelGrid:
     height: int
 
 
-class _Files(Sequence[Array]):
+class PictureFiles(Sequence[Array]):
     """Files of V views, read on access. Slices are sequences of the same kind; nothing is kept in memory."""
 
     def __init__(self, paths: Sequence[Path | None], grids: Sequence[PixelGrid], remaps: RemapCache) -> None:
@@ -198,13 +241,13 @@ class _Files(Sequence[Array]):
             raise IndexError(f"view {view} of {len(self)}")
         return self._load(view % len(self))
 
-    def _slice(self, rows: slice) -> "_Files[Array]":
+    def _slice(self, rows: slice) -> "PictureFiles[Array]":
         return type(self)(self._paths[rows], self._grids[rows], self._remaps)
 
     @abstractmethod
     def _load(self, view: int) -> Array: ...
 
-    def _checked(self, view: int, shape: tuple[int, ...]) -> None:
+    def checked(self, view: int, shape: tuple[int, ...]) -> None:
         source = self._grids[view].source
         if shape != (source.height, source.width):
             raise InputError(
@@ -214,7 +257,7 @@ class _Files(Sequence[Array]):
 
     def _nearest(self, view: int, values: np.ndarray) -> np.ndarray:
         grid = self._grids[view]
-        self._checked(view, values.shape)
+        self.checked(view, values.shape)
         remap = self._remaps.get(grid.pinhole, grid.source)
         if remap is not None:
             values = remap.nearest(values)
@@ -252,7 +295,7 @@ class DepthSensor:
     color_from_depth: Float64[np.ndarray, "4 4"] | None = None
 
 
-class ImageFiles(_Files[UInt8[np.ndarray, "H W 3"]]):
+class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
     """Photographs as uint8 [H, W, 3] RGB, undistorted and scaled."""
 
     def _load(self, view: int) -> UInt8[np.ndarray, "H W 3"]:
@@ -261,7 +304,7 @@ class ImageFiles(_Files[UInt8[np.ndarray, "H W 3"]]):
         path, grid = self._paths[view], self._grids[view]
         assert path is not None
         color = read_rgba(path)[0]
-        self._checked(view, color.shape[:2])
+        self.checked(view, color.shape[:2])
         remap = self._remaps.get(grid.pinhole, grid.source)
         if remap is not None:
             color = remap.bilinear(color)
@@ -271,7 +314,7 @@ class ImageFiles(_Files[UInt8[np.ndarray, "H W 3"]]):
         return color
 
 
-class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
+class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
     """Sensor depth as float32 [H, W], z in world units, 0 = none; a view without a file is all zero.
 
     PNG holds integers and .npy any number type; both are multiplied by the view's scale. In .npy, NaN and infinity
@@ -322,7 +365,7 @@ class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
         from gsencoder.data.readers.registration import register_depth
 
         grid = self._grids[view]
-        self._checked(view, depth.shape)
+        self.checked(view, depth.shape)
         source = grid.source
         pinhole = pinhole_for(source, str(self._paths[view]))
         remap = self._remaps.get(pinhole, source)
@@ -342,7 +385,7 @@ class DepthFiles(_Files[Float32[np.ndarray, "H W"]]):
         )
 
 
-class InstanceFiles(_Files[Int32[np.ndarray, "H W"]]):
+class InstanceFiles(PictureFiles[Int32[np.ndarray, "H W"]]):
     """Instance maps as int32 [H, W], 0 = none; a view without a file is all zero."""
 
     def _load(self, view: int) -> Int32[np.ndarray, "H W"]:
@@ -350,50 +393,3 @@ class InstanceFiles(_Files[Int32[np.ndarray, "H W"]]):
         if path is None:
             return np.zeros((grid.height, grid.width), np.int32)
         return self._nearest(view, read_integers(path, "an instance map", wide=False))
-
-
-class MaskFiles(_Files[Bool[np.ndarray, "H W"]]):
-    """Which pixels to use, bool [H, W]: the mask file is not 0, alpha is at least one half, and the pinhole pixel has
-    content in the distorted picture. Each of the three counts only where it exists."""
-
-    def __init__(
-        self,
-        paths: Sequence[Path | None],
-        grids: Sequence[PixelGrid],
-        remaps: RemapCache,
-        transparent: Sequence[Path | None],
-    ) -> None:
-        super().__init__(paths, grids, remaps)
-        self._transparent = tuple(transparent)
-
-    def _slice(self, rows: slice) -> "MaskFiles":
-        return MaskFiles(self._paths[rows], self._grids[rows], self._remaps, self._transparent[rows])
-
-    def _load(self, view: int) -> Bool[np.ndarray, "H W"]:
-        from PIL import Image
-
-        path, image, grid = self._paths[view], self._transparent[view], self._grids[view]
-        used = np.ones((grid.source.height, grid.source.width), bool)
-        if path is not None:
-            with _open(path) as opened:
-                picture = _decode(path, opened)
-                values = np.asarray(picture)
-            # A mask saved as RGB is white and black like any other; its alpha, if any, says nothing.
-            values = (
-                values[..., : len(picture.getbands()) - ("A" in picture.getbands())] if values.ndim == 3 else values
-            )
-            nonzero = np.asarray(values.any(axis=2) if values.ndim == 3 else values != 0)
-            self._checked(view, nonzero.shape)
-            used &= nonzero
-        if image is not None:
-            alpha = read_rgba(image)[1]
-            if alpha is not None:
-                self._checked(view, alpha.shape)
-                used &= alpha >= 128
-        remap = self._remaps.get(grid.pinhole, grid.source)
-        if remap is not None:
-            used = remap.nearest(used)
-        if used.shape != (grid.height, grid.width):
-            small = Image.fromarray(used.astype(np.uint8) * 255).resize((grid.width, grid.height), Image.Resampling.BOX)
-            used = np.asarray(small) == 255
-        return used

@@ -131,7 +131,7 @@ LAYOUTS = (
     ),
     Layout(
         name="ScanNet++",
-        files="dslr/ or iphone/ of ScanNet++",
+        files="dslr/ or iphone/ of ScanNet++ (frames extracted to iphone/rgb)",
         matches=is_scannetpp,
         read=_reader_of(read_scannetpp),
     ),

@@ -1,8 +1,8 @@
-"""ScanNet++ scenes: a dslr/ folder with nerfstudio/transforms.json and colmap/, and an iphone/ folder with colmap/.
+"""ScanNet++ scenes: a dslr/ folder with nerfstudio/transforms.json and colmap/, and an iphone/ folder with a video.
 
 The DSLR photographs of dslr/resized_images (fisheye, masks in resized_anon_masks) are read through its
-transforms.json, else through its COLMAP model. iphone/ needs its frames extracted to rgb/ (frame_NNNNNN.jpg); depth/
-is read if it is there, in millimetres at its own size. The world is that of the laser scan: metres, z up.
+transforms.json, else through its COLMAP model; iphone.py reads the other folder, which is used where dslr/ has no
+photographs, or where it is given itself. The world is that of the laser scan: metres, z up.
 """
 
 from dataclasses import replace
@@ -12,21 +12,19 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
-from gsencoder.data.readers.images import picture_size
-from gsencoder.data.readers.posed import PosedImage, PosedImages, inside
+from gsencoder.data.readers.iphone import is_iphone, read_iphone
+from gsencoder.data.readers.posed import PosedImages
 from gsencoder.data.readers.transforms_json import read_transforms
-from gsencoder.data.readers.undistort import CameraModel
 
 NERFSTUDIO = ("nerfstudio/transforms.json", "nerfstudio/transforms_undistorted.json")
 DSLR_PICTURES = ("resized_images", "undistorted_images")
 DSLR_MASKS = ("resized_anon_masks", "undistorted_anon_masks")
-MILLIMETRES = 1e-3
 
 
 def device_folder(folder: Path) -> Path | None:
     """The folder of one capture device: the given one, or dslr/ or else iphone/ in it; None where there is neither."""
     for candidate in (folder, folder / "dslr", folder / "iphone"):
-        if _is_dslr(candidate) or _is_iphone(candidate):
+        if _is_dslr(candidate) or is_iphone(candidate):
             return candidate
     return None
 
@@ -41,10 +39,6 @@ def _is_dslr(folder: Path) -> bool:
     return pictures and (any((folder / name).is_file() for name in NERFSTUDIO) or is_colmap_model(folder / "colmap"))
 
 
-def _is_iphone(folder: Path) -> bool:
-    return (folder / "rgb").is_dir() and is_colmap_model(folder / "colmap")
-
-
 def read_scannetpp(root: Path, *, allow_outside: bool = False, depth_scale: float | None = None) -> PosedImages:
     """Reads a scene.
 
@@ -54,7 +48,10 @@ def read_scannetpp(root: Path, *, allow_outside: bool = False, depth_scale: floa
         depth_scale: metres for each step of a depth file; None = 0.001.
 
     Raises:
-        InputError: as `read_transforms` and `read_colmap`.
+        InputError: a video that is still to be extracted, and as `read_transforms` and `read_colmap`.
+
+    Warns:
+        SceneWarning: a depth stream that is still to be extracted.
     """
     folder = device_folder(root)
     if folder is None:
@@ -62,10 +59,7 @@ def read_scannetpp(root: Path, *, allow_outside: bool = False, depth_scale: floa
     if _is_dslr(folder):
         posed = _read_dslr(folder, allow_outside=allow_outside)
     else:
-        posed = read_colmap(folder / "colmap", folder / "rgb", folder, allow_outside=allow_outside)
-        scale = depth_scale or MILLIMETRES
-        images = tuple(_with_depth(image, folder, scale, allow_outside=allow_outside) for image in posed.images)
-        posed = replace(posed, images=images)
+        posed = read_iphone(folder, allow_outside=allow_outside, depth_scale=depth_scale)
     return replace(posed, metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]))
 
 
@@ -81,16 +75,3 @@ def _read_dslr(folder: Path, *, allow_outside: bool) -> PosedImages:
                 masks=masks if masks.is_dir() else None,
             )
     return read_colmap(folder / "colmap", folder / DSLR_PICTURES[0], folder, allow_outside=allow_outside)
-
-
-def _with_depth(image: PosedImage, folder: Path, scale: float, *, allow_outside: bool) -> PosedImage:
-    """The depth of a frame, at its own size: the camera is that of the photograph, scaled and without distortion."""
-    depth = folder / "depth" / f"{image.image.stem}.png"
-    if not depth.is_file():
-        return image
-    inside(folder, str(depth.relative_to(folder)), f"{folder}: {image.name}", allow_outside=allow_outside)
-    width, height = picture_size(depth)
-    x, y = width / image.camera.width, height / image.camera.height
-    fx, fy, cx, cy = image.camera.pinhole_params()
-    camera = CameraModel(model="PINHOLE", width=width, height=height, params=(fx * x, fy * y, cx * x, cy * y))
-    return replace(image, depth=depth, depth_camera=camera, depth_scale=scale)

@@ -17,6 +17,7 @@ from torch import Tensor
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
+from gsencoder.data.seeding.hull import outside_hull
 from gsencoder.data.seeding.stereo import (
     MAX_PLANES,
     DepthMap,
@@ -94,17 +95,25 @@ class DenseSeeds:
     coverage: tuple[float, float]
 
 
-def covered_share(cameras: Cameras, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
-    """Mean share of the pictures' cells into which some point projects; occlusion is not tested."""
-    shares = []
+def covered_share(photographs: Photographs, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
+    """Mean share of the pictures' cells into which some point projects, of those with a pixel that is not masked;
+    occlusion is not tested. 0 where all are masked."""
+    cameras, shares = photographs.cameras, []
     for view in views:
         width, height = int(cameras.widths[view]), int(cameras.heights[view])
-        cell = max(1.0, CELL * max(width, height))
+        cell, mask = max(1.0, CELL * max(width, height)), photographs.mask(view)
+        across, down = math.ceil(width / cell), math.ceil(height / cell)
+        used, reached = np.ones((down, across), bool), np.zeros((down, across), bool)
+        if mask is not None:
+            used[:] = False
+            rows, columns = (mask.nonzero().numpy() / cell).astype(np.int64).T
+            used[rows, columns] = True
         pixels, depths = cameras.project(points.astype(np.float64), view)
         columns, rows = (pixels[cameras.in_image(pixels, depths, view)] / cell).astype(np.int64).T
-        across, down = math.ceil(width / cell), math.ceil(height / cell)
-        shares.append(len(np.unique(rows * across + columns)) / (across * down))
-    return float(np.mean(shares))
+        reached[rows, columns] = True
+        if used.any():
+            shares.append(float(reached[used].mean()))
+    return float(np.mean(shares)) if shares else 0.0
 
 
 def densify(
@@ -117,7 +126,8 @@ def densify(
     guide: Float32[np.ndarray, "G 3"] | None = None,
     track: Track = untracked,
 ) -> DenseSeeds | None:
-    """Points for every surface that the training photographs show; None where the given ones cover enough.
+    """Points for every surface that the training photographs show; None where the given ones cover enough. No point
+    remains where photographs show that nothing is.
 
     Args:
         photographs: of all views.
@@ -130,7 +140,7 @@ def densify(
     """
     cameras = photographs.cameras
     guide = points if guide is None else guide
-    before = covered_share(cameras, training, points)
+    before = covered_share(photographs, training, points)
     if before >= config.enough:
         return None
     neighbors = source_views(cameras, guide, training, config.sources)
@@ -148,8 +158,13 @@ def densify(
     swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses, DEPTH_TOLERANCE)
     filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
     filled = carve(*filled, consistent, photos, poses, DEPTH_TOLERANCE)
-    positions, tints = (np.concatenate(arrays) for arrays in zip((points, colors), swept, filled, strict=True))
-    after = covered_share(cameras, training, positions)
+    given, swept, filled = (
+        (positions[keep], tints[keep])
+        for positions, tints in ((points, colors), swept, filled)
+        for keep in [~outside_hull(positions, photographs, training)]
+    )
+    positions, tints = (np.concatenate(arrays) for arrays in zip(given, swept, filled, strict=True))
+    after = covered_share(photographs, training, positions)
     return DenseSeeds(
         points=positions, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after)
     )

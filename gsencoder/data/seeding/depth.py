@@ -5,12 +5,13 @@ w = −n·r / c with the ray r = (u', v', 1): linear in the pixel. Its normal is
 n ∝ −(∂w/∂u', ∂w/∂v', w − u' ∂w/∂u' − v' ∂w/∂v'), and always faces the camera, because n·r ∝ −w < 0.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from gsencoder.core.errors import InputError, about
+from gsencoder.core.runtime.threads import ahead, kernel
 from gsencoder.data.seeding.surface_grid import SurfaceGrid, SurfaceSamples
 from gsencoder.types import Cameras, Views
 from gsencoder.types.cameras import pixel_centers, unproject_points
@@ -74,7 +75,7 @@ def surface_pixels(
 def depth_samples(
     views: Views, *, voxel: float, min_cos: float = 0.1, max_depth: float | None = None
 ) -> tuple[SurfaceSamples, list[str]]:
-    """Surface samples of all RGB-D frames on a grid of `voxel` world units, one view in memory at a time.
+    """Surface samples of all RGB-D frames on a grid of `voxel` world units, two views in memory at a time.
 
     Returns the samples and the names of the views that gave none. Raises InputError where there is no depth or image,
     or one has the wrong size or is not finite.
@@ -86,20 +87,22 @@ def depth_samples(
     if views.images is None:
         raise InputError("seeds: the scene has depth but no images, and seeds take their color from the photographs")
     grid = SurfaceGrid(voxel, np.median(views.cameras.centers, axis=0))
-    empty = []
-    for view, name in enumerate(views.names):
+
+    def samples_of(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         depth, image = read_rgbd(views, view)
         if views.masks is not None:
             depth = np.where(views.masks[view], depth, np.float32(0))
         if max_depth is not None:
             depth = np.where(depth <= max_depth, depth, np.float32(0))
         pixels = surface_pixels(depth, views.cameras.Ks[view], min_cos=min_cos)
-        if not pixels.use.any():
-            empty.append(name)
-            continue
-        points, normals = _to_world(pixels, views.cameras, view)
+        return *_to_world(pixels, views.cameras, view), image[pixels.use]
+
+    empty = []
+    for name, samples in zip(views.names, ahead(samples_of, range(len(views))), strict=True):
         with about(f"view {name!r}"):
-            grid.add(points, normals, image[pixels.use])
+            grid.add(*samples)
+        if not len(samples[0]):
+            empty.append(name)
     return grid.samples(), empty
 
 
@@ -140,55 +143,75 @@ def _second_difference_noise(inverse: np.ndarray, valid: np.ndarray) -> float:
     return float(np.quantile(second, 0.75)) / 1.1503 if second.size else 0.0
 
 
-def _smooth(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> np.ndarray:
+@kernel
+@no_type_check
+def _smooth(inverse, valid, step):
     """Mean over a window, taken in pairs of opposite pixels whose line passes the center within `step`.
 
     Pairs keep a plane a plane however steep it is: what one side adds, the other takes off.
     """
     height, width = inverse.shape
-    total, weight = inverse.copy(), np.ones_like(inverse)
-    for dy in range(min(SMOOTHING_RADIUS, (height - 1) // 2) + 1):
-        reach = min(SMOOTHING_RADIUS, (width - 1) // 2)
-        for dx in range(-reach if dy else 1, reach + 1):
-            left, right = abs(dx), width - abs(dx)
-            here = (slice(dy, height - dy), slice(left, right))
-            ahead = (slice(2 * dy, height), slice(left + dx, right + dx))
-            behind = (slice(0, height - 2 * dy), slice(left - dx, right - dx))
-            pair = inverse[ahead] + inverse[behind]
-            fits = valid[ahead] & valid[behind] & (np.abs(pair - 2 * inverse[here]) < step)
-            total[here] += pair * fits
-            weight[here] += 2 * fits
-    return total / weight
+    result = np.empty_like(inverse)
+    weight = np.empty(width, inverse.dtype)
+    for y in range(height):
+        total, center = result[y], inverse[y]
+        total[:] = center
+        weight[:] = 1
+        for dy in range(min(SMOOTHING_RADIUS, y, height - 1 - y) + 1):
+            for dx in range(-SMOOTHING_RADIUS if dy else 1, SMOOTHING_RADIUS + 1):
+                left, inner = abs(dx), width - 2 * abs(dx)
+                # Slices that start at 0 are added without a test of each index, eight pixels at a time.
+                ahead, behind = inverse[y + dy, left + dx :], inverse[y - dy, left - dx :]
+                known, too = valid[y + dy, left + dx :], valid[y - dy, left - dx :]
+                middle, sums, weights = center[left:], total[left:], weight[left:]
+                for x in range(inner):
+                    pair = ahead[x] + behind[x]
+                    fits = known[x] & too[x] & (abs(pair - (middle[x] + middle[x])) < step)
+                    sums[x] += pair * fits
+                    weights[x] += fits + fits
+        for x in range(width):
+            total[x] /= weight[x]
+    return result
 
 
-def _gradient(inverse: np.ndarray, valid: np.ndarray, step: np.float32) -> tuple[np.ndarray, np.ndarray]:
+@kernel
+@no_type_check
+def _gradient(inverse, valid, step):
     """Gradient along the rows, [H, W], and the pixels that float between two surfaces or show beside a nearer one.
 
     Central where the three pixels lie on a line within `step`; at an edge the smaller one-sided step, which stays on
     the pixel's own surface; zero where the pixel is a peak between two edges.
     """
-    known = valid[:, 1:] & valid[:, :-1]
-    steps = np.diff(inverse, axis=1) * known
-    none = np.zeros((len(inverse), 1), inverse.dtype)
-    before, after = np.hstack([none, steps]), np.hstack([steps, none])
-    never = none.astype(bool)
-    has_before, has_after = np.hstack([never, known]), np.hstack([known, never])
-    both = has_before & has_after
-    size_before, size_after = np.abs(before), np.abs(after)
-    smaller = np.minimum(size_before, size_after)
-    line = both & (np.abs(after - before) < step)
-    opposite = both & (before * after < 0) & (smaller > step)
-    one_sided = np.where(~has_after | (has_before & (size_before < size_after)), before, after)
-    gradient = np.where(line, (before + after) / 2, np.where(opposite, np.float32(0), one_sided))
-    # The surfaces that a floating pixel lies between go on beside it, less steep than the steps towards it.
-    flatter = (
-        np.maximum(np.hstack([none, size_before[:, :-1]]), np.hstack([size_after[:, 1:], none])) < BETWEEN * smaller
-    )
-    between = both & (before * after > 0) & (smaller > step) & flatter
-    # How much nearer the neighbor is, beyond what the pixel's own surface explains by its slope on the other side.
-    edge = np.maximum(step, np.float32(OCCLUSION) * inverse)
-    behind = both & ((np.maximum(after, -before) > edge + 3 * smaller) | ((after > edge) & (-before > edge)))
-    return gradient, between | behind
+    height, width = inverse.shape
+    gradient, astray = np.zeros_like(inverse), np.zeros(inverse.shape, np.bool_)
+    steps = np.zeros(width + 3, inverse.dtype)
+    known = np.zeros(width + 3, np.bool_)
+    occlusion, flatter = np.float32(OCCLUSION), np.float32(BETWEEN)
+    for y in range(height):
+        # steps[x + 1] and steps[x + 2] lead to pixel x and on from it; there are none beyond the border.
+        for x in range(1, width):
+            known[x + 1] = valid[y, x] & valid[y, x - 1]
+            steps[x + 1] = inverse[y, x] - inverse[y, x - 1] if known[x + 1] else 0
+        for x in range(width):
+            before, after = steps[x + 1], steps[x + 2]
+            if not (known[x + 1] and known[x + 2]):
+                gradient[y, x] = before if known[x + 1] else after
+                continue
+            smaller = min(abs(before), abs(after))
+            steep = smaller > step
+            if abs(after - before) < step:
+                gradient[y, x] = (before + after) / 2
+            elif not (steep and before * after < 0):
+                gradient[y, x] = before if abs(before) < abs(after) else after
+            # The surfaces that a floating pixel lies between go on beside it, less steep than the steps towards it.
+            beyond = max(abs(steps[x]), abs(steps[x + 3]))
+            between = steep and before * after > 0 and beyond < flatter * smaller
+            # How much nearer the neighbor is, beyond what the pixel's own surface explains by its slope on the other
+            # side.
+            edge = max(step, occlusion * inverse[y, x])
+            behind = max(after, -before) > edge + 3 * smaller or (after > edge and -before > edge)
+            astray[y, x] = between or behind
+    return gradient, astray
 
 
 def _rays(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

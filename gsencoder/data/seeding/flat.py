@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from gsencoder.core.runtime.threads import thread_count
 from gsencoder.types import Gaussians, sh_from_colors
 
 SIZE = 0.6
@@ -94,7 +95,8 @@ def nearest(
     from scipy.spatial import cKDTree
 
     count = min(count, len(points))
-    distances, rows = cKDTree(points, balanced_tree=False, compact_nodes=False).query(queries, k=count)
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    distances, rows = tree.query(queries, k=count, workers=thread_count())
     shape = (len(queries), count)
     return np.reshape(distances, shape).astype(np.float32), np.reshape(rows, shape).astype(np.int64)
 

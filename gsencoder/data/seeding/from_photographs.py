@@ -40,6 +40,12 @@ ROUGH_TOLERANCE = 0.06
 """Largest relative difference of two rough depths of one surface."""
 
 
+SAME_PLACE = 1e-6
+"""Cameras that are this near to each other, relative to their coordinates, differ by rounding."""
+FLAT = 0.01
+"""Standard deviation of colors (0 to 1) below which a photograph is of one color."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PhotographSeeds:
     """Seeds of posed photographs, and where they come from.
@@ -76,11 +82,16 @@ def seeds_of_photographs(
         InputError: fewer than two photographs, or no two that show the same surface from different places.
     """
     rows = list(range(len(photographs))) if training is None else list(training)
+    if len(rows) < 2:
+        raise InputError(
+            f"seeds: {len(rows)} photograph without depth and points says nothing about where surfaces are; give two "
+            "or more, a splat (splat=PATH), or a mesh (seeds.source=mesh seeds.mesh=PATH)"
+        )
     triangulation = triangulate(views, track=track)
     points = triangulation.points
     cameras = views.cameras
     rough = np.empty((0, 3), np.float32)
-    if covered_share(cameras, range(len(cameras)), points) < MIN_COVERAGE:
+    if covered_share(photographs, rows, points) < MIN_COVERAGE:
         rough = _rough_points(photographs, rows, cameras, track)
     dense = densify(
         photographs,
@@ -94,12 +105,28 @@ def seeds_of_photographs(
     if dense is None:
         dense = DenseSeeds(points=points, colors=triangulation.colors, swept=0, filled=0, coverage=(1.0, 1.0))
     if not len(dense.points):
-        raise InputError(
-            f"seeds: no two of the {len(views)} photographs show the same surface from different places by their "
-            "poses; "
-            "check the poses (axes, world_from_camera or its inverse), or take photographs with more overlap"
-        )
+        raise InputError(f"seeds: {_why_nothing(photographs, rows)}")
     return PhotographSeeds(dense=dense, triangulation=triangulation, rough=len(rough))
+
+
+def _why_nothing(photographs: Photographs, rows: Sequence[int]) -> str:
+    """Why photographs gave no point, for an error."""
+    centers = photographs.cameras.centers[rows]
+    if np.ptp(centers, axis=0).max() <= SAME_PLACE * (1 + np.abs(centers).max()):
+        return (
+            f"all {len(rows)} cameras stand in one place by their poses, from which photographs say nothing about "
+            "depth; check the translations of the poses, or give depth, a mesh or a splat"
+        )
+    flat = [view for view in rows if float(photographs.at_scale(view).image.std(dim=(0, 1)).max()) < FLAT]
+    if len(flat) > len(rows) / 2:
+        return (
+            f"{len(flat)} of {len(rows)} photographs are of one color all over (first: "
+            f"{photographs.names[flat[0]]!r}), and nothing in them can be found in others"
+        )
+    return (
+        f"no two of the {len(rows)} photographs show the same surface from different places by their poses; check the "
+        "poses (axes, world_from_camera or its inverse), or take photographs with more overlap"
+    )
 
 
 def seed_from_photographs(views: Views, config: DenseConfig = DenseConfig(), *, track: Track = untracked) -> Gaussians:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import SceneWarning
+from gsencoder.core.runtime.threads import thread_count
 from gsencoder.types import Scene
 
 SPACING_SAMPLE = 100_000
@@ -33,7 +34,8 @@ def scene_spacing(means: Float32[np.ndarray, "N 3"]) -> float:
         chosen = (mixed >> np.uint64(33)) % np.uint64(every) == 0
         asking = means[chosen] if chosen.any() else means
     # Column 0 is the point itself.
-    distances = np.asarray(cKDTree(means).query(asking, k=min(NEIGHBOR, len(means) - 1) + 1)[0])
+    tree = cKDTree(means, balanced_tree=False, compact_nodes=False)
+    distances = np.asarray(tree.query(asking, k=min(NEIGHBOR, len(means) - 1) + 1, workers=thread_count())[0])
     if (distances[:, 1] == 0).any():
         distinct = np.unique(means, axis=0)
         return scene_spacing(distinct) if len(distinct) < len(means) else 0.0

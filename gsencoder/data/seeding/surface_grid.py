@@ -6,17 +6,20 @@ face, and by their layer along the normal; sums of one voxel that turn out to be
 the end. Sums add up in any order, so frames stream through in constant memory.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.threads import kernel
 
 AXIS_BITS = 19
 """Bits of a voxel index along one axis: 524,288 voxels, or 10 km at 2 cm."""
-MAX_PARTIAL_ROWS = 2_000_000
-"""Partial sums are joined when there are more rows than this (about 180 MB)."""
+OUT_OF_REACH = 2.0**62
+"""Voxels that no integer counts."""
+MIN_SLOTS = 1 << 12
+"""Size of the hash table at first, a power of two like every later one."""
 LAYER = 0.25
 """Height of a layer along the normal, in voxels."""
 SAME_SURFACE_COS = 0.95
@@ -56,8 +59,9 @@ class SurfaceGrid:
     def __init__(self, voxel: float, around: np.ndarray) -> None:
         self.voxel = voxel
         self._base = np.floor(np.asarray(around, np.float64) / voxel).astype(np.int64) - (1 << (AXIS_BITS - 1))
-        self._keys: list[np.ndarray] = []
-        self._sums: list[np.ndarray] = []
+        self._slots = np.full(MIN_SLOTS, -1, np.int32)
+        self._keys = np.empty(0, np.int64)
+        self._sums = np.empty((0, _COLUMNS))
         self._rows = 0
 
     def add(
@@ -66,36 +70,26 @@ class SurfaceGrid:
         """Adds samples. Raises InputError where one lies outside the grid's reach."""
         if not len(points):
             return
-        # Numbers that no integer holds are out of reach too, and must not be cast.
-        countable = float(np.abs(points).max()) < 2.0**62 * self.voxel
-        cells = np.floor(points / np.float32(self.voxel)) if countable else np.zeros_like(points)
-        local = (cells.astype(np.int64) - self._base).T
-        if not countable or ((local < 0) | (local >= 1 << AXIS_BITS)).any():
+        self._make_room(self._rows + len(points))
+        arrays = (points, normals, colors, np.float32(self.voxel), self._base)
+        rows = _add_samples(*arrays, self._slots, self._keys, self._sums, self._rows)
+        if rows < 0:
             reach = self.voxel * (1 << (AXIS_BITS - 1))
             raise InputError(
                 f"seeds: a sample lies further than {reach:.6g} units ({1 << (AXIS_BITS - 1)} voxels) from the "
                 "cameras' middle; look at the pose, remove far samples (max_depth) or take a larger voxel"
             )
-        # The offset of the sample's own plane from the voxel's center is at most √3/2 voxels: layers −3 … 3.
-        offset = np.einsum("ij,ij->i", points / np.float32(self.voxel) - cells - np.float32(0.5), normals)
-        layer = np.clip(np.rint(offset / np.float32(LAYER)).astype(np.int64) + _LAYERS // 2, 0, _LAYERS - 1)
-        axis = np.abs(normals).argmax(1)
-        facing = 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0)
-        keys = (local[0] << AXIS_BITS | local[1]) << AXIS_BITS | local[2]
-        values = np.empty((len(points), _COLUMNS))
-        values[:, 0:3], values[:, 3:6], values[:, 6:9], values[:, 9] = points, normals, colors, 1
-        self._append(*_sum_by_key((keys * _DIRECTIONS + facing) * _LAYERS + layer, values))
-        if self._rows > MAX_PARTIAL_ROWS:
-            self._join()
+        self._rows = rows
 
     def samples(self) -> SurfaceSamples:
         """One sample for each surface in each voxel, ordered by voxel: mean position, normal and color."""
-        self._join()
         if not self._rows:
             empty = np.zeros((0, 3), np.float32)
             return SurfaceSamples(empty, empty, empty, np.zeros(0, np.int64))
-        voxel_of = self._keys[0] // (_DIRECTIONS * _LAYERS)
-        _, sums = _sum_by_key(_surfaces(voxel_of, self._sums[0], self.voxel), self._sums[0])
+        order = np.argsort(self._keys[: self._rows])
+        keys, sums = self._keys[order], self._sums[order]
+        surface = _surfaces(keys // (_DIRECTIONS * _LAYERS), sums, self.voxel)
+        sums = _sum_rows(surface, sums, int(surface.max()) + 1)
         counts = sums[:, 9:]
         normals = sums[:, 3:6] / np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True)
         return SurfaceSamples(
@@ -105,24 +99,89 @@ class SurfaceGrid:
             counts[:, 0].astype(np.int64),
         )
 
-    def _append(self, keys: np.ndarray, sums: np.ndarray) -> None:
-        self._keys.append(keys)
-        self._sums.append(sums)
-        self._rows += len(keys)
+    def _make_room(self, rows: int) -> None:
+        """Makes the arrays large enough for so many rows, and the hash table twice as large."""
+        if rows > len(self._keys):
+            size = max(rows, 2 * len(self._keys))
+            self._keys = np.concatenate([self._keys[: self._rows], np.empty(size - self._rows, np.int64)])
+            self._sums = np.concatenate([self._sums[: self._rows], np.empty((size - self._rows, _COLUMNS))])
+        if 2 * rows > len(self._slots):
+            self._slots = np.full(1 << (2 * rows - 1).bit_length(), -1, np.int32)
+            _fill_slots(self._keys[: self._rows], self._slots)
 
-    def _join(self) -> None:
-        if len(self._keys) > 1:
-            keys, sums = _sum_by_key(np.concatenate(self._keys), np.concatenate(self._sums))
-            self._keys, self._sums, self._rows = [], [], 0
-            self._append(keys, sums)
+
+@kernel
+@no_type_check
+def _slot_of(key, keys, slots):
+    """The slot of a key in a hash table with linear probing, or the empty one where it belongs."""
+    mask = len(slots) - 1
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    slot = np.int64(mixed >> np.uint64(20)) & mask
+    while slots[slot] >= 0 and keys[slots[slot]] != key:
+        slot = (slot + 1) & mask
+    return slot
 
 
-def _sum_by_key(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sums of the rows that share a key, keys ascending. The stable order makes the rounding repeatable."""
-    order = np.argsort(keys, kind="stable")
-    keys = keys[order]
-    starts = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
-    return keys[starts], np.add.reduceat(values[order], starts, axis=0)
+@kernel
+@no_type_check
+def _fill_slots(keys, slots):
+    for row in range(len(keys)):
+        slots[_slot_of(keys[row], keys, slots)] = row
+
+
+@kernel
+@no_type_check
+def _add_samples(points, normals, colors, voxel, base, slots, keys, sums, rows):
+    """Adds samples to the sums of their keys, in their order; returns the number of rows, or −1 where one lies outside.
+
+    A key is the voxel, the axis direction that the normal is closest to, and the layer: the offset of the sample's
+    plane from the voxel's center, at most √3/2 voxels, in steps of LAYER.
+    """
+    half, layer_height = np.float32(0.5), np.float32(LAYER)
+    last_key, line = np.int64(-1), sums[0]
+    for n in range(len(points)):
+        key, offset, facing, largest = np.int64(0), np.float32(0), 0, np.float32(-1)
+        for axis in range(3):
+            place, normal = points[n, axis] / voxel, normals[n, axis]
+            cell = np.floor(place)
+            # Numbers that no integer holds are out of reach too, and must not be cast.
+            if not abs(cell) < OUT_OF_REACH:
+                return -1
+            local = np.int64(cell) - base[axis]
+            if local < 0 or local >= 1 << AXIS_BITS:
+                return -1
+            key = key << AXIS_BITS | local
+            offset += (place - cell - half) * normal
+            if abs(normal) > largest:
+                largest, facing = abs(normal), 2 * axis + (normal > 0)
+        layer = min(max(int(np.rint(offset / layer_height)) + _LAYERS // 2, 0), _LAYERS - 1)
+        key = (key * _DIRECTIONS + facing) * _LAYERS + layer
+        # Neighboring pixels mostly fall into one voxel.
+        if key != last_key:
+            slot = _slot_of(key, keys, slots)
+            if slots[slot] < 0:
+                slots[slot], keys[rows] = rows, key
+                sums[rows] = 0.0
+                rows += 1
+            last_key, line = key, sums[slots[slot]]
+        for axis in range(3):
+            line[axis] += points[n, axis]
+            line[3 + axis] += normals[n, axis]
+            line[6 + axis] += colors[n, axis]
+        line[9] += 1
+    return rows
+
+
+@kernel
+@no_type_check
+def _sum_rows(group_of, values, groups):
+    """Sums of the rows of each group, in their order."""
+    sums = np.zeros((groups, values.shape[1]))
+    for row in range(len(values)):
+        line = sums[group_of[row]]
+        for column in range(len(line)):
+            line[column] += values[row, column]
+    return sums
 
 
 def _surfaces(voxel_of: np.ndarray, sums: np.ndarray, voxel: float) -> np.ndarray:

@@ -102,10 +102,13 @@ class PaletteTeacher:
 
     def name_shares(self, rgb: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 11"]:
         """Share of each color name, summing to 1."""
-        lab = lab_from_rgb(rgb)
-        distance = ((lab[:, None] - self._centers) ** 2).sum(axis=-1)
-        nearest = np.stack([distance[:, self._owner == k].min(axis=1) for k in range(len(COLOR_NAMES))], axis=1)
-        score = -nearest / (2 * self.softness**2)
+        # Channel by channel: an array of pixels × prototypes × channels would not fit into the cache.
+        lightness, a, b = np.ascontiguousarray(lab_from_rgb(rgb).T)
+        nearest = np.full((len(COLOR_NAMES), len(rgb)), np.inf, np.float32)
+        for center, owner in zip(self._centers, self._owner, strict=True):
+            distance = (lightness - center[0]) ** 2 + (a - center[1]) ** 2 + (b - center[2]) ** 2
+            np.minimum(nearest[owner], distance, out=nearest[owner])
+        score = -np.ascontiguousarray(nearest.T) / (2 * self.softness**2)
         score = np.exp(score - score.max(axis=1, keepdims=True))
         return (score / score.sum(axis=1, keepdims=True)).astype(np.float32)
 

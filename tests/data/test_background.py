@@ -1,0 +1,179 @@
+"""Backgrounds of one color and transparency say where nothing is; photographs of real places have no background."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lone_object import SOLIDS, WHITE_SOLID, Ground, hemisphere_cameras, look, save_over, write_blender
+from scene_files import photograph, save, write_transforms
+from textured_box import box_cameras
+from textured_box import look as look_at_walls
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.background import Background, background_pixels, find_background, outline
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.types import Views
+
+SIZE = 64
+
+
+@pytest.fixture(scope="module")
+def alphas() -> list[np.ndarray]:
+    cameras = hemisphere_cameras(6, SIZE)
+    return [look(cameras, view)[1] for view in range(6)]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    made = {}
+    for name in ("transparent", "white", "black", "jpeg"):
+        folder = tmp_path_factory.mktemp(name)
+        ground: Ground = "white" if name == "jpeg" else name  # type: ignore[assignment]
+        write_blender(folder, size=SIZE, train=6, others=1, ground=ground, suffix=".jpg" if name == "jpeg" else ".png")
+        made[name] = folder
+    return made
+
+
+def views_of(folder: Path, **options: object) -> Views:
+    views = load_scene(folder, options=SceneConfig(**options)).views  # type: ignore[arg-type]
+    assert views is not None
+    return views
+
+
+def test_transparency_is_empty_where_nothing_shows_and_used_where_half_shows(
+    scenes: dict[str, Path], alphas: list[np.ndarray]
+) -> None:
+    views = views_of(scenes["transparent"])
+    assert views.masks is not None
+    assert views.empty is not None
+    edges = 0
+    for view, alpha in enumerate(alphas):
+        rounded = np.round(255 * alpha)
+        np.testing.assert_array_equal(views.masks[view], rounded >= 128)
+        np.testing.assert_array_equal(views.empty[view], rounded < 4)
+        edges += int((~views.masks[view] & ~views.empty[view]).sum())
+    # Half-transparent edges are in neither.
+    assert edges > 100
+
+
+@pytest.mark.parametrize("name", ["white", "black", "jpeg"])
+def test_a_background_of_one_color_is_empty_and_no_part_of_the_object_is(
+    scenes: dict[str, Path], alphas: list[np.ndarray], name: str
+) -> None:
+    color = "black" if name == "black" else "white"
+    with pytest.warns(SceneWarning, match=rf"background of one color \({color}, 79% of the pixels\); it is masked"):
+        views = views_of(scenes[name])
+    assert views.masks is not None
+    assert views.empty is not None
+    for view, alpha in enumerate(alphas):
+        used, empty = views.masks[view], views.empty[view]
+        assert not (used & empty).any()
+        # A white solid's outline is hidden by white: that little may be taken for empty.
+        assert empty[alpha > 0.5].mean() < 0.02
+        assert used[alpha > 0].sum() > 0.7 * (alpha == 1).sum()
+        assert not used[alpha == 0].any()
+        assert empty[alpha == 0].mean() > 0.93
+
+
+def test_views_are_selected_with_what_is_empty(scenes: dict[str, Path]) -> None:
+    views = views_of(scenes["transparent"])
+    assert views.empty is not None
+    few = views.select([3, 1])
+    assert few.empty is not None
+    np.testing.assert_array_equal(few.empty[0], views.empty[3])
+
+
+def test_the_background_can_be_kept(scenes: dict[str, Path]) -> None:
+    views = views_of(scenes["white"], background="none")
+    assert views.masks is None
+    assert views.empty is None
+
+
+def test_another_background_is_refused(no_jaxtyping: None) -> None:
+    with pytest.raises(InputError, match="background: expected auto or none, got 'white'"):
+        SceneConfig(background="white")  # type: ignore[arg-type]
+
+
+def test_smaller_pictures_are_empty_where_all_that_they_cover_is(scenes: dict[str, Path]) -> None:
+    large, small = views_of(scenes["transparent"]), views_of(scenes["transparent"], image_scale=0.5)
+    assert large.empty is not None
+    assert small.empty is not None
+    blocks = large.empty[0].reshape(SIZE // 2, 2, SIZE // 2, 2)
+    np.testing.assert_array_equal(small.empty[0], blocks.all(axis=(1, 3)))
+
+
+def test_what_has_the_color_and_is_not_connected_to_the_border_stays(tmp_path: Path) -> None:
+    picture = np.full((40, 40, 3), 255, np.uint8)
+    picture[10:30, 10:30] = 90
+    picture[15:25, 15:25] = 255
+    path = save(tmp_path / "ring.png", picture)
+    region = background_pixels(picture, (255, 255, 255), path)
+    assert not region[10:30, 10:30].any()
+    assert region.sum() == 1600 - 400
+    used, empty = outline(path, Background(color=(255, 255, 255), share=0.75))
+    assert used[15:25, 15:25].all()
+    # Two pixels beside the background mix both colors, one of the background's own may.
+    assert used.sum() == 16 * 16
+    assert empty.sum() == 1600 - 22 * 22 + 4
+
+
+def test_photographs_of_rooms_have_no_background(tmp_path: Path) -> None:
+    cameras = box_cameras(6, 96, 72, 70.0)
+    paths = [save(tmp_path / f"{view}.png", look_at_walls(cameras, view)[0]) for view in range(6)]
+    assert find_background(paths) is None
+
+
+def test_bright_walls_windows_and_lens_shades_are_no_background(tmp_path: Path) -> None:
+    """White walls vary by more than rounding, windows end in the picture, and dark corners are the same everywhere."""
+    made = np.random.default_rng(0)
+    across = np.linspace(0, 6, 64)
+    for view in range(6):
+        wall = 244 + np.round(across + made.normal(0, 1.5, (64, 64))).clip(0, 11)
+        wall[20:40, 10 + view : 40] = 60
+        save(tmp_path / f"wall_{view}.png", np.repeat(wall[..., None], 3, axis=2).astype(np.uint8))
+        window = made.integers(0, 200, (64, 64, 3), dtype=np.uint8)
+        window[:40] = 255
+        save(tmp_path / f"window_{view}.png", window)
+        disc = photograph(view, 64, 64)
+        y, x = np.mgrid[:64, :64] - 31.5
+        disc[np.hypot(x, y) > 30] = 0
+        save(tmp_path / f"lens_{view}.png", disc)
+    for kind in ("wall", "window", "lens"):
+        assert find_background([tmp_path / f"{kind}_{view}.png" for view in range(6)]) is None, kind
+
+
+def test_few_photographs_that_the_object_fills_do_not_hide_the_background(tmp_path: Path) -> None:
+    cameras = hemisphere_cameras(8, 48)
+    paths = [tmp_path / f"{view}.png" for view in range(8)]
+    for view, path in enumerate(paths):
+        save_over(path, *look(cameras, view, oversampling=2), "white")
+    for view in range(4):
+        found = find_background(paths)
+        assert (found is not None) == (view < 3)
+        save(paths[view], photograph(view, 48, 48))
+
+
+def test_pictures_of_one_color_have_no_background(tmp_path: Path) -> None:
+    paths = [save(tmp_path / f"{view}.png", np.full((40, 40, 3), 128, np.uint8)) for view in range(4)]
+    assert find_background(paths) is None
+
+
+def test_depth_on_it_makes_a_background_a_wall(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    write_transforms(tmp_path, 4, depth=True)
+    for view in range(4):
+        picture = np.full((24, 32, 3), 255, np.uint8)
+        picture[8:16, 8 + view : 20] = photograph(view, 12 - view, 8)
+        save(tmp_path / f"images/{view:03d}.png", picture)
+    assert views_of(tmp_path).empty is None
+    assert not recwarn.list
+    for view in range(4):
+        save(tmp_path / f"depth/{view:03d}.png", np.zeros((24, 32), np.uint16))
+    with pytest.warns(SceneWarning, match="background of one color"):
+        assert views_of(tmp_path).empty is not None
+
+
+def test_the_white_solid_reaches_the_outline() -> None:
+    """Or the tests above would not try what they say."""
+    low, high = SOLIDS[WHITE_SOLID].aabb()
+    assert high[2] == max(solid.aabb()[1][2] for solid in SOLIDS)
+    assert low[0] < high[0]

@@ -1,0 +1,147 @@
+"""The iphone/ folder of ScanNet++ is read as its toolkit extracts it; what is still to be extracted is named."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.layouts import layout_of
+from gsencoder.data.scenes import find_scenes, load_scene
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.types import Scene, Views
+from gsencoder.types.poses import OPENCV_FROM_OPENGL
+
+Poses = Literal["colmap", "nerfstudio", "arkit"]
+EVERY = 10
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return make_room(3, objects=4, views=4, width=96, height=72)
+
+
+def write_iphone(scene: Scene, folder: Path, poses: Poses, *, prefix: str = "") -> Path:
+    """A scene whose frames are every tenth of the video; depth is a quarter as large as the photographs."""
+    views, iphone = scene.views, folder / "iphone"
+    assert views is not None
+    assert views.images is not None
+    assert views.depths is not None
+    for name in ("rgb", "depth", "rgb_masks", "colmap", "nerfstudio"):
+        (iphone / name).mkdir(parents=True)
+    K = views.cameras.Ks[0].astype(float)
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    world_from_cam = views.cameras.world_from_cam.astype(float)
+    world_from_cam[:, :3, 3] += scene.origin
+    lines, frames, arkit = [], [], {}
+    for view, pose in enumerate(world_from_cam):
+        stem = f"frame_{EVERY * view:06d}"
+        Image.fromarray(views.images[view]).save(iphone / "rgb" / f"{stem}.jpg", quality=100, subsampling=0)
+        steps = np.round(1000 * views.depths[view][2::4, 2::4]).astype(np.uint16)
+        Image.fromarray(steps).save(iphone / "depth" / f"{stem}.png")
+        mask = np.full((72, 96), 255, np.uint8)
+        mask[:9] = 0
+        Image.fromarray(mask).save(iphone / "rgb_masks" / f"{stem}.png")
+        inverse = np.linalg.inv(pose)
+        quat = Rotation.from_matrix(inverse[:3, :3]).as_quat()[[3, 0, 1, 2]]
+        lines += [" ".join(map(str, (view + 1, *quat, *inverse[:3, 3], 1, f"{prefix}{stem}.jpg"))), ""]
+        frames.append({"file_path": f"{stem}.jpg", "transform_matrix": (pose @ OPENCV_FROM_OPENGL).tolist()})
+        arkit[stem] = {"timestamp": view / 6, "pose": np.eye(4).tolist(), "intrinsic": K.tolist()}
+        arkit[stem]["aligned_pose"] = pose.tolist()
+    if poses == "colmap":
+        (iphone / "colmap/cameras.txt").write_text(f"1 OPENCV 96 72 {' '.join(map(str, params))} 0 0 0 0\n")
+        (iphone / "colmap/images.txt").write_text("\n".join(lines) + "\n")
+        (iphone / "colmap/points3D.txt").write_text("1 0.5 0.5 0.5 10 20 30 0.1 1 0\n".replace(" 1 0", ""))
+    elif poses == "nerfstudio":
+        camera = dict(zip(("fl_x", "fl_y", "cx", "cy"), params, strict=True))
+        content = {**camera, "camera_model": "OPENCV", "k1": 0.0, "frames": frames, "test_frames": []}
+        (iphone / "nerfstudio/transforms.json").write_text(json.dumps(content))
+    # In downloads the file is always there.
+    (iphone / "pose_intrinsic_imu.json").write_text(json.dumps(arkit))
+    for stream in ("rgb.mkv", "rgb_mask.mkv", "depth.bin", "exif.json"):
+        (iphone / stream).write_bytes(b"")
+    return iphone
+
+
+def views_of(scene: Scene) -> Views:
+    assert scene.views is not None
+    return scene.views
+
+
+@pytest.mark.parametrize(
+    ("poses", "prefix"), [("colmap", ""), ("colmap", "iphone/"), ("nerfstudio", ""), ("arkit", "")]
+)
+def test_a_room_is_read_back_from_each_kind_of_poses(room: Scene, tmp_path: Path, poses: Poses, prefix: str) -> None:
+    folder = tmp_path / "scene"
+    iphone = write_iphone(room, folder, poses, prefix=prefix)
+    for given in (folder, iphone):
+        recognized = layout_of(given)
+        assert recognized is not None
+        assert recognized.name == "ScanNet++"
+    assert find_scenes([tmp_path]) == (folder,)
+    read = load_scene(folder)
+    ours, theirs = views_of(read), views_of(room)
+    np.testing.assert_allclose(ours.cameras.cam_from_world, theirs.cameras.cam_from_world, atol=1e-5)
+    np.testing.assert_allclose(ours.cameras.Ks, theirs.cameras.Ks, rtol=1e-6)
+    assert ours.images is not None
+    assert ours.depths is not None
+    assert ours.masks is not None
+    assert theirs.images is not None
+    assert theirs.depths is not None
+    for view in range(4):
+        assert np.abs(ours.images[view].astype(int) - theirs.images[view]).mean() < 3
+        np.testing.assert_allclose(ours.depths[view][2::4, 2::4], theirs.depths[view][2::4, 2::4], atol=6e-4)
+        assert not ours.masks[view][:9].any()
+        assert ours.masks[view][9:].all()
+    assert read.metres_per_unit == 1.0
+    assert (read.sfm_points is not None) == (poses == "colmap")
+
+
+def test_a_video_that_is_still_to_be_extracted_is_named_with_the_command(room: Scene, tmp_path: Path) -> None:
+    iphone = write_iphone(room, tmp_path / "scene", "colmap")
+    shutil.rmtree(iphone / "rgb")
+    with pytest.raises(InputError, match=r"extracted from rgb.mkv to rgb/ .* ffmpeg -i rgb.mkv -start_number 0"):
+        load_scene(tmp_path / "scene")
+    (iphone / "rgb.mkv").rename(iphone / "rgb.mp4")
+    with pytest.raises(InputError, match=r"ffmpeg -i rgb.mp4 -start_number 0"):
+        load_scene(iphone)
+    for stream in ("rgb.mp4", "depth.bin"):
+        (iphone / stream).unlink()
+    with pytest.raises(InputError, match=r"rgb.mkv, which is not here either"):
+        load_scene(tmp_path / "scene")
+
+
+def test_a_depth_stream_that_is_still_to_be_extracted_is_said(room: Scene, tmp_path: Path) -> None:
+    iphone = write_iphone(room, tmp_path / "scene", "colmap")
+    shutil.rmtree(iphone / "depth")
+    with pytest.warns(SceneWarning, match=r"depth.bin is still to be extracted to depth/"):
+        assert views_of(load_scene(iphone)).depths is None
+
+
+def test_frames_without_a_pose_or_depth_are_counted(room: Scene, tmp_path: Path) -> None:
+    iphone = write_iphone(room, tmp_path / "scene", "arkit")
+    path = iphone / "pose_intrinsic_imu.json"
+    content = json.loads(path.read_text())
+    del content["frame_000000"]
+    content["frame_000010"]["aligned_pose"][0][3] = float("nan")
+    path.write_text(json.dumps(content))
+    (iphone / "depth/frame_000020.png").unlink()
+    with pytest.warns(SceneWarning) as caught:
+        assert views_of(load_scene(iphone)).names == ("frame_000020.jpg", "frame_000030.jpg")
+    said = " ".join(str(warning.message) for warning in caught)
+    assert "1 of 4 frames are not in pose_intrinsic_imu.json and are left out (first: 'frame_000000.jpg')" in said
+    assert "1 of 4 frames lost tracking" in said
+    assert "1 of 2 depth files are missing (first: 'frame_000020.jpg')" in said
+
+
+@pytest.mark.parametrize("broken", ["[]", '{"frame_000000": 3}', '{"frame_000000": {"aligned_pose": [[1]]}}'])
+def test_poses_that_are_none_are_refused(room: Scene, tmp_path: Path, broken: str) -> None:
+    iphone = write_iphone(room, tmp_path / "scene", "arkit")
+    (iphone / "pose_intrinsic_imu.json").write_text(broken)
+    with pytest.raises(InputError, match="expected an object of frames|aligned_pose must have 4 rows of 4 numbers"):
+        load_scene(iphone)
