@@ -1,9 +1,11 @@
-"""Phrases that are no names of the table: whether the first box of each is a right object.
+"""Phrases that are no names of the table: whether the first box of each is a right object, and whether it is known
+where there is none.
 
-    python bench/phrases.py $S/scenes/house [--rooms 48] [--text minilm_l6]
+    python bench/phrases.py $S/scenes/house [--first 40 --count 8 --every 1] [--text minilm_l6]
 
 The phrases of `bench/house_phrases.csv` were written before the first run. Labels are fused in the space of the text
-tower, and each phrase is asked in every room that holds one of its right objects well enough seen to be asked for.
+tower, and every phrase is asked in every room. It is present where a right object is seen in five views and with 60
+pixels, and absent where no right object is listed at all.
 """
 
 import argparse
@@ -15,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from sklearn.metrics import roc_auc_score
 
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import find_scenes, load_scene
@@ -25,47 +28,63 @@ from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.text.build import OnnxTextConfig, vocabulary_of
+from gsencoder.types import SceneObject
 
 LEAST_IOU = 0.25
+BINS = 10
+
+
+def overlap(corners: tuple[np.ndarray, np.ndarray], right: list[SceneObject]) -> float:
+    return max((aabb_iou(*corners, o.aabb_min, o.aabb_max) for o in right), default=0.0)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes")
-    parser.add_argument("--rooms", type=int, default=48)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--count", type=int, default=48)
+    parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--text", default="minilm_l6")
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
     os.environ.setdefault("GSENCODER_MODELS", str(Path(options.scenes).parents[1] / "models"))
     words = vocabulary_of(OnnxTextConfig(model=options.text, pooling="mean"))
     with Path(__file__).with_name("house_phrases.csv").open(encoding="utf-8") as stream:
-        right = {row["phrase"]: set(row["right"].split(";")) for row in csv.DictReader(stream)}
-    hits: dict[str, list[tuple[bool, bool]]] = defaultdict(list)
-    for path in find_scenes([Path(options.scenes)])[: options.rooms]:
+        names = {row["phrase"]: set(row["right"].split(";")) for row in csv.DictReader(stream)}
+    present: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    absent: list[float] = []
+    last = options.first + options.count
+    for path in find_scenes([Path(options.scenes)])[options.first : last : options.every]:
         scene = load_scene(path)
-        objects = [o for o in scene.objects if o.name and o.views >= 5 and o.max_pixels >= 60]
         scene = replace(scene, gaussians=seed(scene))
         features = fuse(scene, build_teacher(LabelsConfig(), scene, words)).features
         scene = replace(scene, features={features.space.name: features})
-        asked = [phrase for phrase, names in right.items() if any(o.name in names for o in objects)]
-        boxes = localize(scene, asked, words, LocalizeConfig()).boxes
-        for phrase in asked:
-            first = next((box for box in boxes if box.query == phrase), None)
-            ious = [
-                aabb_iou(first.aabb_min, first.aabb_max, o.aabb_min, o.aabb_max) if first is not None else 0.0
-                for o in objects
-                if o.name in right[phrase]
-            ]
-            hits[phrase].append((first is not None, max(ious) >= LEAST_IOU))
-    rows = [hit for each in hits.values() for hit in each]
-    boxed, good = (np.array([hit[column] for hit in rows]) for column in (0, 1))
-    by_phrase = {phrase: float(np.mean([hit[1] for hit in each])) for phrase, each in hits.items()}
+        result = localize(scene, list(names), words, LocalizeConfig(min_probability=0.0))
+        for phrase, value in zip(names, result.probabilities.tolist(), strict=True):
+            listed = [o for o in scene.objects if o.name in names[phrase]]
+            seen = [o for o in listed if o.views >= 5 and o.max_pixels >= 60]
+            first = next((box for box in result.boxes if box.query == phrase), None)
+            if seen:
+                iou = 0.0 if first is None else overlap((first.aabb_min, first.aabb_max), seen)
+                present[phrase].append((value, iou))
+            elif not listed:
+                absent.append(value)
+        print(scene.name, flush=True)
+    values = np.array([pair for pairs in present.values() for pair in pairs])
+    level = LocalizeConfig().min_probability
+    boxed, right = values[:, 0] >= level, values[:, 1] >= LEAST_IOU
+    truth = np.concatenate([np.ones(len(values)), np.zeros(len(absent))])
+    scores = np.concatenate([values[:, 0], absent])
+    bins = np.minimum((scores * BINS).astype(int), BINS - 1)
+    gaps = [abs((truth - scores)[bins == one].mean()) * (bins == one).mean() for one in np.unique(bins)]
     print(
-        f"{len(hits)} phrases, {len(rows)} questions: first box right {good.mean():.3f}, boxed {boxed.mean():.3f}, "
-        f"right where boxed {good[boxed].mean():.3f}; mean over phrases {np.mean(list(by_phrase.values())):.3f}"
+        f"{len(present)} phrases, {len(values)} times present: first box right {(boxed & right).mean():.3f} "
+        f"({right.mean():.3f} with min_probability=0), boxed {boxed.mean():.3f}; {len(absent)} times absent: boxed "
+        f"{(np.array(absent) >= level).mean():.3f}; AUROC {roc_auc_score(truth, scores):.3f}, ECE {sum(gaps):.3f}"
     )
-    for phrase, share in sorted(by_phrase.items(), key=lambda item: item[1]):
-        print(f"  {share:.2f}  {np.mean([hit[0] for hit in hits[phrase]]):.2f} boxed  {len(hits[phrase]):2d}  {phrase}")
+    for phrase, pairs in sorted(present.items(), key=lambda item: np.mean([pair[1] >= LEAST_IOU for pair in item[1]])):
+        median, share = np.median([pair[0] for pair in pairs]), np.mean([pair[1] >= LEAST_IOU for pair in pairs])
+        print(f"  right {share:.2f}  median probability {median:.3f}  {len(pairs):2d}  {phrase}")
 
 
 if __name__ == "__main__":

@@ -195,17 +195,6 @@ def test_a_text_encoder_without_names_gives_probabilities_too() -> None:
     assert table.boxes[0].probability == phrases.boxes[0].probability
 
 
-def test_phrases_that_are_no_names_need_less() -> None:
-    """A phrase is boxed above the level for phrases, and never asked for more than a name."""
-    everything = quietly(SCENE, ["spoon"], Phrases(), EVERYTHING)
-    value = float(everything.probabilities[0])
-    for name_level, phrase_level, boxed in ((1.0, value * 0.9, True), (1.0, value * 1.1, False), (0.0, 1.0, True)):
-        config = LocalizeConfig(min_probability=name_level, min_phrase_probability=phrase_level)
-        assert bool(quietly(SCENE, ["spoon"], Phrases(), config).boxes) == boxed
-    names = quietly(SCENE, ["spoon"], TABLE, LocalizeConfig(min_probability=1.0, min_phrase_probability=0.0))
-    assert not names.boxes
-
-
 def test_rivals_of_another_space_are_refused() -> None:
     other = make_text_table(WORDS, TABLE.embeddings, "another")
     with pytest.raises(InputError, match="another"):

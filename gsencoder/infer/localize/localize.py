@@ -16,6 +16,7 @@ from gsencoder.infer.localize.cluster import cluster
 from gsencoder.infer.localize.presence import Evidence, Presence, probability
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
+from gsencoder.text.build import closed_table
 from gsencoder.text.encoder import TextEncoder, check_space
 from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable
@@ -72,14 +73,6 @@ class LocalizeConfig:
         metadata={"help": "boxes that are less probable are left out, and words without a box are absent; 0 = none"},
     )
 
-    min_phrase_probability: float = field(
-        default=0.001,
-        metadata={
-            "help": "the same for phrases that are no names of the text table, whose probabilities are lower; the "
-            "smaller of both counts"
-        },
-    )
-
     def __post_init__(self) -> None:
         if self.mode not in ("centred", "raw"):
             raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
@@ -96,9 +89,8 @@ class LocalizeConfig:
                 raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         if not 0 <= self.min_share <= 1:
             raise InputError(f"min_share: expected a share in [0, 1], got {self.min_share}")
-        for name in ("min_probability", "min_phrase_probability"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"{name}: expected a probability in [0, 1], got {getattr(self, name)}")
+        if not 0 <= self.min_probability <= 1:
+            raise InputError(f"min_probability: expected a probability in [0, 1], got {self.min_probability}")
 
 
 _DEFAULT = LocalizeConfig()
@@ -117,10 +109,10 @@ def localize(
 
     Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
     score that `gsencoder.infer.localize.boxes.score_clusters` and the probability that
-    `gsencoder.infer.localize.presence` defines. Boxes that are less probable than `config.min_probability`, for phrases
-    `config.min_phrase_probability`, are left out, and a word that has no box is absent. Axis-aligned and oriented boxes
-    are drawn around Gaussian means, unless `config.extent` says "sigma", and have the scene's origin added back in
-    float64. A word's boxes do not depend on the other queries, unless `config.contrast` is on.
+    `gsencoder.infer.localize.presence` defines. Boxes that are less probable than `config.min_probability` are left
+    out, and a word that has no box is absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless
+    `config.extent` says "sigma", and have the scene's origin added back in float64. A word's boxes do not depend on the
+    other queries, unless `config.contrast` is on.
 
     Args:
         scene: Gaussians with features.
@@ -128,7 +120,8 @@ def localize(
         text: turns words into the features' space.
         config: see there.
         space: name of the feature set; None where the scene has only one.
-        rivals: words that may fit the Gaussians better than those asked; None = those of `text`, if it is a table.
+        rivals: words that may fit the Gaussians better than those asked; None = the names that
+            `text` knows, if it knows any.
 
     Returns:
         Relevancy, thresholds, probabilities, and the boxes best first within each word.
@@ -144,10 +137,9 @@ def localize(
     probabilities = [[probability(each) for each in one.evidence] for one in candidates.words]
     boxes = []
     for word, one, values in zip(queries, candidates.words, probabilities, strict=True):
-        level = config.min_probability
-        if not _is_name(word, text):
-            level = min(level, config.min_phrase_probability)
-        probable = [(each, value) for each, value in zip(one.clusters, values, strict=True) if value >= level]
+        probable = [
+            (each, value) for each, value in zip(one.clusters, values, strict=True) if value >= config.min_probability
+        ]
         boxes += boxes_of_word(
             word,
             probable,
@@ -212,8 +204,8 @@ def find_candidates(
     check_space(features.space, text.space)
     if rivals is not None:
         check_space(features.space, rivals.space)
-    elif isinstance(text, TextTable):
-        rivals = text
+    elif isinstance(text, (TextTable, OpenVocabulary)):
+        rivals = closed_table(text)
     vectors = text.encode(list(queries))
     cosines = scores = relevancy(features, vectors, text.mean)
     if config.contrast or config.mode == "raw":
@@ -290,11 +282,6 @@ def _negatives(text: TextEncoder, words: Sequence[str]) -> Float32[np.ndarray, "
     if unknown and not known:
         known = [(text.mean / max(float(np.linalg.norm(text.mean)), 1e-12))[None].astype(np.float32)]
     return np.concatenate(known) if known else np.zeros((0, text.space.channels), np.float32)
-
-
-def _is_name(word: str, text: TextEncoder) -> bool:
-    table = text.table if isinstance(text, OpenVocabulary) else text
-    return isinstance(table, TextTable) and table.find(word) is not None
 
 
 def _warn_about_absent(scene: str, localization: Localization) -> None:

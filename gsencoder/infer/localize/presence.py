@@ -2,13 +2,15 @@
 
 The evidence of a cluster c of the word q, with centered cosines cos and weights w normalized over the cluster:
 
-    mean        Σ wᵢ cos(fᵢ, q)
+    mean        Σ wᵢ cos(fᵢ, q), relative to the best that a name of the vocabulary reaches
     margin      mean − max over rivals r of Σ wᵢ cos(fᵢ, r): negative where another word of the vocabulary fits better
     prominence  log((best cosine in c − median) / spread), of the word's cosines over the scene
     size        log10 of the number of Gaussians
     share       of the cluster in the weight of all that was selected for the word
 
-Words whose cosine with q is `SYNONYM` or more are no rivals: "couch" does not speak against "sofa". The coefficients
+Words whose cosine with q is `SYNONYM` or more are no rivals: "couch" does not speak against "sofa". A phrase such as
+"something to sit on" is less like any name than names are like themselves: its cosines are taken relative to the
+largest that it has with a name of the vocabulary, and the names that come as near to it are no rivals. The coefficients
 were fitted by `bench/presence.py`; `docs/measurements.md` has the reliability of the probabilities.
 """
 
@@ -29,6 +31,8 @@ from gsencoder.types import GaussianFeatures
 SYNONYM = 0.77
 """Centered cosine of two words from which on they are no rivals. Names that are beside each other in the rooms of the
 fit go up to 0.75 (dining table and table); couch and sofa have 0.82, tv and television 0.89."""
+LEAST_ATTAINABLE = 0.3
+"""A phrase whose best name has a smaller cosine than this is not understood, and not helped any further."""
 SMALLEST_SPREAD = 1e-3
 """Spread of relevancy below which that of the background counts as this: a scene of one kind alone has none."""
 
@@ -108,9 +112,11 @@ class Presence:
             return []
         direction = word_directions(word[None], self._text_mean)
         target = self._axes.project(direction)[0]
-        rivals = None
+        rivals, attainable = None, 1.0
         if self._rivals is not None:
-            rivals = self._rival_targets[self._rivals @ direction[0] < SYNONYM]
+            likeness = self._rivals @ direction[0]
+            attainable = float(np.clip(likeness.max(), LEAST_ATTAINABLE, 1))
+            rivals = self._rival_targets[likeness < SYNONYM * attainable]
         median, spread = background(cosines[np.isfinite(cosines)])
         listed = []
         for each in clusters:
@@ -118,7 +124,7 @@ class Presence:
             weights = self._features.weights[rows].astype(np.float64)
             # Cosines are linear in the directions, so that those of a cluster's mean direction are the mean cosines.
             mean_direction = (weights / weights.sum()) @ self._axes.directions_of(self._features.features[rows])
-            mean = float(target @ mean_direction)
+            mean = min(float(target @ mean_direction) / attainable, 1.0)
             margin = None
             if rivals is not None and len(rivals):
                 margin = mean - float((rivals @ mean_direction).max())
