@@ -182,14 +182,15 @@ def _run(command: Command, config: Any, debug: bool) -> None:
         run(config, summary)
 
 
-def _run_one(command: Command, config: Any, debug: bool) -> int:
-    """Runs one of several runs; its error is printed, and the others continue."""
+def _run_one(command: Command, config: Any, debug: bool) -> str:
+    """Runs one of several runs; its error is printed and returned, and the others continue."""
     try:
         _run(command, config, debug)
     except InputError as error:
-        _report("error", f"{config.out}: {error}", debug)
-        return 2
-    return 0
+        message = f"{config.out}: {error}"
+        _report("error", message, debug)
+        return message
+    return ""
 
 
 @contextmanager

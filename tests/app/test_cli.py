@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -343,6 +344,30 @@ def test_many_runs_complain_like_one(
     assert said in err
     assert err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["hydra/launcher=nowhere"], "no such launcher is installed; .*pip install 'gsencoder\\[slurm\\]'"),
+        (["hydra/launcher=submitit_local", "hydra.launcher.timeout_mim=1"], "timeout_mim: Hydra has no such setting"),
+        (
+            ["hydra/launcher=submitit_slurm", "+hydra.launcher.additional_parameters.account=mine"],
+            "submitit_slurm: .*srun.*the logs of the jobs are in .*submitit",
+        ),
+    ],
+)
+def test_a_launcher_that_cannot_start_jobs_says_so_in_one_line(
+    toy: Any, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    if "submitit" in words[0]:
+        pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    monkeypatch.setenv("PATH", "")
+    assert cli.main(["toy", "-m", "size=1,2", f"out={tmp_path / 'out'}", *words]) == 2
+    err = capsys.readouterr().err
+    assert re.search(said, err)
+    assert err.count("\n") == 1
 
 
 def test_a_launcher_in_another_process_can_take_a_run(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Many scenes in one command: what is finished is skipped, what fails waits for the end, and processes share."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -151,3 +153,30 @@ def test_a_broken_scene_does_not_stop_the_others_on_the_command_line(
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"one", "two"}
     assert (tmp_path / "out" / "two" / "summary.json").stat().st_mtime_ns == before
     assert json.loads((tmp_path / "out" / "one" / "summary.json").read_text())["results"]["views"] == 3
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_jobs_of_submitit_share_the_scenes_and_their_failures_come_back(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    for name in ("one", "two", "three"):
+        write_box(tmp_path / "scenes" / name, box_views(box_cameras(3, width=64, height=48, focal=45.0)))
+    broken, out = tmp_path / "scenes" / "two" / "transforms.json", tmp_path / "out"
+    good = broken.read_text()
+    broken.write_text(good.replace("file_path", "path"))
+    # In a process of its own: the launcher sets signal handlers and environment variables for good.
+    command = [sys.executable, "-W", "ignore", "-m", "gsencoder", "fuse", str(tmp_path / "scenes"), "teacher=palette"]
+    command += [f"out={out}", "-m", "worker=0,1", "hydra/launcher=submitit_local", "hydra.launcher.timeout_min=10"]
+    first = subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)
+    assert first.returncode == 2
+    # Both workers meet the broken scene.
+    assert first.stderr.count("1 of 3 scenes failed") == 1
+    assert "frame 0 has no file_path" in first.stderr
+    assert first.stderr.endswith("error: 2 of 2 runs failed\n")
+    assert {path.name for path in out.iterdir()} == {"one", "three", "multirun.yaml", ".submitit"}
+    before = (out / "one" / "summary.json").stat().st_mtime_ns
+    broken.write_text(good)
+    again = subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)
+    assert (again.returncode, again.stderr) == (0, "")
+    assert (out / "two" / "features.safetensors").is_file()
+    assert (out / "one" / "summary.json").stat().st_mtime_ns == before

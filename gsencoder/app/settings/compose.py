@@ -37,6 +37,8 @@ Config = TypeVar("Config", bound=CommonConfig)
 
 SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
 """Form of the value of a text option that is swept, with -m."""
+HYDRA_KEY = re.compile(r"\+{0,2}hydra[./]")
+"""Settings of Hydra itself, with -m; + adds one, as `+hydra.launcher.additional_parameters.account=…`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,7 +141,7 @@ def read_words(
                 raise InputError("a path is empty; leave it out or name a file")
             paths.append(word)
             continue
-        full = key if sweep and re.match(r"hydra[./]", key) else _full_key(key, choices)
+        full = key if sweep and HYDRA_KEY.match(key) else _full_key(key, choices)
         if full is None and os.path.lexists(word):
             paths.append(word)
         elif full is None and (removed := removed_option(key, choices.options)) is not None:
@@ -219,10 +221,19 @@ def _is_list(option: Option) -> bool:
 
 
 def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) -> str:
-    """The message of an error of Hydra; it is explained if an option belongs to a member that was not chosen."""
+    """The message of an error of Hydra; it is explained if an option belongs to a member that was not chosen, or to no
+    launcher, or if the launcher is not installed."""
+    missing = re.search(r"Could not find 'hydra/launcher/([^']+)'", str(error))
+    if missing:
+        return (
+            f"hydra/launcher={missing[1]}: no such launcher is installed; submitit_slurm and submitit_local come with "
+            "pip install 'gsencoder[slurm]'"
+        )
     match = re.search(r"Could not override '([^']+)'", str(error))
     if match and match[1] in given:
         key = match[1]
+        if HYDRA_KEY.match(key):
+            return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
         section = key.rpartition(".")[0]
         group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
         now = given.get(group, choices.chosen.get(group))

@@ -35,16 +35,17 @@ from gsencoder.core.errors import InputError
 OmegaConf.register_new_resolver("text", unseal, replace=True)
 
 
-def _job(composed: Any, *, cls: type[CommonConfig], run: Callable[[Any], int], swept: Sequence[str]) -> int:
-    """Runs one job in its folder and returns the exit code, so that a failed run does not stop the others."""
+def _job(composed: Any, *, cls: type[CommonConfig], run: Callable[[Any], str], swept: Sequence[str]) -> str:
+    """Runs one job in its folder and returns its error, so that a failed run does not stop the others."""
     from hydra.core.hydra_config import HydraConfig
 
     job = HydraConfig.get()
     try:
         config = typed(cls, plain_settings(composed))
     except InputError as error:
-        print(one_line(f"error: run {job.job.num}: {error}"), file=sys.stderr)
-        return 2
+        message = f"run {job.job.num}: {error}"
+        print(one_line(f"error: {message}"), file=sys.stderr)
+        return message
     assert config.out is not None
     if not config.quiet:
         values = [text for text in job.overrides.task if text.partition("=")[0] in swept]
@@ -58,13 +59,20 @@ def run_many(
     command: str,
     cls: type[CommonConfig],
     words: Sequence[str],
-    run: Callable[[Any], int],
+    run: Callable[[Any], str],
     conf: Path | None = None,
 ) -> int:
-    """Calls `run(settings)` for every combination of the values given and returns the largest exit code.
+    """Calls `run(settings)` for every combination of the values given and returns the exit code: 2 if one failed.
+
+    Args:
+        command: its name.
+        cls: the class of its settings.
+        words: the command line after the command.
+        run: does one run, prints its error and returns it; an empty text for none.
+        conf: folder of YAML files; None = the package's.
 
     Raises:
-        InputError: the words are not settings of this command, or out= is missing.
+        InputError: the words are not settings of this command, out= is missing, or the launcher fails.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -86,17 +94,30 @@ def run_many(
     written = [f"{key}={value}" for key, value in hydra_settings.items() if key not in given] + requested
     parsed = OverridesParser.create().parse_overrides(requested)
     swept = tuple(override.get_key_element() for override in parsed if override.is_sweep_override())
+    launcher = given.get("hydra/launcher", "basic")
     job = partial(_job, cls=cls, run=run, swept=swept)
     with open_hydra(command, cls, conf) as hydra:
         try:
             batches = hydra.multirun(command, job, written, with_log_configuration=False)
         except HydraException as error:
             raise InputError(hydra_error(error, given, choices)) from error
-    codes = [int(result.return_value) for batch in batches for result in batch]
-    failed = sum(code != 0 for code in codes)
+        except Exception as error:
+            # The basic launcher returns the exceptions of a run; others raise their own, of many types.
+            if launcher == "basic":
+                raise
+            raise InputError(
+                f"hydra/launcher={launcher}: {error}; the logs of the jobs are in "
+                f"{given['out']}/.submitit unless hydra.launcher.submitit_folder= says otherwise"
+            ) from error
+    errors = [str(result.return_value) for batch in batches for result in batch]
+    failed = [error for error in errors if error]
     if failed:
-        print(f"error: {failed} of {len(codes)} runs failed", file=sys.stderr)
-    return max(codes, default=0)
+        if launcher != "basic":
+            # Jobs in other processes print into logs of their own; workers of one list may fail at the same scenes.
+            for message in dict.fromkeys(failed):
+                print(one_line(f"error: {message}"), file=sys.stderr)
+        print(f"error: {len(failed)} of {len(errors)} runs failed", file=sys.stderr)
+    return 2 if failed else 0
 
 
 def _check_out(command: str, given: dict[str, str], choices: Choices) -> None:
