@@ -359,6 +359,15 @@ def test_workers_are_spawned_and_make_the_same_samples(dataset: Prepared, tmp_pa
     np.testing.assert_allclose(losses(tmp_path / "alone"), losses(tmp_path / "helped"), rtol=1e-5)
 
 
+EIGHT_GPUS = """
+import torch
+
+def refuse() -> None:
+    raise AssertionError("the GPU was used")
+
+torch.cuda.is_available, torch.cuda.device_count, torch.cuda._lazy_init = lambda: True, lambda: 8, refuse
+"""
+"""Lets torch say that the machine has GPUs, and lets every use of one fail."""
 SCRIPT = """
 import sys
 from dataclasses import replace
@@ -383,11 +392,12 @@ if __name__ == "__main__":
 """
 
 
-def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int) -> Path:
+def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int, before: str = "") -> Path:
     folder.mkdir(exist_ok=True)
     path = folder / "run.py"
     path.write_text(
-        SCRIPT.format(
+        before
+        + SCRIPT.format(
             tests=str(Path(__file__).resolve().parent.parent),
             prepared=str(dataset[0].folder),
             names=dataset[1],
@@ -400,9 +410,11 @@ def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int) -> P
 
 
 @pytest.mark.alone
-def test_two_processes_follow_the_losses_of_one(dataset: Prepared, tmp_path: Path) -> None:
+def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_one(
+    dataset: Prepared, tmp_path: Path
+) -> None:
     alone = script(dataset, tmp_path / "one", steps=6, accumulate=2)
-    pair = script(dataset, tmp_path / "two", steps=6, accumulate=1)
+    pair = script(dataset, tmp_path / "two", steps=6, accumulate=1, before=EIGHT_GPUS)
     subprocess.run([sys.executable, "-W", "ignore", str(alone)], check=True, timeout=300)
     launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
