@@ -9,7 +9,7 @@ from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import blend
-from gsencoder.types import Cameras, Scene, Views
+from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
 
 
 def camera(width: int, height: int) -> Cameras:
@@ -76,3 +76,69 @@ def test_selected_views_read_what_belongs_to_them_when_it_is_asked_for() -> None
     assert read == [2, 0]
     assert float(chosen.select([1]).depths[0][0, 0]) == 0  # type: ignore[index]
     assert [float(depth[0, 0]) for depth in chosen.depths[1:]] == [0]
+
+
+def test_views_need_a_name_and_an_entry_for_each_camera(no_jaxtyping: None) -> None:
+    two = camera(8, 6).select([0, 0])
+    with pytest.raises(InputError, match=r"Views\.names: expected 2 names, one a camera, got 1"):
+        Views(cameras=two, names=("a",))
+    with pytest.raises(InputError, match=r"Views\.names: expected unique names, got 1 repeated"):
+        Views(cameras=two, names=("a", "a"))
+    for field in ("images", "depths", "masks", "instances"):
+        with pytest.raises(InputError, match=rf"Views\.{field}: expected 2 entries, one a camera, got 1"):
+            Views(cameras=two, names=("a", "b"), **{field: [np.zeros((6, 8))]})
+    assert len(Views(cameras=two, names=("a", "b"))) == 2
+
+
+def test_selected_views_have_all_that_belongs_to_them_also_by_slices_and_from_the_end() -> None:
+    cameras = camera(8, 6).select([0, 0, 0, 0])
+    kinds = {"images": np.uint8, "depths": np.float32, "masks": bool, "instances": np.int32}
+    entries = {
+        name: [np.full((6, 8, 3) if name == "images" else (6, 8), view % 2 if kind is bool else view, kind)
+               for view in range(4)]
+        for name, kind in kinds.items()
+    }  # fmt: skip
+    chosen = Views(cameras=cameras, names=tuple("abcd"), **entries).select([3, 1, 2])
+    assert len(chosen) == 3
+    for name in kinds:
+        items = getattr(chosen, name)
+        assert len(items) == 3
+        for row, view in enumerate((3, 1, 2)):
+            np.testing.assert_array_equal(items[row], entries[name][view])
+        np.testing.assert_array_equal(items[-1], entries[name][2])
+        assert [item.max() for item in items[::-2]] == [item.max() for item in (entries[name][2], entries[name][3])]
+        with pytest.raises(IndexError):
+            items[3]
+    assert Views(cameras=cameras, names=tuple("abcd")).select([]).names == ()
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a\0b"])
+def test_the_name_of_a_scene_can_be_that_of_a_folder(name: str) -> None:
+    with pytest.raises(InputError, match=r"Scene\.name: expected a name that a folder can have"):
+        Scene(name=name)
+
+
+def test_up_and_origin_of_a_scene_are_three_float64(no_jaxtyping: None) -> None:
+    for up in (np.array([0.0, 0, 1.01]), np.array([0.0, 0.98, 0]), np.array([0.0, 1.0]), np.array([0, 1, 0])):
+        with pytest.raises(InputError, match=r"Scene\.up"):
+            Scene(name="a", up=up)
+    for origin in (np.array([0.0, np.inf, 0]), np.zeros(4), np.zeros(3, np.float32)):
+        with pytest.raises(InputError, match=r"Scene\.origin"):
+            Scene(name="a", origin=origin)
+    assert Scene(name="..a", up=np.array([0.0, 0.6, 0.8])).origin.tolist() == [0, 0, 0]
+
+
+def test_features_lie_on_the_gaussians_of_their_scene() -> None:
+    space = FeatureSpace(name="a", channels=2)
+    features = GaussianFeatures(
+        features=np.zeros((5, 2), np.float32), weights=np.ones(5, np.float32), mean=np.zeros(2, np.float32), space=space
+    )
+    Scene(name="a", gaussians=random_gaussians(5), features={"a": features})
+    for gaussians, got in ((None, "no Gaussians"), (random_gaussians(4), "4 Gaussians")):
+        with pytest.raises(InputError, match=rf"Scene\.features\['a'\]: expected 5 Gaussians to lie on, got {got}"):
+            Scene(name="a", gaussians=gaussians, features={"a": features})
+
+
+def test_an_object_that_nobody_counted_has_no_views() -> None:
+    thing = SceneObject(id=3, name=None, aabb_min=np.zeros(3), aabb_max=np.ones(3))
+    assert (thing.placed, thing.views, thing.max_pixels) == (True, 0, 0)

@@ -11,8 +11,21 @@ from textured_box import box_views, write_box
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.up import estimate_up, surfaces_of_gaussians, up_of_cameras, up_of_scene, with_up
-from gsencoder.types import Cameras, Gaussians, Scene
+from gsencoder.data.up import (
+    Surfaces,
+    _bells,
+    _floor_area,
+    _refine,
+    _sphere,
+    _support,
+    estimate_up,
+    surfaces_of_depth,
+    surfaces_of_gaussians,
+    up_of_cameras,
+    up_of_scene,
+    with_up,
+)
+from gsencoder.types import Cameras, Gaussians, Scene, Views
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -124,3 +137,141 @@ def test_up_can_be_stated_when_a_scene_is_read(tmp_path: Path) -> None:
     for wrong in ((0.0, 0.0, 0.0), (float("inf"), 0.0, 0.0)):
         with pytest.raises(InputError, match="up: expected three finite numbers"):
             SceneConfig(up=wrong)
+
+
+def test_the_candidates_lie_evenly_on_the_sphere() -> None:
+    """Their mean is zero and their second moments are those of the sphere, a third of the unit matrix."""
+    sphere = _sphere(4000)
+    np.testing.assert_allclose(np.linalg.norm(sphere, axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(sphere.mean(axis=0), 0, atol=1e-3)
+    np.testing.assert_allclose(sphere.T @ sphere / 4000, np.eye(3) / 3, atol=1e-3)
+    nearest = np.rad2deg(np.arccos(np.sort(sphere @ sphere.T, axis=1)[:, -2].clip(-1, 1)))
+    assert 2.5 < nearest.min() <= nearest.max() < 3.5
+
+
+def test_bells_are_one_on_their_axis_and_fall_off_as_a_gaussian_of_six_degrees() -> None:
+    cosines = np.cos(np.deg2rad([0.0, 6, 45, 84, 90, 96, 174, 180]))
+    lying, standing = _bells(cosines)
+    e = np.exp(-1)
+    np.testing.assert_allclose(lying, [1, e, 0, 0, 0, 0, e, 1], atol=1e-9)
+    np.testing.assert_allclose(standing, [0, 0, 0, e, 1, e, 0, 0], atol=1e-9)
+
+
+def test_support_is_the_area_that_lies_and_half_of_what_stands() -> None:
+    normals = np.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [np.sqrt(0.5), 0, np.sqrt(0.5)]])
+    areas = np.array([0.2, 0.1, 0.4, 0.3])
+    np.testing.assert_allclose(_support(UP[None], normals, areas), [0.2 + 0.1 + 0.5 * 0.4], atol=1e-6)
+    many = np.concatenate((np.tile(UP, (600, 1)), np.array([[0.0, 1, 0]])))
+    np.testing.assert_allclose(_support(many, normals, areas), [0.5] * 600 + [0.5], atol=1e-6)
+
+
+def test_a_refined_direction_is_what_floors_and_walls_agree_on() -> None:
+    made = np.random.default_rng(0)
+    tilt = Rotation.from_rotvec(np.deg2rad([3.0, -2.0, 0])).as_matrix()
+    exact = np.concatenate([np.tile(axis, (200, 1)) for axis in np.eye(3)]) @ tilt.T
+    noisy = exact + 0.02 * made.normal(size=exact.shape)
+    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    found = _refine(UP, noisy, np.full(600, 1 / 600))
+    assert degrees(found, tilt @ UP) < 0.2
+    # Floors and walls that contradict each other by 2°: one floor counts as much as two walls of its area.
+    leaning = Rotation.from_rotvec(np.deg2rad([0, 2.0, 0])).as_matrix()
+    normals = np.array([[0.0, 0, 1], leaning @ [1.0, 0, 0]])
+    assert degrees(_refine(UP, normals, np.array([1.0, 2.0])), UP) == pytest.approx(1.0, abs=0.02)
+    assert degrees(_refine(UP, normals, np.array([1.0, 1.0])), UP) == pytest.approx(2 / 3, abs=0.02)
+
+
+def test_surfaces_of_gaussians_are_their_thin_axes_and_areas_count_opacity() -> None:
+    rotations = Rotation.random(3, random_state=0)
+    scales = np.array([[0.01, 0.2, 0.3], [0.2, 0.01, 0.5], [0.2, 0.3, 0.11]], np.float32)
+    some = Gaussians(
+        means=np.arange(9, dtype=np.float32).reshape(3, 3),
+        quats=rotations.as_quat(scalar_first=True).astype(np.float32),
+        scales=scales,
+        opacities=np.array([0.5, 1.0, 1.0], np.float32),
+        sh=np.zeros((3, 1, 3), np.float32),
+    )
+    found = surfaces_of_gaussians(some)
+    order = np.argsort(found.means[:, 0])
+    # The third is thicker than half of its middle axis.
+    np.testing.assert_allclose(found.means[order], some.means[:2])
+    axes = rotations.as_matrix()
+    for row, axis in ((0, axes[0][:, 0]), (1, axes[1][:, 1])):
+        assert abs(found.normals[order][row] @ axis) == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(found.areas[order], (0.2 * 0.3 * 0.5, 0.2 * 0.5), rtol=1e-6)
+
+
+def test_areas_of_depth_samples_are_those_of_the_surfaces(room: Scene) -> None:
+    """Of a plane across the view, seen by all pixels, z² / (fx fy) each; of a slanted one more by its cosine."""
+    width, height, focal = 64, 48, 60.0
+    cameras = Cameras(
+        cam_from_world=np.eye(4, dtype=np.float32)[None],
+        Ks=np.array([[[focal, 0, 32], [0, focal, 24], [0, 0, 1]]], np.float32),
+        widths=np.array([width], np.int32),
+        heights=np.array([height], np.int32),
+    )
+    columns = np.tile((np.arange(width) + 0.5 - 32) / focal, (height, 1))
+    for slope in (0.0, 1.0):
+        depth = (2 / (1 - slope * columns)).astype(np.float32)
+        views = Views(cameras=cameras, names=("a",), depths=[depth])
+        found = surfaces_of_depth(views)
+        normal = np.array([slope, 0, -1]) / np.hypot(1, slope)
+        np.testing.assert_allclose(np.abs(found.normals @ normal), 1, atol=1e-3)
+        z = found.means[:, 2]
+        rays = found.means / z[:, None]
+        exact = z**2 / focal**2 / np.abs(rays @ normal) * np.linalg.norm(rays, axis=1)
+        np.testing.assert_allclose(found.areas, exact, rtol=0.01)
+        np.testing.assert_allclose(z, 2 + slope * found.means[:, 0], rtol=2e-3)
+
+
+def test_the_side_of_a_bare_splat_with_the_floor_is_down() -> None:
+    """A floor, a smaller table top and walls on all sides, upside down or not."""
+    made = np.random.default_rng(0)
+    floor = np.concatenate((made.uniform(-2, 2, (800, 2)), np.zeros((800, 1))), axis=1)
+    ceiling = np.concatenate((made.uniform(-1, 1, (300, 2)), np.full((300, 1), 2.5)), axis=1)
+    wall = np.concatenate(
+        (np.full((400, 1), 2.0), made.uniform(-2, 2, (400, 1)), made.uniform(0, 2.5, (400, 1))), axis=1
+    )
+    means = np.concatenate((floor, ceiling, wall))
+    normals = np.repeat([[0.0, 0, 1], [0, 0, 1], [1, 0, 0]], (800, 300, 400), axis=0)
+    areas = np.full(1500, 1.0)
+    for number in range(3):
+        rotation = Rotation.random(random_state=number).as_matrix()
+        up = estimate_up(Surfaces(means @ rotation.T, normals @ rotation.T, areas), None)
+        assert degrees(up.direction, rotation @ UP) < 0.5
+    area = _floor_area(UP, means, normals, areas / 1500)
+    assert area == pytest.approx((800 - 0.5 * 300) / 1500, abs=0.01)
+    assert _floor_area(-UP, means, normals, areas / 1500) == pytest.approx((300 - 0.5 * 800) / 1500, abs=0.01)
+    assert _floor_area(UP, means[:1], normals[:1], areas[:1]) == 0
+
+
+def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room: Scene) -> None:
+    assert room.views is not None
+    cameras = room.views.cameras
+    level = estimate_up(None, cameras)
+    assert (level.source, level.from_cameras) == ("cameras", 0.0)
+    assert level.confidence > 0.99
+    rolled = cameras.cam_from_world.astype(np.float64)
+    for view, angle in enumerate(np.linspace(-0.5, 0.5, len(rolled))):
+        rolled[view, :3] = Rotation.from_rotvec([0, 0, angle]).as_matrix() @ rolled[view, :3]
+    right = rolled[:, 0, :3]
+    other = estimate_up(None, replace(cameras, cam_from_world=rolled.astype(np.float32)))
+    assert other.confidence == pytest.approx(1 - 3 * np.mean(np.square(right @ other.direction)), abs=1e-5)
+    assert estimate_up(None, cameras.select([0, 1])).confidence == 0
+    found = up_of_scene(room)
+    assert found is not None
+    assert found.from_cameras is not None
+    assert found.from_cameras < 0.02
+    assert found.to_dict() == {
+        "direction": found.direction.tolist(), "source": "cameras and surfaces", "confidence": found.confidence,
+    }  # fmt: skip
+    assert found.describe().endswith(f"estimated from cameras and surfaces, confidence {found.confidence:.2f}")
+
+
+def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room: Scene) -> None:
+    """Only a wall is seen: its normal is no up, though it has all the area."""
+    assert room.views is not None
+    prior = up_of_cameras(room.views.cameras)
+    across = np.array([1.0, 0, 0])
+    up = estimate_up(Surfaces(np.zeros((50, 3)), np.tile(across, (50, 1)), np.ones(50)), room.views.cameras)
+    assert degrees(up.direction, prior) <= 40.0
+    assert abs(up.direction @ across) < 0.1

@@ -43,7 +43,8 @@ def view_spreads(residual: Float64[np.ndarray, "V V n"]) -> Float64[np.ndarray, 
 
 
 def surface_normals(views: DepthViews, view: int) -> Float64[np.ndarray, "h w 3"]:
-    """Unit normals of a depth image in the world, from differences between neighboring pixels; NaN without depth."""
+    """Unit normals of a depth image in the world, from differences between neighboring pixels; NaN beside pixels
+    without depth."""
     depth = views.depths[view].astype(np.float64) * views.scale
     depth[depth <= 0] = np.nan
     height, width = depth.shape
