@@ -90,6 +90,18 @@ def test_workers_begin_at_different_scenes_and_leave_alone_what_another_one_does
     assert "another run is writing it now" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("names", ["a", "ab"])
+def test_without_an_output_folder_results_lie_in_outputs(
+    tmp_path: Path, names: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = [tmp_path / name for name in names]
+    options = {"overwrite": False, "worker": 0, "screen": console()}
+    run_scenes(paths, None, "features", Work(), Summary("fuse", SETTINGS), **options)
+    for name in names:
+        assert (Path("outputs") / name / "features" / "name.txt").read_text() == name
+
+
 def test_a_scene_that_another_process_finished_meanwhile_is_no_failure(tmp_path: Path) -> None:
     class Late(Work):
         def __call__(self, path: Path, out: Path, summary: Summary) -> None:

@@ -163,6 +163,15 @@ def test_colors_of_one_place_correlate_wherever_they_are_seen_from(views: Views,
     assert np.isnan(color_correlations(small, dim, small.Ks)[0]).all()
 
 
+def test_colors_are_compared_where_both_photographs_show_the_place(small: DepthViews) -> None:
+    """Photographs of a longer focal length leave out the edges of the depth images."""
+    narrow = box_views(box_cameras(COUNT, width=96, height=72, focal=1.5 * 67.2))
+    grey = grey_pictures(narrow, np.arange(COUNT), small.depths.shape[1:])
+    known = color_correlations(small, grey, small.with_focal_times(1.5).Ks)
+    assert np.nanmedian(known) > 0.9
+    assert np.nanmin(known) > 0.6
+
+
 def test_the_correlation_of_a_view_is_its_median_in_both_directions() -> None:
     nan = np.nan
     found = view_correlations(np.array([[nan, 0.1, 0.2], [0.3, nan, nan], [nan, nan, nan]]))

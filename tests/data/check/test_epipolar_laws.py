@@ -135,6 +135,14 @@ def test_of_few_views_none_is_astray(matches: list[PairMatches]) -> None:
     assert [finding.view for finding in _stray_views(errors, four, NAMES)] == ["0.png"]
 
 
+def test_two_pairs_are_enough_to_call_a_view_astray_and_one_is_not(matches: list[PairMatches]) -> None:
+    two = [pair for pair in matches if pair.second < 4 and (pair.first, pair.second) != (0, 3)]
+    errors = np.array([9.0 if pair.first == 0 else 0.1 for pair in two])
+    assert [finding.view for finding in _stray_views(errors, two, NAMES)] == ["0.png"]
+    one = [pair for pair in two if (pair.first, pair.second) != (0, 2)]
+    assert _stray_views(np.array([9.0 if pair.first == 0 else 0.1 for pair in one]), one, NAMES) == []
+
+
 def test_groups_of_three_neighbors_are_spread_over_all_views() -> None:
     assert _spread_triples(24, 24).tolist() == list(range(24))
     assert _spread_triples(25, 6).tolist() == [0, 1, 2, 22, 23, 24]
@@ -150,14 +158,14 @@ def test_matches_that_fit_no_fundamental_matrix_are_left_out(matches: list[PairM
     pair = matches[0]
     noisy = pair.second_pixels.copy()
     noisy[:15] = made.uniform(0, 240, (15, 2))
-    kept = consistent_matches([replace(pair, second_pixels=noisy)])
-    assert len(kept) == 1
-    assert 45 <= len(kept[0].first_pixels) <= 50
+    (found,) = consistent_matches([replace(pair, second_pixels=noisy)])
+    assert 45 <= len(found.first_pixels) <= 50
     few = slice(0, MIN_MATCHES - 1)
     assert consistent_matches([replace(pair, first_pixels=pair.first_pixels[few], second_pixels=noisy[few])]) == []
     exactly = slice(60 - MIN_MATCHES, 60)
     again = replace(pair, first_pixels=pair.first_pixels[exactly], second_pixels=pair.second_pixels[exactly])
     assert len(consistent_matches([again])) == 1
-    mostly = pair.second_pixels.copy()
-    mostly[:40] = made.uniform(0, 240, (40, 2))
-    assert consistent_matches([replace(pair, second_pixels=mostly)]) == []
+    for right, wrong, kept in ((40, 40, True), (30, 70, False)):
+        first = np.concatenate((pair.first_pixels[:right], made.uniform(0, 240, (wrong, 2))))
+        second = np.concatenate((pair.second_pixels[:right], made.uniform(0, 240, (wrong, 2))))
+        assert bool(consistent_matches([replace(pair, first_pixels=first, second_pixels=second)])) == kept

@@ -102,6 +102,10 @@ def test_cameras_that_look_apart_are_taken_to_look_ten_neighbors_away() -> None:
     assert typical_distance(replace(cameras, cam_from_world=mixed)) == pytest.approx(2, rel=0.05)
 
 
+def test_two_cameras_that_look_at_one_point_are_as_far_from_it_as_they_are() -> None:
+    assert typical_distance(arc(2, 30.0)) == pytest.approx(2, rel=1e-5)
+
+
 def test_distances_between_neighbors_count_each_place_once() -> None:
     assert nearest_distances(np.array([[0.0, 0, 0]])).tolist() == []
     centers = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [4, 0, 0]])
