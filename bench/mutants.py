@@ -42,6 +42,30 @@ MODULES = (
     *("data/seeding/depth", "data/readers/transforms_json", "reconstruct/prune"),
 )
 FOLDERS = {"geometry": ("tests/test_geometry.py", "tests/render", "tests/data")}
+CHECKS = ("color_agreement", "depth_agreement", "epipolar", "pose_readings", "readings", "scene_check", "stray_views")
+REPAIRS = ("data/check/registration_fit", "data/check/repair_scene", "data/readers/write_transforms")
+LAYOUTS = ("registration", "replica", "scannetpp", "seven_scenes", "tum")
+FILES = ("layouts", "posed")
+PHOTOGRAPHS = ("feature_matches", "from_photographs", "triangulate", "view_pairs")
+SCENE_FILES = {
+    **{f"data/check/{name}": ("tests/data/check",) for name in CHECKS},
+    **dict.fromkeys(REPAIRS, ("tests/data/check", "tests/app/commands/test_inspect_scene.py")),
+    **{f"data/readers/{name}": ("tests/data/readers", "tests/data/test_layouts.py") for name in LAYOUTS},
+    **{
+        f"data/readers/{name}": (
+            "tests/data/readers",
+            "tests/data/test_layouts.py",
+            "tests/data/test_scenes.py",
+            "tests/data/test_transforms_json.py",
+        )
+        for name in FILES
+    },
+    **{f"data/seeding/{name}": ("tests/data/seeding", "tests/data/test_triangulate.py") for name in PHOTOGRAPHS},
+    "data/up": ("tests/data/test_up.py",),
+    "app/runs/scene_queue": ("tests/app/test_scene_queue.py",),
+    "types/scene": ("tests/test_types.py",),
+}
+"""Modules that read, check and seed scenes of others, drawn with `--scenes`, and the tests that belong to them."""
 NOT_COPIED = shutil.ignore_patterns(".git", ".venv", "outputs", "dist", "build", ".*_cache")
 
 SWAPS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
@@ -145,15 +169,21 @@ def draw(module: str, count: int, seed: int) -> list[Mutant]:
 
 def test_files(project: Path, module: str) -> tuple[list[str], list[str]]:
     """Test files that belong to a module, and the rest of its folder."""
+    if module in SCENE_FILES:
+        named = [path for place in SCENE_FILES[module] for path in _tests_at(project / place)]
+        return [str(path.relative_to(project)) for path in named], []
     folders = FOLDERS.get(module, (f"tests/{module.partition('/')[0]}",))
-    files = [path for folder in folders for path in sorted(project.joinpath(folder).glob("**/test_*.py"))]
-    files += [project / folder for folder in folders if folder.endswith(".py")]
+    files = [path for folder in folders for path in _tests_at(project / folder)]
     name, stem = "gsencoder." + module.replace("/", "."), module.rpartition("/")[2]
     named = [path for path in files if path.stem == f"test_{stem}"]
     importing = [path for path in files if path not in named and re.search(rf"\b{name}\b", path.read_text())]
     first = [*named, *importing]
     relative = [[str(path.relative_to(project)) for path in part] for part in (first, files)]
     return relative[0], [path for path in relative[1] if path not in relative[0]]
+
+
+def _tests_at(path: Path) -> list[Path]:
+    return [path] if path.suffix == ".py" else sorted(path.glob("**/test_*.py"))
 
 
 def run_tests(folder: Path, files: list[str], limit: float) -> tuple[str, str]:
@@ -213,7 +243,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=5, help="faults of each module")
-    parser.add_argument("--modules", nargs="+", default=MODULES, choices=MODULES, metavar="MODULE")
+    parser.add_argument("--modules", nargs="+", choices=(*MODULES, *SCENE_FILES), metavar="MODULE")
+    parser.add_argument("--scenes", action="store_true", help="modules that read, check and seed scenes of others")
     parser.add_argument("--out", type=Path, help="default: outputs/mutants_SEED.jsonl")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="judge the survivors once more")
@@ -227,7 +258,8 @@ def main() -> None:
     for line in out.read_text().splitlines() if out.exists() else []:
         row = json.loads(line)
         known[Mutant(*(row[name] for name in Mutant.__dataclass_fields__))] = row
-    mutants = [mutant for module in chosen.modules for mutant in draw(module, chosen.count, chosen.seed)]
+    modules = chosen.modules or (tuple(SCENE_FILES) if chosen.scenes else MODULES)
+    mutants = [mutant for module in modules for mutant in draw(module, chosen.count, chosen.seed)]
     due = [each for each in mutants if each not in known or (chosen.again and not known[each]["killed"])]
     # Started in the background, this process ignores the signal that tests of stopping send, and so would they.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -247,7 +279,7 @@ def main() -> None:
             fault = f"{mutant.module}:{mutant.line}  {mutant.before}  →  {mutant.after}"
             print(f"{verdict:<8} {fault}  {row['test']}", flush=True)
 
-        for module in chosen.modules:
+        for module in modules:
             faults = [each for each in due if each.module == module]
             if not faults:
                 continue
@@ -258,7 +290,7 @@ def main() -> None:
                     sys.exit(f"{module}: without a fault its tests end with: {end} {test}")
             with ThreadPoolExecutor(chosen.jobs) as pool:
                 list(pool.map(work, faults))
-    for module in chosen.modules:
+    for module in modules:
         rows = [known[each] for each in mutants if each.module == module]
         print(f"{module:<22} {sum(row['killed'] for row in rows)} of {len(rows)}")
     print(f"killed: {sum(known[each]['killed'] for each in mutants) / len(mutants):.2f} of {len(mutants)}")

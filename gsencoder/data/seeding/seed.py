@@ -21,7 +21,9 @@ from gsencoder.data.seeding.depth import depth_samples, read_rgbd
 from gsencoder.data.seeding.flat import flat_gaussians
 from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
 from gsencoder.data.seeding.points import seed_from_points, typical_spacing
+from gsencoder.data.seeding.room_frame import room_frame
 from gsencoder.types import Gaussians, Scene, Views
+from gsencoder.types.poses import invert_rigid, transform
 
 __all__ = ["SeedConfig", "seed", "seed_from_depth", "seed_from_mesh", "seed_from_points", "seed_from_tsdf"]
 
@@ -153,7 +155,8 @@ def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_dep
 
     Frames are read one at a time. Depth is smoothed within its own noise; pixels that float between two surfaces are
     dropped; samples are averaged by voxel, facing and layer (see surface_grid.py), so that thin objects keep their
-    edges. The result does not depend on the order of the views beyond rounding.
+    edges. The grid stands in a frame that turns and moves with the scene (see room_frame.py). The order of the views
+    changes no more than rounding, unless there are more than those a frame is taken from.
 
     Args:
         views: posed depth and images; masked pixels are not used.
@@ -166,6 +169,11 @@ def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_dep
     """
     if not 0 < voxel < math.inf:
         raise InputError(f"seeds: voxel must be a positive length, got {voxel}")
+    frame = room_frame(views)
+    world_from_frame = np.eye(4) if frame is None else invert_rigid(frame)
+    if frame is not None:
+        poses = views.cameras.cam_from_world.astype(np.float64) @ world_from_frame
+        views = replace(views, cameras=replace(views.cameras, cam_from_world=poses.astype(np.float32)))
     samples, empty = depth_samples(views, voxel=voxel, min_cos=min_cos, max_depth=max_depth)
     if not len(samples.points):
         raise InputError(
@@ -178,7 +186,11 @@ def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_dep
             SceneWarning,
             stacklevel=2,
         )
-    return flat_gaussians(samples.points, samples.normals, samples.colors, largest=LARGEST_SPACING * voxel)
+    points, normals = samples.points, samples.normals
+    if frame is not None:
+        points = transform(world_from_frame, points).astype(np.float32)
+        normals = (normals @ world_from_frame[:3, :3].T).astype(np.float32)
+    return flat_gaussians(points, normals, samples.colors, largest=LARGEST_SPACING * voxel)
 
 
 def _voxel(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:

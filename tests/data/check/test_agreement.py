@@ -23,7 +23,7 @@ from gsencoder.data.check.depth_agreement import (
     world_samples,
 )
 from gsencoder.data.check.pose_readings import other_orders
-from gsencoder.data.check.readings import other_readings
+from gsencoder.data.check.readings import _best_factor, other_readings
 from gsencoder.data.check.registration_fit import MIN_SHARED, _details, fit_registration
 from gsencoder.data.check.scene_check import _needed, check_depth, check_scene
 from gsencoder.data.check.stray_views import fit_pose, surface_normals, view_spreads
@@ -202,6 +202,14 @@ def test_the_focal_length_of_the_depth_is_refined_between_the_factors_that_are_t
     readings = {reading.cause: reading for reading in other_readings(wrong, np.arange(COUNT), small.cam_from_world)}
     assert readings["depth focal length"].factor == pytest.approx(0.87, rel=2e-3)
     assert {reading.factor for cause, reading in readings.items() if cause not in ("depth scale", "order")} >= {None}
+
+
+def test_a_factor_under_which_hardly_anything_is_compared_says_nothing(small: DepthViews) -> None:
+    wrong = small.with_focal_times(1.2)
+    few = replace(small, values=np.where(np.arange(SAMPLES) < 5, small.values, 0))
+    assert agreement(residuals(few)).spread < agreement(residuals(wrong)).spread
+    found = _best_factor("depth scale", lambda factor: few if factor == 2.0 else wrong, (1.0, 2.0))
+    assert found.factor != 2.0
 
 
 def test_normals_of_a_box_are_those_of_its_walls_and_there_are_none_beside_missing_depth(small: DepthViews) -> None:

@@ -121,6 +121,8 @@ def test_neighbors_of_a_sweep_stand_an_eighth_of_the_distance_apart_if_they_can(
     hidden = np.where(np.arange(21) < 10, 0.5, 1.0)
     assert _spread_neighbors(cameras, hidden, 10)[:2] == [14, 15]
     assert _spread_neighbors(cameras, np.zeros(21), 10) == []
+    # A hundredth of the points is the least to share.
+    assert _spread_neighbors(cameras, np.where(np.arange(21) == 6, 0.011, 0.008), 10) == [6]
     twins = cameras.select([0, 0, 0])
     assert _spread_neighbors(twins, overlaps(twins, 1.0)[0], 0) == []
     assert 0 < MIN_COVERAGE < 1
