@@ -210,7 +210,8 @@ def test_depth_of_an_iphone_has_its_own_size_and_the_photographs_field_of_view(t
     assert posed.up is not None
     assert (posed.up.tolist(), posed.metres_per_unit) == ([0, 0, 1], 1)
     image.depth.unlink()
-    assert read_scannetpp(iphone).images[0].depth is None
+    with pytest.warns(SceneWarning, match="1 of 1 depth files are missing"):
+        assert read_scannetpp(iphone).images[0].depth is None
 
 
 def test_photographs_of_the_dslr_come_first_and_through_colmap_where_there_is_no_transforms_json(
