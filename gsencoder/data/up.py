@@ -35,6 +35,9 @@ FLAT = 0.5
 """Gaussians whose thinnest axis is above this share of the middle one have no normal."""
 MIN_CONFIDENCE = 0.1
 """Below this, surfaces alone say nothing about up."""
+MIN_CONFIDENCE_NEAR_USUAL = 0.05
+"""The same within `MAX_TILT` of -y, which is up in the worlds of COLMAP and of most splats, and what is assumed where
+surfaces say nothing."""
 FLOOR_THICKNESS = 0.01
 """Thickness of the slices in which floors are sought, as a share of the scene's extent along up."""
 
@@ -174,9 +177,13 @@ def with_up(scene: Scene) -> tuple[Scene, Up | None]:
     """The scene with `up` filled in where its files do not state it, and how it is known; None, and the scene as it
     is, where nothing says or where the surfaces of a bare splat lean nowhere (`MIN_CONFIDENCE`)."""
     up = up_of_scene(scene)
-    if up is None or (up.source == "surfaces" and up.confidence < MIN_CONFIDENCE):
+    if up is None or (up.source == "surfaces" and up.confidence < _needed_confidence(up.direction)):
         return scene, None
     return (scene if scene.up is not None else replace(scene, up=up.direction)), up
+
+
+def _needed_confidence(direction: Float64[np.ndarray, "3"]) -> float:
+    return MIN_CONFIDENCE_NEAR_USUAL if -direction[1] >= np.cos(MAX_TILT) else MIN_CONFIDENCE
 
 
 def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:

@@ -275,3 +275,18 @@ def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room: Scene) -
     up = estimate_up(Surfaces(np.zeros((50, 3)), np.tile(across, (50, 1)), np.ones(50)), room.views.cameras)
     assert degrees(up.direction, prior) <= 40.0
     assert abs(up.direction @ across) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("direction", "confidence", "used"),
+    [((0, -1, 0), 0.06, True), ((0, -0.8, -0.6), 0.06, True), ((0, 0, 1), 0.06, False), ((0, -1, 0), 0.04, False),
+     ((0, 0, 1), 0.11, True), ((0, 1, 0), 0.06, False)],
+)  # fmt: skip
+def test_surfaces_of_a_bare_splat_need_less_where_they_say_what_is_assumed_anyway(
+    monkeypatch: pytest.MonkeyPatch, direction: tuple[float, ...], confidence: float, used: bool
+) -> None:
+    estimate = Up(direction=np.array(direction), confidence=confidence, source="surfaces", from_cameras=None)
+    monkeypatch.setattr("gsencoder.data.up.up_of_scene", lambda scene: estimate)
+    scene, up = with_up(Scene(name="bare"))
+    assert (up is estimate) == used
+    assert (scene.up is not None) == used
