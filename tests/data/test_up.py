@@ -286,7 +286,9 @@ def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room: Scene) -
 def test_surfaces_of_a_bare_splat_need_less_where_they_say_what_is_assumed_anyway(
     monkeypatch: pytest.MonkeyPatch, direction: tuple[float, ...], confidence: float, used: bool
 ) -> None:
-    estimate = Up(direction=np.array(direction, np.float64), confidence=confidence, source="surfaces", from_cameras=None)
+    estimate = Up(
+        direction=np.array(direction, np.float64), confidence=confidence, source="surfaces", from_cameras=None
+    )
     monkeypatch.setattr("gsencoder.data.up.up_of_scene", lambda scene: estimate)
     scene, up = with_up(Scene(name="bare"))
     assert (up is estimate) == used

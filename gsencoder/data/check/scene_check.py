@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.core.errors import SceneWarning
+from gsencoder.core.errors import SceneWarning, listed
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.check.color_agreement import color_correlations, grey_pictures, view_correlations
@@ -44,6 +44,8 @@ UNRELATED = 0.3
 """Photographs whose colors correlate by less than this across views show something else than the depth."""
 SAME_FACTOR = 0.03
 """Depth and photographs whose focal lengths are off by factors this near to each other share one wrong camera."""
+PHOTOGRAPHS = 4
+"""So many are looked at for pictures of one color."""
 SUSPICIOUS = 0.9
 """`suspicious_depth` looks for the cause where a smaller share of the depth agrees."""
 
@@ -117,9 +119,19 @@ def fit_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> float:
 
 
 def warn_of_faults(scene: Scene) -> None:
-    """Warns if a quick look at a scene's depth images says that they, or the poses, are wrong."""
+    """Warns if a quick look at a scene's photographs and depth images says that they, or the poses, are wrong."""
     views = scene.views
-    if views is None or views.depths is None or len(views) < 2:
+    if views is None:
+        return
+    plain, looked_at = plain_photographs(views)
+    if plain:
+        warnings.warn(
+            f"scene {scene.name}: {len(plain)} of {looked_at} photographs that were looked at are of one color all over: "
+            f"{listed(plain)}",
+            SceneWarning,
+            stacklevel=2,
+        )
+    if views.depths is None or len(views) < 2:
         return
     _, finding = suspicious_depth(views)
     if finding is not None:
@@ -129,6 +141,15 @@ def warn_of_faults(scene: Scene) -> None:
             SceneWarning,
             stacklevel=2,
         )
+
+
+def plain_photographs(views: Views) -> tuple[list[str], int]:
+    """The names of photographs whose pixels all have one color, of up to four, and how many were looked at."""
+    if views.images is None or not len(views):
+        return [], 0
+    chosen = even_indices(len(views), PHOTOGRAPHS)
+    plain = [int(view) for view in chosen if (views.images[int(view)] == views.images[int(view)][:1, :1]).all()]
+    return [views.names[view] for view in plain], len(chosen)
 
 
 def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:

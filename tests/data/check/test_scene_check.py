@@ -6,12 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from splats import front_camera
 from textured_box import box_cameras, box_views, look
 
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.check.depth_agreement import agreement_map, depth_views, residuals
 from gsencoder.data.check.epipolar import check_matches
-from gsencoder.data.check.scene_check import check_depth, check_scene, suspicious_depth, warn_of_faults
+from gsencoder.data.check.scene_check import (
+    check_depth,
+    check_scene,
+    plain_photographs,
+    suspicious_depth,
+    warn_of_faults,
+)
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.types import Scene, Views
 from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
@@ -268,3 +275,12 @@ def test_the_cameras_that_the_box_is_seen_by_are_its_own() -> None:
     points = cameras.unproject(pixels.reshape(-1, 2), depth.reshape(-1).astype(np.float64), 1)
     nearest = np.abs(np.abs(points) - np.array([2.0, 2.5, 1.4])).min(axis=1)
     assert nearest.max() < 1e-5
+
+
+def test_photographs_of_one_color_are_counted_and_named() -> None:
+    grey, other = np.full((6, 8, 3), 128, np.uint8), np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
+    cameras = front_camera(8, 6).select(np.zeros(3, np.int64))
+    views = Views(cameras=cameras, names=("a", "b", "c"), images=[grey, other, grey])
+    assert plain_photographs(views) == (["a", "c"], 3)
+    with pytest.warns(SceneWarning, match="2 of 3 photographs that were looked at are of one color all over: a, c"):
+        warn_of_faults(Scene(name="s", views=views))
