@@ -126,8 +126,8 @@ def warn_of_faults(scene: Scene) -> None:
     plain, looked_at = plain_photographs(views)
     if plain:
         warnings.warn(
-            f"scene {scene.name}: {len(plain)} of {looked_at} photographs that were looked at are of one color all over: "
-            f"{listed(plain)}",
+            f"scene {scene.name}: {len(plain)} of {looked_at} photographs that were looked at are of one color all "
+            f"over: {listed(plain)}",
             SceneWarning,
             stacklevel=2,
         )
