@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.files.model_files import check_fetched
 
 EXTRA = "pip install 'gsencoder[teachers]'"
 BLOCK_BYTES = 1 << 24
@@ -47,8 +48,9 @@ def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = 
                 ignore_mismatched_sizes=True,
             )
     except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError, SafetensorError) as error:
-        message = " ".join(str(error).split())[:160]
-        raise InputError(f"{what}: {folder} holds no model that transformers reads: {message}") from error
+        for path in folder.glob("*.safetensors"):
+            check_fetched(path)
+        raise _unreadable(folder, what, error) from error
     _check_keys(folder, model, report, what, other_parts)
     return model.eval()
 
@@ -67,8 +69,17 @@ def read_config(folder: Path, what: str) -> Any:
         with quiet_transformers():
             return AutoConfig.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
     except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError) as error:
-        message = " ".join(str(error).split())[:160]
-        raise InputError(f"{what}: {folder} holds no model that transformers reads: {message}") from error
+        raise _unreadable(folder, what, error) from error
+
+
+def _unreadable(folder: Path, what: str, error: Exception) -> InputError:
+    message = " ".join(str(error).split())
+    if "custom code" in message or "trust_remote_code" in message:
+        return InputError(
+            f"{what}: {folder}: the model needs Python code of its own, which is never run; give a model of a kind "
+            "that transformers knows"
+        )
+    return InputError(f"{what}: {folder} holds no model that transformers reads: {message[:160]}")
 
 
 @contextmanager

@@ -69,8 +69,8 @@ def words_of_table(table: TextTable, config: TextConfig = TableTextConfig()) -> 
     if table.tower is None or table.tower.identity != tower.identity:
         made_by = table.tower.describe() if table.tower is not None else repr(table.space.text_encoder)
         raise InputError(
-            f"text.model={config.model}: words for these features are made by {made_by}, and this tower is "
-            f"{tower.name!r} ({tower.identity})"
+            f"text.model={config.model}: the words were made by {made_by}, and this is {tower.name!r} "
+            f"({tower.identity}); give that one: its model, tokenizer and text.pooling= must be the same"
         )
     return OpenVocabulary(table, lambda: tower)
 

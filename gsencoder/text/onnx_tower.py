@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files.model_files import check_fetched, find_file
 from gsencoder.core.pretrained import digest_files
-from gsencoder.text.towers import NO_TEMPLATES, check_templates, unit
+from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
 Pooling = Literal["mean", "cls", "eos", "output"]
 GRAPHS = ("model.onnx", "onnx/model.onnx", "text_model.onnx")
@@ -105,10 +105,13 @@ class OnnxTower:
         return unit(np.stack([self._pool(*self._run(self._tokens(phrase))) for phrase in phrases]))
 
     def _tokens(self, phrase: str) -> Int64[np.ndarray, " T"]:
-        encoded = self._tokenizer.encode(phrase)
+        try:
+            encoded = self._tokenizer.encode(phrase)
+        except Exception as error:  # tokenizers raises plain Exceptions
+            message = " ".join(str(error).split())[:120]
+            raise InputError(f"{self._folder}: tokenizer.json cannot read {phrase[:60]!r}: {message}") from error
         inside = [token for token, special in zip(encoded.ids, encoded.special_tokens_mask, strict=True) if not special]
-        if not inside or all(token == self._unknown for token in inside):
-            raise InputError(f"query {phrase[:60]!r}: holds no word that its tokenizer knows")
+        check_known(phrase, inside, self._unknown)
         if self._longest and len(encoded.ids) > self._longest:
             raise InputError(
                 f"query {phrase[:60]!r}…: has {len(encoded.ids)} tokens; the tower takes at most {self._longest}"
@@ -178,6 +181,8 @@ class OnnxTower:
         positions = _read_json(self._folder / "config.json").get("max_position_embeddings")
         limits = [self._fixed, truncation.get("max_length"), settings, positions]
         self._longest = min((limit for limit in limits if isinstance(limit, int) and 0 < limit < 1 << 20), default=0)
+        # What looks like a special token in a phrase is text.
+        self._tokenizer.encode_special_tokens = True
         # Neither in silence: a phrase that is cut is another phrase.
         self._tokenizer.no_truncation()
         self._tokenizer.no_padding()
@@ -220,7 +225,8 @@ def _load_graph(path: Path, threads: int) -> Any:
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises its own classes, which share only this base
-        message = " ".join(str(error).split())[:120]
+        check_fetched(path)
+        message = " ".join(str(error).replace(str(path), path.name).split())[:120]
         raise InputError(f"{path}: is no model that onnxruntime reads: {message}") from error
 
 

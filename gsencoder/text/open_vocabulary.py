@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, about
 from gsencoder.text.embedding_cache import cached_vectors
 from gsencoder.text.reference_nouns import REFERENCE_NOUNS
 from gsencoder.text.table import MAX_SHOWN, TextTable, normalize
@@ -132,9 +132,10 @@ def make_vocabulary(
         kind=kind, name=tower.name, identity=tower.identity, pooling=tower.pooling, templates=tuple(templates)
     )
     space = FeatureSpace(name=tower.identity, channels=tower.channels, text_encoder=tower.identity)
-    vectors = cached_vectors(
-        record.identity, templates, REFERENCE_NOUNS, lambda missing: embed_in_templates(tower, missing, templates)
-    )
+    with about(f"text tower {tower.name} cannot embed everyday words, so its tokenizer may be that of another model"):
+        vectors = cached_vectors(
+            record.identity, templates, REFERENCE_NOUNS, lambda missing: embed_in_templates(tower, missing, templates)
+        )
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     table = TextTable(names=REFERENCE_NOUNS, embeddings=vectors, space=space, mean=mean, tower=record)
     return OpenVocabulary(table, lambda: tower).including(names)

@@ -107,6 +107,26 @@ def check_phrase(phrase: str) -> str:
     return text
 
 
+def check_known(phrase: str, tokens: Sequence[int], unknown: int | None) -> None:
+    """Checks that a tokenizer knows all of a phrase; with a part of it unknown another phrase would be embedded.
+
+    Args:
+        phrase: for the message.
+        tokens: of the phrase, without special ones at its ends.
+        unknown: the token for what is not known; None where there is none.
+
+    Raises:
+        InputError: nothing, or not all of it, is known.
+    """
+    if not tokens or all(token == unknown for token in tokens):
+        raise InputError(f"query {phrase[:60]!r}: holds no word that its tokenizer knows")
+    if unknown in tokens:
+        raise InputError(
+            f"query {phrase[:60]!r}: its tokenizer does not know {tokens.count(unknown)} of its {len(tokens)} parts; "
+            "leave these out"
+        )
+
+
 def embed_in_templates(
     tower: TextTower, phrases: Sequence[str], templates: Sequence[str]
 ) -> Float32[np.ndarray, "Q D"]:

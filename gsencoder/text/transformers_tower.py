@@ -13,9 +13,10 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import find_file
 from gsencoder.core.pretrained import digest_files, load_pretrained, quiet_transformers, read_config
 from gsencoder.text.onnx_tower import Pooling, stated_pooling
-from gsencoder.text.towers import NO_TEMPLATES, check_templates, unit
+from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
 WHAT = "text tower"
+VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
 TOKENIZER_FILES = ("tokenizer*.json", "vocab*", "merges.txt", "*.model", "special_tokens_map.json")
 
 
@@ -142,8 +143,7 @@ class TransformersTower:
     def _vector(self, phrase: str) -> Float32[np.ndarray, " D"]:
         text = canonical(phrase) if self._lower else phrase
         bare = self._tokenizer(text, add_special_tokens=False)["input_ids"]
-        if not bare or all(token == self._tokenizer.unk_token_id for token in bare):
-            raise InputError(f"query {phrase[:60]!r}: holds no word that its tokenizer knows")
+        check_known(phrase, bare, self._tokenizer.unk_token_id)
         count = len(self._tokenizer(text)["input_ids"])
         if self._longest and count > self._longest:
             raise InputError(f"query {phrase[:60]!r}…: has {count} tokens; the tower takes at most {self._longest}")
@@ -185,9 +185,14 @@ def _choose_pooling(folder: Path, model_type: str, asked: str) -> str:
 def _load_tokenizer(folder: Path) -> Any:
     from transformers import AutoTokenizer
 
+    # Without any of these transformers makes a tokenizer that knows nothing.
+    if not any(path for pattern in VOCABULARIES for path in folder.glob(pattern)):
+        raise InputError(f"{WHAT}: {folder}: the tokenizer is missing; expected tokenizer.json beside the model")
     try:
         with quiet_transformers():
-            return AutoTokenizer.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
+            # What looks like a special token in a phrase is text.
+            options = {"local_files_only": True, "trust_remote_code": False, "split_special_tokens": True}
+            return AutoTokenizer.from_pretrained(str(folder), **options)
     except Exception as error:  # tokenizers raises plain Exceptions
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{WHAT}: {folder} holds no tokenizer that transformers reads: {message}") from error

@@ -12,6 +12,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -95,6 +96,11 @@ def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Sce
         scene = load_scene(path, splat=config.splat or None, options=config.data)
     with summary.step("check"):
         warn_of_faults(scene)
+    if scene.views is None and isinstance(config.teacher, LabelsConfig):
+        raise InputError(
+            f"{path}: a splat without views has no labels for teacher=labels; give a teacher that looks at pictures, "
+            "such as teacher=palette, or teacher=mosaic text=minilm"
+        )
     if scene.gaussians is None:
         with summary.step("seeds"):
             scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))

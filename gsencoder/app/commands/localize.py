@@ -7,6 +7,7 @@ import numpy as np
 
 from gsencoder.app.commands.query_words import load_words, query_words
 from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
@@ -75,9 +76,9 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
                     picture.save(target / f"{name}.png")
     screen = console(config.quiet)
     for word in words:
-        screen.print(f"{word}: {_first_box(localization, word)}")
-    written = "boxes.json, words.json, boxes.ply and pictures"
-    screen.print(f"{out}: {written}; boxes are drawn around Gaussian {config.localize.extent}")
+        screen.print(f"{one_line(word)}: {_first_box(localization, word)}")
+    drawn = "boxes.ply and pictures" if config.pictures and scene.views is not None else "boxes.ply"
+    screen.print(f"{out}: boxes.json, words.json, {drawn}; boxes are drawn around Gaussian {config.localize.extent}")
 
 
 def _first_box(localization: Localization, word: str) -> str:

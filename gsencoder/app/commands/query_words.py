@@ -5,7 +5,7 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, words_of_table
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, vocabulary_of, words_of_table
 from gsencoder.text.table import load_text_table
 
 MAX_QUERIES_BYTES = 1 << 20
@@ -55,9 +55,11 @@ def load_words(folder: Path, given: str, text: TextConfig = TableTextConfig()) -
     if given:
         return words_of_table(load_text_table(given), text)
     path = folder / WORDS_FILE
+    if not path.is_file() and not isinstance(text, TableTextConfig):
+        return vocabulary_of(text)
     if not path.is_file():
         raise InputError(
-            f"{folder}: the folder holds no text table for these features; fuse with a teacher that has words, or "
-            "give words="
+            f"{folder}: there is no {WORDS_FILE} beside these features: no words lead into them, or the file was lost; "
+            "fuse with a teacher that has words, or give words= or text="
         )
     return words_of_table(load_text_table(path), text)

@@ -88,8 +88,8 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
             targets = targets_of(scene.gaussians, localization, config.boxes)
         absent = {word: describe_absent(value) for word, value in localization.absent.items()}
         if not targets:
-            listing = ", ".join(f"{word} {text}" for word, text in absent.items())
-            raise InputError(f"views: none of {', '.join(words)} was found in scene {scene.name}: {listing}")
+            listing = ", ".join(f"{word!r} is {text}" for word, text in absent.items())
+            raise InputError(f"views: none of the words has a box in scene {scene.name}: {listing}")
         boxes = best_boxes(localization, config.boxes)
         summary.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
     with summary.step("choose"):

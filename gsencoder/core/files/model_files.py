@@ -8,6 +8,21 @@ from gsencoder.core.errors import InputError
 MODELS_VARIABLE = "GSENCODER_MODELS"
 
 
+POINTER = b"version https://git-lfs"
+"""What files begin with that stand for large ones in a repository."""
+
+
+def check_fetched(path: Path) -> None:
+    """Checks that a file is not the pointer that git keeps in the place of a large one.
+
+    Raises:
+        InputError: it is.
+    """
+    with path.open("rb") as stream:
+        if stream.read(len(POINTER)) == POINTER:
+            raise InputError(f"{path}: is a pointer of git-lfs and not the file itself; fetch it with git lfs pull")
+
+
 def find_file(name: str, option: str, *, folder: bool = False) -> Path:
     """The file at `name`, else the file of that name in the folder GSENCODER_MODELS.
 

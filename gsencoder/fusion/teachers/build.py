@@ -43,7 +43,18 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
     if isinstance(text, TableTextConfig):
         return text_table_of(config)
     if isinstance(config, PaletteConfig):
-        raise InputError(f"text={text.name}: teacher=palette has the words of its eleven colors; leave out text=")
+        raise InputError("text=: teacher=palette has the words of its eleven colors; leave out text=")
+    if isinstance(config, RadioConfig):
+        raise InputError("text=: no text tower speaks for the features of RADIO's backbone; leave out text=")
+    if isinstance(config, OnnxConfig) and config.classes:
+        raise InputError("text=: the classes of teacher.classes= have vectors of their own; leave out one of the two")
+    if isinstance(config, OnnxConfig) and not config.joint:
+        raise InputError(
+            "text=: the features of teacher=onnx are taken for those of the text tower if teacher.joint=true says that "
+            "both belong to one joint model, such as CLIP; other backbones have no words"
+        )
+    if isinstance(config, (OnnxConfig, SegmenterConfig)) and config.words:
+        raise InputError("text= and teacher.words= both say what words are; leave out one of them")
     return vocabulary_of(text)
 
 
@@ -70,7 +81,13 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
     if isinstance(config, PaletteConfig):
         return PaletteTeacher(config)
     if isinstance(config, OnnxConfig):
-        return OnnxTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
+        backbone = OnnxTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
+        if words is not None and words.space.channels != backbone.space.channels:
+            raise InputError(
+                f"teacher onnx: its features have {backbone.space.channels} channels and its words "
+                f"{words.space.channels} ({words.space.text_encoder}); expected both of one joint model"
+            )
+        return backbone
     if isinstance(config, RadioConfig):
         return RadioTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
     if isinstance(config, SegmenterConfig):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files.model_files import check_fetched, find_file
 from gsencoder.core.files.npz import read_npz
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
@@ -40,6 +40,10 @@ class OnnxConfig:
     top_k: int = field(default=5, metadata={"help": "classes in a mixture"})
     temperature: float = field(default=1.0, metadata={"help": "softmax temperature of the posteriors"})
     words: str = field(default="", metadata={"help": "text table that leads into the space; empty if none"})
+    joint: bool = field(
+        default=False,
+        metadata={"help": "the model is the image side of the joint model that text= is the text side of"},
+    )
     threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
 
     def __post_init__(self) -> None:
@@ -92,6 +96,7 @@ class OnnxTeacher:
         try:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises its own classes, which share only this base
+            check_fetched(path)
             raise InputError(f"teacher onnx: {path} is no model that onnxruntime reads: {str(error)[:120]}") from error
         self._path = path
         inputs = [tensor.name for tensor in self._session.get_inputs()]
@@ -206,7 +211,7 @@ class OnnxTeacher:
 
     def settings(self) -> dict[str, Any]:
         values = {name: getattr(self.config, name) for name in self.config.__dataclass_fields__}
-        del values["threads"], values["words"]
+        del values["threads"], values["words"], values["joint"]
         values["model"] = self._digest
         values["classes"] = Path(self.config.classes).name
         return {**{k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}}

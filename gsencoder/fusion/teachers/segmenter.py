@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.teachers.segmenter_classes import read_classes, synonyms_of_classes
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenter, OnnxSegmenterOptions
@@ -205,7 +205,8 @@ def _class_vectors(synonyms: Sequence[Sequence[str]], words: Words) -> Float32[n
     phrases = list(dict.fromkeys(phrase for each in synonyms for phrase in each))
     if not phrases:
         raise InputError("teacher segmenter: none of its classes is a kind of thing; check teacher.nothing")
-    vector_of = dict(zip(phrases, words.encode(phrases).astype(np.float64), strict=True))
+    with about("teacher segmenter: names of its classes"):
+        vector_of = dict(zip(phrases, words.encode(phrases).astype(np.float64), strict=True))
     mean = words.mean.astype(np.float64)
     table = np.stack([np.mean([vector_of[phrase] for phrase in each], axis=0) if each else mean for each in synonyms])
     return (table / np.sqrt((table**2).sum(axis=1, keepdims=True) + 1e-24)).astype(np.float32)

@@ -2,10 +2,11 @@
 
 import json
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning, listed
 
 MAX_CLASSES_BYTES = 1 << 22
 
@@ -16,9 +17,26 @@ def synonyms_of_classes(names: Sequence[str], nothing: Sequence[str]) -> list[li
     Args:
         names: of the classes.
         nothing: names of classes that are no kind of thing.
+
+    Raises:
+        InputError: a class has no name.
+
+    Warns:
+        SceneWarning: several classes have one name.
     """
     no_kind = {word.strip().casefold() for word in nothing}
-    return [[] if name.strip().casefold() in no_kind else _synonyms(name) for name in names]
+    synonyms = [[] if name.strip().casefold() in no_kind else _synonyms(name) for name in names]
+    for name, each in zip(names, synonyms, strict=True):
+        if not each and name.strip().casefold() not in no_kind:
+            raise InputError(f"teacher.classes: class {name!r} has no name; expected a word, or one of teacher.nothing")
+    if len(set(names)) < len(names):
+        doubled = sorted({name for name in names if list(names).count(name) > 1})
+        warnings.warn(
+            f"teacher.classes: {len(doubled)} names stand for several classes: {listed(doubled)}",
+            SceneWarning,
+            stacklevel=3,
+        )
+    return synonyms
 
 
 def _synonyms(name: str) -> list[str]:

@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.model_files import check_fetched
 from gsencoder.core.pretrained import digest_files
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.fusion.teachers.segmenter_classes import read_classes
@@ -75,7 +76,8 @@ class OnnxSegmenter:
         try:
             self._session = onnxruntime.InferenceSession(str(path), session_options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises its own classes, which share only this base
-            message = " ".join(str(error).split())[:120]
+            check_fetched(path)
+            message = " ".join(str(error).replace(str(path), path.name).split())[:120]
             raise InputError(f"teacher segmenter: {path} is no model that onnxruntime reads: {message}") from error
         self.name, self.options = path.stem, options
         inputs = {tensor.name: tensor for tensor in self._session.get_inputs()}

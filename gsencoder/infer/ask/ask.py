@@ -205,8 +205,8 @@ class Asker:
     def _nothing(self, words: Sequence[str], absent: Mapping[str, float]) -> str:
         if not words:
             return "the question names nothing to look for"
-        listing = (f"{word} {describe_absent(absent[word])}" if word in absent else word for word in words)
-        return f"nothing was found of {', '.join(listing)}"
+        listing = (f"{word!r} is {describe_absent(absent[word])}" if word in absent else repr(word) for word in words)
+        return f"none of the words has a box: {', '.join(listing)}"
 
     def _look_up(self, words: Sequence[str], question: Question) -> LookedUp:
         targets, boxes, absent = self._targets(words, question)

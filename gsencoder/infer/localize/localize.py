@@ -70,7 +70,10 @@ class LocalizeConfig:
     max_boxes: int = field(default=10, metadata={"help": "largest number of boxes for each word"})
     min_probability: float = field(
         default=0.02,
-        metadata={"help": "boxes that are less probable are left out, and words without a box are absent; 0 = none"},
+        metadata={
+            "help": "boxes that are less probable are left out, and words without a box are absent; 0 = every box that "
+            "reaches the threshold stays"
+        },
     )
 
     def __post_init__(self) -> None:
@@ -291,8 +294,8 @@ def _warn_about_absent(scene: str, localization: Localization) -> None:
         words = ", ".join(map(repr, list(absent)[:5])) + more
         values = ", ".join(f"{value:.2f}" for value in list(absent.values())[:5]) + more
         warnings.warn(
-            f"scene {scene}: {len(absent)} of {len(localization.queries)} words have no box ({words}): nothing answers "
-            f"them, or too improbably (probability {values})",
+            f"scene {scene}: {len(absent)} of {len(localization.queries)} words have no box ({words}): no cluster of "
+            f"Gaussians reaches their threshold and is probable enough (probability {values})",
             SceneWarning,
             stacklevel=3,
         )
