@@ -62,6 +62,16 @@ def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:
     assert step_seconds(300_000.0, 60_000.0, CPU, whole) > step_seconds(300_000.0, 60_000.0, CPU, USUAL)
 
 
+def test_on_two_cores_a_step_takes_the_seconds_that_were_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = replace(USUAL, shrinks=(1,), shares=(1.0,))
+    measured = 1.2 * (0.03 + 0.07 + 0.075)
+    for threads, cores, factor in ((2, 2, 1.0), (8, 2, 1.0), (2, 16, 1.0), (4, 4, 2**-0.8), (1, None, 2**0.8)):
+        monkeypatch.setattr("torch.get_num_threads", lambda threads=threads: threads)
+        monkeypatch.setattr("os.cpu_count", lambda cores=cores: cores)
+        assert step_seconds(100_000.0, 60_000.0, CPU, full) == pytest.approx(factor * measured)
+        assert step_seconds(100_000.0, 60_000.0, torch.device("cuda"), full) == pytest.approx(measured / 30)
+
+
 def optimizer(config: OptimizeConfig) -> Optimizer:
     photographs = Photographs(wall_views(depth=True))
     made = np.random.default_rng(0)

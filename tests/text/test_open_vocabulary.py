@@ -15,6 +15,7 @@ from gsencoder.text.open_vocabulary import OpenVocabulary, make_vocabulary
 from gsencoder.text.reference_nouns import REFERENCE_NOUNS
 from gsencoder.text.table import TextTable, load_text_table, save_text_table
 from gsencoder.text.towers import embed_in_templates, unit
+from gsencoder.text.transformers_tower import TransformersTextConfig
 
 
 class HashTower:
@@ -89,6 +90,26 @@ def test_without_the_tower_its_words_work_and_an_error_says_what_to_get(
     assert f"'mug with a handle': not among the {len(REFERENCE_NOUNS)} words stored with these features" in said
     assert "'hash' (onnx:0123456789abcdef); put its folder into GSENCODER_MODELS or give text=onnx" in said
     assert "known without it: handle, mug, …" in said
+
+
+def test_a_missing_tower_names_three_phrases_and_three_near_names_of_each(
+    tower: HashTower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("GSENCODER_MODELS", raising=False)
+    words = words_of_table(vocabulary(tower).table)
+    phrases = [f"{thing} by the chair, the lamp, the table and the bed" for thing in ("mug", "cup", "sofa", "door")]
+    with pytest.raises(InputError) as error:
+        words.encode(phrases)
+    said = str(error.value)
+    assert [phrase in said for phrase in phrases] == [True, True, True, False]
+    assert said.rpartition("known without it: ")[2].count(", ") == 9
+
+
+@pytest.mark.parametrize("config", [OnnxTextConfig, TransformersTextConfig])
+def test_a_template_needs_one_place_for_the_phrase(config: type) -> None:
+    for wrong in ((), ("a photo",), ("{} and {}",)):
+        with pytest.raises(InputError, match="templates: expected"):
+            config(templates=wrong)
 
 
 def test_a_tower_is_recognized_by_its_files_in_a_folder_of_another_name(
