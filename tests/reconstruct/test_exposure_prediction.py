@@ -88,6 +88,16 @@ def test_exposures_that_follow_nothing_are_taken_to_be_the_mean() -> None:
     assert predict_exposures(exposures(gains, np.array([1])), cameras(COUNT), []).maps.shape == (0, 3, 4)
 
 
+def test_two_photographs_are_enough_to_predict_from_and_one_is_not() -> None:
+    gains = np.linspace(0.5, 1.5, COUNT)
+    assert predict_exposures(exposures(gains, np.array([4])), cameras(COUNT), [5]).errors == {}
+    two = predict_exposures(exposures(gains, np.array([4, 6])), cameras(COUNT), [5])
+    # Each is the only one that predicts the other, whatever the source.
+    assert two.errors.keys() == {"mean", "order", "cameras"}
+    assert len({round(error, 6) for error in two.errors.values()}) == 1
+    assert two.errors["mean"] > 0
+
+
 def test_where_the_order_is_none_the_nearest_cameras_tell() -> None:
     shuffled = np.random.default_rng(0).permutation(COUNT)
     gains = (1 + 0.3 * np.sin(np.arange(COUNT) / 4))[shuffled]
