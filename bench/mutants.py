@@ -71,7 +71,12 @@ TOWERS = ("build", "embedding_cache", "onnx_tower", "open_vocabulary", "towers",
 SEGMENTERS = ("build", "segmenter", "segmenter_classes", "segmenter_onnx", "segmenter_transformers")
 WORD_FILES = {
     **{f"text/{name}": ("tests/text",) for name in TOWERS},
-    "core/pretrained": ("tests/text/test_transformers_tower.py", "tests/fusion/test_radio.py", SEGMENTER),
+    "core/pretrained": (
+        "tests/core/test_pretrained.py",
+        "tests/text/test_transformers_tower.py",
+        "tests/fusion/test_radio.py",
+        SEGMENTER,
+    ),
     **{f"fusion/teachers/{name}": (SEGMENTER, "tests/fusion/test_teachers.py") for name in SEGMENTERS},
     "fusion/lift": ("tests/fusion/test_lift.py", SEGMENTER, "tests/fusion/test_fuse.py"),
     "fusion/interior_views": ("tests/fusion/test_interior_views.py",),

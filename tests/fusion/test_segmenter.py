@@ -18,13 +18,15 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teacher_maps import read_map, write_map
-from gsencoder.fusion.teachers.build import build_teacher, words_beside
+from gsencoder.fusion.teachers.build import build_teacher, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher, softmax
 from gsencoder.fusion.teachers.segmenter_classes import MAX_CLASSES_BYTES, read_classes, synonyms_of_classes
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
+from gsencoder.text.onnx_tower import OnnxTextConfig
 from gsencoder.text.open_vocabulary import OpenVocabulary, make_vocabulary
-from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.text.towers import unit
 from gsencoder.types import FeatureMap, Scene, SceneObject, Views
 
@@ -206,6 +208,34 @@ def test_probabilities_are_taken_as_they_are_and_logits_are_recognized(
         teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, activation="none")).feature_map(views_of(image), 0)
 
 
+def test_a_segmenter_needs_a_model_words_and_pictures(tmp_path: Path, rng: np.random.Generator) -> None:
+    save_graph(tmp_path / "net.onnx")
+    config = SegmenterConfig(model=str(tmp_path / "net.onnx"))
+    with pytest.raises(InputError, match="its classes need words"):
+        build_teacher(config, Scene(name="s"), None)
+    with pytest.raises(InputError, match="teacher.model= is missing"):
+        build_teacher(SegmenterConfig(), Scene(name="s"), words(rng))
+    blind = Views(cameras=front_camera(12, 8), names=("a",))
+    with pytest.raises(InputError, match="the scene has no pictures"):
+        teacher_of(tmp_path / "net.onnx", words(rng)).feature_map(blind, 0)
+
+
+def test_words_are_those_of_a_table_or_of_the_colors_or_none(tmp_path: Path, rng: np.random.Generator) -> None:
+    table = words(rng)
+    save_text_table(tmp_path / "words.safetensors", table)
+    read = words_of(SegmenterConfig(words=str(tmp_path / "words.safetensors")))
+    assert isinstance(read, TextTable)
+    assert read.names == table.names
+    np.testing.assert_array_equal(read.embeddings, table.embeddings)
+    assert words_of(SegmenterConfig()) is None
+    colors = words_of(PaletteConfig())
+    assert isinstance(colors, TextTable)
+    assert colors.names == COLOR_NAMES
+    np.testing.assert_array_equal(colors.encode(["red"])[0], np.eye(11)[COLOR_NAMES.index("red")])
+    with pytest.raises(InputError, match="text=onnx: teacher=palette has the words of its eleven colors"):
+        words_of(PaletteConfig(), OnnxTextConfig(model="any"))
+
+
 def test_probabilities_may_sum_to_less_than_one_and_be_zero_and_not_negative(
     tmp_path: Path, rng: np.random.Generator, image: np.ndarray
 ) -> None:
@@ -227,6 +257,25 @@ def test_pictures_are_normalized_as_those_of_imagenet_unless_stated() -> None:
 
     usual = OnnxSegmenterOptions()
     assert (usual.scale, [*usual.mean], [*usual.std]) == (255, IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)
+
+
+@pytest.mark.parametrize("byte", [False, True])
+def test_settings_tell_how_pictures_are_given_to_the_network(
+    tmp_path: Path, rng: np.random.Generator, byte: bool
+) -> None:
+    """Maps that were made otherwise are not taken up; a network of bytes is not given normalized ones."""
+    save_graph(
+        tmp_path / "net.onnx", input_type=TensorProto.UINT8 if byte else TensorProto.FLOAT, shape=("n", 3, "h", "w")
+    )
+    table = words(rng)
+
+    def settings(**options: Any) -> dict[str, Any]:
+        return teacher_of(tmp_path / "net.onnx", table, replace(PLAIN, **options)).settings()
+
+    for options in ({"scale": 2.0}, {"mean": (0.0, 0.5, 0.0)}, {"std": (1.0, 1.0, 2.0)}):
+        assert (settings(**options) == settings()) is byte
+    assert settings(size=64) != settings()
+    assert settings(activation="none") != settings()
 
 
 @pytest.mark.parametrize(

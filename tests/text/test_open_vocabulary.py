@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,6 +104,17 @@ def test_a_missing_tower_names_three_phrases_and_three_near_names_of_each(
     said = str(error.value)
     assert [phrase in said for phrase in phrases] == [True, True, True, False]
     assert said.rpartition("known without it: ")[2].count(", ") == 9
+
+
+def test_the_record_of_a_tower_has_a_known_kind_and_short_texts(no_jaxtyping: None) -> None:
+    good: dict[str, Any] = {"kind": "onnx", "name": "n", "identity": "i", "pooling": "p" * 1000}
+    TowerRecord(**good)
+    for name in good:
+        for wrong in ("", "p" * 1001, 5):
+            with pytest.raises(InputError, match="expected a kind among onnx, transformers, a name"):
+                TowerRecord(**{**good, name: wrong})
+    with pytest.raises(InputError, match="expected a kind among onnx, transformers"):
+        TowerRecord(**{**good, "kind": "table"})
 
 
 @pytest.mark.parametrize("config", [OnnxTextConfig, TransformersTextConfig])
