@@ -17,6 +17,7 @@ from gsencoder.reconstruct.budget import (
     choose_scale,
     plan_steps,
     step_seconds,
+    trial_views,
     wanted_steps,
 )
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
@@ -80,6 +81,13 @@ def optimizer(config: OptimizeConfig) -> Optimizer:
     means = np.column_stack((made.uniform(-1, 1, 50), made.uniform(-1, 1, 50), np.full(50, 3.0)))
     adam = RowAdam(parameters_from(replace(splat, means=means.astype(np.float32)), config.sh_degree))
     return Optimizer(adam, photographs, range(len(photographs)), config, prune=PruneConfig())
+
+
+def test_four_views_from_the_first_to_the_last_stand_for_all() -> None:
+    assert trial_views(range(100, 110)) == [100, 103, 106, 109]
+    assert trial_views([2, 3, 5, 8, 13]) == [2, 3, 5, 13]
+    assert trial_views([7, 4]) == [7, 4]
+    assert trial_views([7]) == [7]
 
 
 def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time() -> None:

@@ -66,6 +66,20 @@ def test_the_error_of_maps_is_that_of_colors() -> None:
     assert map_error(torch.stack((one - other, torch.zeros(3, 4)))) == pytest.approx(float(expected) / 2**0.5, rel=0.01)
 
 
+@pytest.mark.parametrize("row", range(3))
+def test_colors_are_equally_frequent_in_the_error_of_maps(row: int) -> None:
+    """Of independent values from 0 to 1 the mean is 1/2, the mean square 1/3 and the mean product 1/4."""
+    for first in range(4):
+        for second in range(first + 1):
+            difference = torch.zeros(1, 3, 4, dtype=torch.float64)
+            difference[0, row, first] += 1
+            difference[0, row, second] += 2
+            squares = [1.0 if column == 3 else 1 / 3 for column in (first, second)]
+            product = 1 / 4 if first < 3 else 1 / 2
+            expected = 9 * squares[0] if first == second else squares[0] + 4 * squares[1] + 4 * product
+            assert map_error(difference) == pytest.approx((expected / 3) ** 0.5)
+
+
 def test_exposures_that_drift_along_the_recording_are_interpolated() -> None:
     gains = 1 + 0.3 * np.sin(np.arange(COUNT) / 4)
     found = predict_exposures(exposures(gains), cameras(COUNT), HELD_OUT.tolist())
