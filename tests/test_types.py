@@ -9,7 +9,7 @@ from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import blend
-from gsencoder.types import Cameras, FeatureMap, FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
+from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
 
 
 def camera(width: int, height: int) -> Cameras:
@@ -208,3 +208,15 @@ def test_features_and_their_mean_are_arrays_of_the_space_with_finite_weights(no_
     ):
         with pytest.raises(InputError, match=rf"GaussianFeatures\.{name}"):
             GaussianFeatures(**{**good, name: value}, space=GRID["space"])
+
+
+def test_a_basis_keeps_between_nothing_and_all_of_the_energy() -> None:
+    def basis(energy: float) -> FeatureBasis:
+        rows, mean = np.eye(1, 2, dtype=np.float32), np.zeros(2, np.float32)
+        return FeatureBasis(mean=mean, components=rows, energy_kept=energy, space=GRID["space"])
+
+    # Sums are rounded.
+    assert [basis(energy).rank for energy in (0.0, 0.5, 1.0, 1 + 1e-7)] == [1] * 4
+    for energy in (-1e-9, 1.01, float("nan")):
+        with pytest.raises(InputError, match=r"FeatureBasis\.energy_kept: expected a share in \[0, 1\]"):
+            basis(energy)
