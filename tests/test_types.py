@@ -187,6 +187,8 @@ def test_codes_and_shares_belong_to_rows_of_their_table_and_those_to_the_space(n
             FeatureMap(codes=np.array([[0, wrong]], np.int32), table=TABLE, **GRID)
     with pytest.raises(InputError, match=r"features: expected 2 channels \(a\), got 3"):
         FeatureMap(shares=np.ones((3, 4, 3), np.float32), table=np.eye(3, dtype=np.float32), **GRID)
+    with pytest.raises(InputError, match=r"features: expected 2 channels \(a\), got 5"):
+        FeatureMap(features=np.ones((3, 4, 5), np.float32), **GRID)
 
 
 def test_features_and_their_mean_are_arrays_of_the_space_with_finite_weights(no_jaxtyping: None) -> None:

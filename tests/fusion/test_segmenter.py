@@ -252,6 +252,19 @@ def test_probabilities_may_sum_to_less_than_one_and_be_zero_and_not_negative(
         teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(image), 0)
 
 
+def test_probabilities_that_were_rounded_may_sum_to_a_hundredth_more_than_one(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+) -> None:
+    probable, black = replace(PLAIN, activation="none"), np.zeros_like(image)
+    save_graph(tmp_path / "net.onnx", fourth=1.01)
+    made = teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(black), 0)
+    assert made.shares is not None
+    assert (made.shares == np.float32([0, 0, 0, 1.01])).all()
+    save_graph(tmp_path / "net.onnx", fourth=1.011)
+    with pytest.raises(InputError, match=r"got 0 to 1\.01; are these logits"):
+        teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(black), 0)
+
+
 def test_pictures_are_normalized_as_those_of_imagenet_unless_stated() -> None:
     from transformers.image_utils import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
 
