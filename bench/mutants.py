@@ -66,6 +66,30 @@ SCENE_FILES = {
     "types/scene": ("tests/test_types.py",),
 }
 """Modules that read, check and seed scenes of others, drawn with `--scenes`, and the tests that belong to them."""
+SEGMENTER = "tests/fusion/test_segmenter.py"
+TOWERS = ("build", "embedding_cache", "onnx_tower", "open_vocabulary", "towers", "transformers_tower")
+SEGMENTERS = ("build", "segmenter", "segmenter_classes", "segmenter_onnx", "segmenter_transformers")
+WORD_FILES = {
+    **{f"text/{name}": ("tests/text",) for name in TOWERS},
+    "core/pretrained": (
+        "tests/core/test_pretrained.py",
+        "tests/text/test_transformers_tower.py",
+        "tests/fusion/test_radio.py",
+        SEGMENTER,
+    ),
+    **{f"fusion/teachers/{name}": (SEGMENTER, "tests/fusion/test_teachers.py") for name in SEGMENTERS},
+    "fusion/lift": ("tests/fusion/test_lift.py", SEGMENTER, "tests/fusion/test_fuse.py"),
+    "fusion/interior_views": ("tests/fusion/test_interior_views.py",),
+    "fusion/orbit_views": ("tests/fusion/test_interior_views.py",),
+    "fusion/teacher_maps": ("tests/fusion/test_teacher_maps.py", SEGMENTER),
+    "types/features": ("tests/test_types.py", SEGMENTER),
+    "infer/localize/presence": ("tests/infer/test_presence.py",),
+    "infer/localize/threshold": ("tests/infer/test_presence.py", "tests/infer/test_relevancy.py"),
+    **{f"reconstruct/{name}": (f"tests/reconstruct/test_{name}.py",) for name in ("exposure_prediction", "budget")},
+    "reconstruct/expected_time": ("tests/reconstruct/test_expected_time.py",),
+}
+"""Modules of words, of cameras in bare splats and of times and exposures, drawn with `--words`, and their tests."""
+LISTED_FILES = SCENE_FILES | WORD_FILES
 NOT_COPIED = shutil.ignore_patterns(".git", ".venv", "outputs", "dist", "build", ".*_cache")
 
 SWAPS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
@@ -169,8 +193,8 @@ def draw(module: str, count: int, seed: int) -> list[Mutant]:
 
 def test_files(project: Path, module: str) -> tuple[list[str], list[str]]:
     """Test files that belong to a module, and the rest of its folder."""
-    if module in SCENE_FILES:
-        named = [path for place in SCENE_FILES[module] for path in _tests_at(project / place)]
+    if module in LISTED_FILES:
+        named = [path for place in LISTED_FILES[module] for path in _tests_at(project / place)]
         return [str(path.relative_to(project)) for path in named], []
     folders = FOLDERS.get(module, (f"tests/{module.partition('/')[0]}",))
     files = [path for folder in folders for path in _tests_at(project / folder)]
@@ -243,8 +267,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=5, help="faults of each module")
-    parser.add_argument("--modules", nargs="+", choices=(*MODULES, *SCENE_FILES), metavar="MODULE")
+    parser.add_argument("--modules", nargs="+", choices=(*MODULES, *LISTED_FILES), metavar="MODULE")
     parser.add_argument("--scenes", action="store_true", help="modules that read, check and seed scenes of others")
+    parser.add_argument("--words", action="store_true", help="modules of words, cameras in bare splats and times")
     parser.add_argument("--out", type=Path, help="default: outputs/mutants_SEED.jsonl")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="judge the survivors once more")
@@ -258,7 +283,8 @@ def main() -> None:
     for line in out.read_text().splitlines() if out.exists() else []:
         row = json.loads(line)
         known[Mutant(*(row[name] for name in Mutant.__dataclass_fields__))] = row
-    modules = chosen.modules or (tuple(SCENE_FILES) if chosen.scenes else MODULES)
+    groups = (*(SCENE_FILES if chosen.scenes else ()), *(WORD_FILES if chosen.words else ()))
+    modules = chosen.modules or groups or MODULES
     mutants = [mutant for module in modules for mutant in draw(module, chosen.count, chosen.seed)]
     due = [each for each in mutants if each not in known or (chosen.again and not known[each]["killed"])]
     # Started in the background, this process ignores the signal that tests of stopping send, and so would they.

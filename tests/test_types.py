@@ -9,7 +9,7 @@ from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import blend
-from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
+from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
 
 
 def camera(width: int, height: int) -> Cameras:
@@ -142,3 +142,83 @@ def test_features_lie_on_the_gaussians_of_their_scene() -> None:
 def test_an_object_that_nobody_counted_has_no_views() -> None:
     thing = SceneObject(id=3, name=None, aabb_min=np.zeros(3), aabb_max=np.ones(3))
     assert (thing.placed, thing.views, thing.max_pixels) == (True, 0, 0)
+
+
+GRID: dict[str, Any] = {"grid_from_image": np.eye(2, 3), "space": FeatureSpace(name="a", channels=2)}
+TABLE = np.eye(3, 2, dtype=np.float32)
+
+
+def test_a_map_is_in_one_form_and_knows_its_size() -> None:
+    features, codes = np.zeros((3, 4, 2), np.float32), np.array([[-1, 0, 1, 2]] * 3, np.int32)
+    shares = np.zeros((3, 4, 3), np.float32)
+    shares[0, 0] = (0, 2, 1e30)
+    maps = [
+        FeatureMap(features=features, **GRID),
+        FeatureMap(codes=codes, table=TABLE, **GRID),
+        FeatureMap(shares=shares, table=TABLE, **GRID),
+    ]
+    assert [(each.height, each.width) for each in maps] == [(3, 4)] * 3
+    forms: list[dict[str, Any]] = [
+        {},
+        {"table": TABLE},
+        {"features": features, "table": TABLE},
+        {"features": features, "shares": shares},
+        {"codes": codes},
+        {"codes": codes, "shares": shares, "table": TABLE},
+    ]
+    for form in forms:
+        with pytest.raises(InputError, match="expected features, or codes or shares with their table"):
+            FeatureMap(**form, **GRID)
+
+
+@pytest.mark.parametrize("value", [-1e-6, float("nan"), float("inf")])
+def test_shares_are_finite_and_not_negative(value: float) -> None:
+    shares = np.ones((3, 4, 3), np.float32)
+    shares[1, 2, 0] = value
+    with pytest.raises(InputError, match=r"FeatureMap\.shares: expected finite shares from 0"):
+        FeatureMap(shares=shares, table=TABLE, **GRID)
+
+
+def test_codes_and_shares_belong_to_rows_of_their_table_and_those_to_the_space(no_jaxtyping: None) -> None:
+    with pytest.raises(InputError, match=r"shares: expected 3 columns, got 4"):
+        FeatureMap(shares=np.ones((3, 4, 4), np.float32), table=TABLE, **GRID)
+    for wrong in (-2, 3):
+        with pytest.raises(InputError, match=r"codes: expected -1 to 2, got"):
+            FeatureMap(codes=np.array([[0, wrong]], np.int32), table=TABLE, **GRID)
+    with pytest.raises(InputError, match=r"features: expected 2 channels \(a\), got 3"):
+        FeatureMap(shares=np.ones((3, 4, 3), np.float32), table=np.eye(3, dtype=np.float32), **GRID)
+    with pytest.raises(InputError, match=r"features: expected 2 channels \(a\), got 5"):
+        FeatureMap(features=np.ones((3, 4, 5), np.float32), **GRID)
+
+
+def test_features_and_their_mean_are_arrays_of_the_space_with_finite_weights(no_jaxtyping: None) -> None:
+    good = {
+        "features": np.zeros((3, 2), np.float32),
+        "weights": np.zeros(3, np.float32),
+        "mean": np.zeros(2, np.float32),
+    }
+    assert not GaussianFeatures(**good, space=GRID["space"]).seen.any()
+    for name, value in (
+        ("features", np.zeros((3, 3), np.float32)),
+        ("features", np.zeros((3, 2))),
+        ("features", np.full((3, 2), np.nan, np.float32)),
+        ("weights", np.zeros(2, np.float32)),
+        ("weights", np.array([0, 1, np.inf], np.float32)),
+        ("weights", np.array([0, 1, -1], np.float32)),
+        ("mean", np.zeros(3, np.float32)),
+        ("mean", np.array([0, np.nan], np.float32)),
+    ):
+        with pytest.raises(InputError, match=rf"GaussianFeatures\.{name}"):
+            GaussianFeatures(**{**good, name: value}, space=GRID["space"])
+
+
+def test_a_basis_keeps_between_nothing_and_all_of_the_energy() -> None:
+    def basis(energy: float) -> FeatureBasis:
+        rows, mean = np.eye(1, 2, dtype=np.float32), np.zeros(2, np.float32)
+        return FeatureBasis(mean=mean, components=rows, energy_kept=energy, space=GRID["space"])
+
+    # Sums are rounded.
+    assert [basis(energy).rank for energy in (0.0, 0.5, 1.0, 1 + 1e-7)] == [1] * 4
+    for energy in (-1e-9, 1.01, float("nan")):
+        with pytest.raises(InputError, match=r"FeatureBasis\.energy_kept: expected a share in \[0, 1\]"):
+            basis(energy)

@@ -23,7 +23,15 @@ def save_tokenizer(path: Path, words: tuple[str, ...] = WORDS) -> None:
     tokenizer.save(str(path))
 
 
-def save_graph(path: Path, rows: int = len(WORDS), *, output: str = "last_hidden_state", scale: float = 1.0) -> None:
+def save_graph(
+    path: Path,
+    rows: int = len(WORDS),
+    *,
+    output: str = "last_hidden_state",
+    scale: float = 1.0,
+    mask: bool = True,
+    length: int | str = "sequence",
+) -> None:
     """A graph that looks each token up in a table; with the output "sentence_embedding" it gives the sum of them."""
     table = np.random.default_rng(0).normal(size=(rows, CHANNELS)).astype(np.float32) * np.float32(scale)
     nodes = [helper.make_node("Gather", ["table", "input_ids"], ["tokens"])]
@@ -37,8 +45,8 @@ def save_graph(path: Path, rows: int = len(WORDS), *, output: str = "last_hidden
         nodes,
         "text",
         [
-            helper.make_tensor_value_info(name, TensorProto.INT64, ["batch", "sequence"])
-            for name in ("input_ids", "attention_mask")
+            helper.make_tensor_value_info(name, TensorProto.INT64, ["batch", length])
+            for name in ("input_ids", *["attention_mask"] * mask)
         ],
         [helper.make_tensor_value_info(output, TensorProto.FLOAT, None)],
         [numpy_helper.from_array(table, "table"), numpy_helper.from_array(np.array([1]), "axes")],

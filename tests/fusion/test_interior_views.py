@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.interior_views import interior_views
-from gsencoder.fusion.orbit_views import with_views
+from gsencoder.fusion.interior_views import _cover, interior_views
+from gsencoder.fusion.orbit_views import check_orbits, with_views
 from gsencoder.types import Gaussians, Scene
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -76,6 +76,22 @@ def test_where_cameras_stand_can_be_stated(rng: np.random.Generator) -> None:
         assert views is not None
         assert views.names[0] == begin
         assert len(views) <= 6
+
+
+def test_the_next_camera_is_the_one_that_shows_most_of_what_is_not_covered_yet() -> None:
+    shares, weights = np.array([[0, 0.03], [0.05, 0], [0.05, 0], [0, 0]]), np.array([0.6, 0.4])
+    assert _cover(shares, weights, 2) == [1, 0]
+    # A camera that shows nothing is never chosen, and none twice.
+    assert _cover(shares, weights, 9) == [1, 0, 2]
+    assert _cover(np.zeros((3, 2)), weights, 2) == []
+
+
+def test_as_many_cameras_as_anybody_means_are_allowed() -> None:
+    for count in (1, 10_000):
+        check_orbits(count)
+    for count in (0, 10_001):
+        with pytest.raises(InputError, match=f"expected 1 to 10000 cameras, got {count}"):
+            check_orbits(count)
 
 
 def test_the_same_splat_gives_the_same_cameras(rng: np.random.Generator) -> None:

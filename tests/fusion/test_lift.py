@@ -39,6 +39,44 @@ def test_cells_without_a_vector_give_neither_features_nor_weight(rng: np.random.
     np.testing.assert_allclose(sums.sums, dense.T @ (share[:, None] * np.nan_to_num(vectors)), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("form", ["codes", "shares"])
+def test_shares_are_masked_in_part_and_codes_where_most_of_their_cell_is_out(
+    rng: np.random.Generator, form: str
+) -> None:
+    shape, space = (HEIGHT // STRIDE, WIDTH // STRIDE), FeatureSpace(name="s", channels=2)
+    affine, table = np.array([[1 / STRIDE, 0, 0], [0, 1 / STRIDE, 0]]), rng.normal(size=(3, 2)).astype(np.float32)
+    mask = np.zeros((*shape, STRIDE * STRIDE), bool)
+    # Cells of which nothing, a half, more than that and all is in the mask.
+    counts = np.resize([0, 8, 9, 16], shape)
+    mask[np.arange(STRIDE * STRIDE) < counts[..., None]] = True
+    mask = mask.reshape(*shape, STRIDE, STRIDE).transpose(0, 2, 1, 3).reshape(HEIGHT, WIDTH)
+    codes, shares = rng.integers(-1, 3, shape).astype(np.int32), rng.random((*shape, 3)).astype(np.float32)
+    values = {"codes": codes} if form == "codes" else {"shares": shares}
+    made = FeatureMap(**values, table=table, grid_from_image=affine, space=space)
+    b = blend(random_gaussians(100), CAMERA, like=made)
+    sums = FeatureSums(100, 2, None, table)
+    sums.add(b, made, mask)
+    sums.add(b, made, None)
+    one_hot = (codes[..., None] == np.arange(3)) * np.where(counts > 8, 2.0, 1.0)[..., None]
+    rows = one_hot if form == "codes" else shares * (1 + counts / 16)[..., None]
+    dense = b.render(torch.eye(100)).numpy().astype(np.float64)
+    np.testing.assert_allclose(sums.sums, dense.T @ rows.reshape(-1, 3), rtol=1e-3, atol=1e-5)
+    assert (sums.views, sums.weights.any()) == (2, False)
+
+
+def test_sensor_depth_hides_what_lies_behind_it() -> None:
+    gaussians, config = random_gaussians(200, log_scale=-1.5), BlendConfig(rays_per_patch=4)
+    depth = np.full((HEIGHT, WIDTH), np.median(gaussians.means[:, 2]), np.float32)
+    views = Views(cameras=CAMERA, names=("v",), depths=[depth])
+    feature_map = map_of(np.zeros((HEIGHT // STRIDE, WIDTH // STRIDE, 2), np.float32))
+    visibility = VisibilityConfig(against=("sensor",), relative=0.1)
+    b = view_matrix(gaussians, views, 0, feature_map, lift="blend", visibility=visibility, config=config)
+    plain = blend(gaussians, CAMERA, like=feature_map, config=config)
+    expected = keep_visible(plain, depth, visibility)
+    assert 0 < len(expected.col) < len(plain.col)
+    assert torch.equal(b.col, expected.col)
+
+
 def test_rendered_depth_is_that_of_pixels_whatever_cells_are_lifted() -> None:
     gaussians, config = random_gaussians(200, log_scale=-1.5), BlendConfig(rays_per_patch=1)
     feature_map = map_of(np.zeros((HEIGHT // STRIDE, WIDTH // STRIDE, 2), np.float32))

@@ -18,17 +18,29 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teacher_maps import read_map, write_map
-from gsencoder.fusion.teachers.build import words_beside
+from gsencoder.fusion.teachers.build import build_teacher, words_beside, words_of
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher, softmax
-from gsencoder.fusion.teachers.segmenter_classes import read_classes, synonyms_of_classes
+from gsencoder.fusion.teachers.segmenter_classes import MAX_CLASSES_BYTES, read_classes, synonyms_of_classes
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
+from gsencoder.text.onnx_tower import OnnxTextConfig
 from gsencoder.text.open_vocabulary import OpenVocabulary, make_vocabulary
-from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.text.towers import unit
-from gsencoder.types import FeatureMap, Scene, Views
+from gsencoder.types import FeatureMap, Scene, SceneObject, Views
 
 NAMES = ("other", "wall", "chair, seat", "table")
 PLAIN = OnnxSegmenterOptions(scale=1.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+
+
+class HashTower:
+    """A vector of normal noise for each phrase, drawn by its letters."""
+
+    name, identity, pooling, channels = "t", "onnx:0", "mean", 8
+
+    def embed(self, phrases: Sequence[str]) -> np.ndarray:
+        return unit(np.stack([np.random.default_rng(list(p.encode())).normal(size=8) for p in phrases]))
 
 
 def words(rng: np.random.Generator, names: Sequence[str] = ("wall", "chair", "seat", "table", "lamp")) -> TextTable:
@@ -36,9 +48,14 @@ def words(rng: np.random.Generator, names: Sequence[str] = ("wall", "chair", "se
 
 
 def save_graph(
-    path: Path, *, input_type: int = TensorProto.FLOAT, shape: Sequence[Any] = (1, 3, 8, 12), last: bool = False
+    path: Path,
+    *,
+    input_type: int = TensorProto.FLOAT,
+    shape: Sequence[Any] = (1, 3, 8, 12),
+    last: bool = False,
+    fourth: float = 1.5,
 ) -> None:
-    """A graph that gives for class c the mean of channel c of cells of 2×2 pixels; the fourth class is 1.5."""
+    """A graph that gives for class c the mean of channel c of cells of 2×2 pixels; the fourth class is constant."""
     pick = np.zeros((4, 3, 2, 2), np.float32)
     for channel in range(3):
         pick[channel, channel] = 0.25
@@ -48,7 +65,7 @@ def save_graph(
     output = helper.make_tensor_value_info("scores", TensorProto.FLOAT, None)
     weights = [
         numpy_helper.from_array(pick, "pick"),
-        numpy_helper.from_array(np.array([0, 0, 0, 1.5], np.float32), "bias"),
+        numpy_helper.from_array(np.array([0, 0, 0, fourth], np.float32), "bias"),
     ]
     graph = helper.make_graph(
         nodes, "net", [helper.make_tensor_value_info("image", input_type, shape)], [output], weights
@@ -156,19 +173,31 @@ def test_a_mixed_map_comes_back_from_its_file(tmp_path: Path, rng: np.random.Gen
 
 
 def test_words_beside_the_features_hold_the_classes(tmp_path: Path) -> None:
-    class Tower:
-        name, identity, pooling, channels = "t", "onnx:0", "mean", 8
-
-        def embed(self, phrases: Sequence[str]) -> np.ndarray:
-            return unit(np.stack([np.random.default_rng(list(p.encode())).normal(size=8) for p in phrases]))
-
     save_graph(tmp_path / "net.onnx")
-    vocabulary = make_vocabulary(Tower(), "onnx", templates=("{}",))
+    vocabulary = make_vocabulary(HashTower(), "onnx", templates=("{}",))
     (tmp_path / "classes.json").write_text(json.dumps(["other", "wall", "zebra crossing", "table"]))
     beside = words_beside(teacher_of(tmp_path / "net.onnx", vocabulary), vocabulary)
     assert beside is not None
     assert beside.find("zebra crossing") is not None
     assert beside.find("other") is None
+
+
+def test_words_beside_labels_hold_the_names_of_all_objects(tmp_path: Path) -> None:
+    vocabulary = make_vocabulary(HashTower(), "onnx", templates=("{}",))
+    assert vocabulary.table.find("abacus") is vocabulary.table.find("other") is None
+    objects = tuple(
+        SceneObject(id=row, name=name, aabb_min=np.zeros(3), aabb_max=np.ones(3))
+        for row, name in enumerate(("abacus", "zebra crossing"))
+    )
+    scene = Scene(name="s", objects=objects)
+    teacher = build_teacher(LabelsConfig(), scene, vocabulary)
+    beside = words_beside(teacher, vocabulary)
+    assert beside is not None
+    assert beside.find("other") is None
+    for name in ("abacus", "zebra crossing"):
+        row = beside.find(name)
+        assert row is not None
+        np.testing.assert_allclose(beside.embeddings[row], HashTower().embed([name])[0], atol=1e-6)
 
 
 def test_probabilities_are_taken_as_they_are_and_logits_are_recognized(
@@ -177,6 +206,102 @@ def test_probabilities_are_taken_as_they_are_and_logits_are_recognized(
     save_graph(tmp_path / "net.onnx")
     with pytest.raises(InputError, match=r"expected probabilities.*are these logits"):
         teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, activation="none")).feature_map(views_of(image), 0)
+
+
+def test_a_segmenter_needs_a_model_words_and_pictures(tmp_path: Path, rng: np.random.Generator) -> None:
+    save_graph(tmp_path / "net.onnx")
+    config = SegmenterConfig(model=str(tmp_path / "net.onnx"))
+    with pytest.raises(InputError, match="its classes need words"):
+        build_teacher(config, Scene(name="s"), None)
+    with pytest.raises(InputError, match="teacher.model= is missing"):
+        build_teacher(SegmenterConfig(), Scene(name="s"), words(rng))
+    blind = Views(cameras=front_camera(12, 8), names=("a",))
+    with pytest.raises(InputError, match="the scene has no pictures"):
+        teacher_of(tmp_path / "net.onnx", words(rng)).feature_map(blind, 0)
+
+
+def test_words_are_those_of_a_table_or_of_the_colors_or_none(tmp_path: Path, rng: np.random.Generator) -> None:
+    table = words(rng)
+    save_text_table(tmp_path / "words.safetensors", table)
+    read = words_of(SegmenterConfig(words=str(tmp_path / "words.safetensors")))
+    assert isinstance(read, TextTable)
+    assert read.names == table.names
+    np.testing.assert_array_equal(read.embeddings, table.embeddings)
+    assert words_of(SegmenterConfig()) is None
+    colors = words_of(PaletteConfig())
+    assert isinstance(colors, TextTable)
+    assert colors.names == COLOR_NAMES
+    np.testing.assert_array_equal(colors.encode(["red"])[0], np.eye(11)[COLOR_NAMES.index("red")])
+    with pytest.raises(InputError, match="text=onnx: teacher=palette has the words of its eleven colors"):
+        words_of(PaletteConfig(), OnnxTextConfig(model="any"))
+
+
+def test_probabilities_may_sum_to_less_than_one_and_be_zero_and_not_negative(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+) -> None:
+    probable = replace(PLAIN, activation="none", scale=18.0)
+    for least in (0, 1):
+        picture = np.maximum(image, np.uint8(least))
+        save_graph(tmp_path / "net.onnx", fourth=0.5 * least)
+        made = teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(picture), 0)
+        assert made.shares is not None
+        np.testing.assert_allclose(made.shares[..., :3], picture.reshape(4, 2, 6, 2, 3).mean((1, 3)) / 18, atol=1e-6)
+        assert (made.shares[..., 3] == 0.5 * least).all()
+    save_graph(tmp_path / "net.onnx", fourth=-0.01)
+    with pytest.raises(InputError, match="expected probabilities, from 0"):
+        teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(image), 0)
+
+
+def test_probabilities_that_were_rounded_may_sum_to_a_hundredth_more_than_one(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+) -> None:
+    probable, black = replace(PLAIN, activation="none"), np.zeros_like(image)
+    save_graph(tmp_path / "net.onnx", fourth=1.01)
+    made = teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(black), 0)
+    assert made.shares is not None
+    assert (made.shares == np.float32([0, 0, 0, 1.01])).all()
+    save_graph(tmp_path / "net.onnx", fourth=1.011)
+    with pytest.raises(InputError, match=r"got 0 to 1\.01; are these logits"):
+        teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(black), 0)
+
+
+def test_pictures_are_normalized_as_those_of_imagenet_unless_stated() -> None:
+    from transformers.image_utils import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
+
+    usual = OnnxSegmenterOptions()
+    assert (usual.scale, [*usual.mean], [*usual.std]) == (255, IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)
+
+
+@pytest.mark.parametrize("byte", [False, True])
+def test_settings_tell_how_pictures_are_given_to_the_network(
+    tmp_path: Path, rng: np.random.Generator, byte: bool
+) -> None:
+    """Maps that were made otherwise are not taken up; a network of bytes is not given normalized ones."""
+    save_graph(
+        tmp_path / "net.onnx", input_type=TensorProto.UINT8 if byte else TensorProto.FLOAT, shape=("n", 3, "h", "w")
+    )
+    table = words(rng)
+
+    def settings(**options: Any) -> dict[str, Any]:
+        return teacher_of(tmp_path / "net.onnx", table, replace(PLAIN, **options)).settings()
+
+    for options in ({"scale": 2.0}, {"mean": (0.0, 0.5, 0.0)}, {"std": (1.0, 1.0, 2.0)}):
+        assert (settings(**options) == settings()) is byte
+    assert settings(size=64) != settings()
+    assert settings(activation="none") != settings()
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [("size", 1, 8192), ("multiple", 1, 1024), ("threads", 0, 1024), ("scale", 1e-6, 1e6), ("temperature", 1e-3, 1e3)],
+)
+def test_settings_may_lie_at_the_ends_of_their_range_and_no_further(name: str, least: float, most: float) -> None:
+    settings: type = SegmenterConfig if name == "temperature" else OnnxSegmenterOptions
+    for value in (least, most):
+        assert getattr(settings(**{name: value}), name) == value
+    for value in (least - 1, most + 1):
+        with pytest.raises(InputError, match=f"{name}: expected"):
+            settings(**{name: value})
 
 
 def test_softmax_holds_at_the_extremes() -> None:
@@ -225,6 +350,16 @@ def test_names_are_read_from_lists_objects_and_lines(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"1": "b", "0": "a"}')
     (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbfa\r\nb\r\n\r\n")
     assert read_classes(tmp_path / "a.json") == read_classes(tmp_path / "b.txt") == ("a", "b")
+
+
+def test_a_file_of_names_is_no_larger_than_four_megabytes(tmp_path: Path) -> None:
+    assert MAX_CLASSES_BYTES == 4 * 1024**2
+    path = tmp_path / "names.txt"
+    path.write_bytes(b"a\nb\n".ljust(MAX_CLASSES_BYTES))
+    assert read_classes(path) == ("a", "b")
+    path.write_bytes(b"a\nb\n".ljust(MAX_CLASSES_BYTES + 1))
+    with pytest.raises(InputError, match="holds more than 4,194,304 bytes"):
+        read_classes(path)
 
 
 def small_segformer() -> Any:

@@ -78,6 +78,27 @@ def test_a_map_is_made_once(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first, second)
 
 
+def test_coded_maps_and_those_of_cheap_teachers_are_made_each_time(tmp_path: Path) -> None:
+    class Coded(ScaledTeacher):
+        table = np.eye(3, 4, dtype=np.float32)
+
+        def feature_map(self, views: Views, view: int) -> FeatureMap:
+            self.calls += 1
+            codes = np.full((3, 4), view, np.int32)
+            return FeatureMap(codes=codes, table=self.table, grid_from_image=np.eye(2, 3), space=SPACE)
+
+    class Cheap(ScaledTeacher):
+        cheap = True
+
+    for teacher in (Coded(), Cheap()):
+        cached = CachedTeacher(teacher, tmp_path, before_write=lambda: pytest.fail("written"))
+        first, second = (cached.feature_map(views(), 0) for _ in range(2))
+        assert teacher.calls == 2
+        assert (first.codes is None) == isinstance(teacher, Cheap)
+        assert first is not second
+    assert not list(tmp_path.iterdir())
+
+
 def test_fusing_with_a_cache_and_preparing_see_the_same_maps(tmp_path: Path) -> None:
     class Recording(CachedTeacher):
         def feature_map(self, views: Views, view: int) -> FeatureMap:

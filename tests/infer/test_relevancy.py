@@ -209,6 +209,13 @@ def test_otsu_agrees_with_an_exhaustive_search(rng: np.random.Generator) -> None
     assert otsu(values, bins=4096) == pytest.approx(best.mean(), abs=0.01)
 
 
+def test_otsu_has_as_many_levels_as_the_pictures_of_its_paper_unless_stated(rng: np.random.Generator) -> None:
+    for _ in range(5):
+        values = rng.normal(size=500).astype(np.float32)
+        assert otsu(values) == otsu(values, bins=256)
+    assert otsu(values, bins=255) != otsu(values)
+
+
 def test_otsu_of_one_value_is_that_value() -> None:
     assert otsu(np.full(9, 0.25, np.float32)) == 0.25
 

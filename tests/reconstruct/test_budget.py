@@ -17,6 +17,7 @@ from gsencoder.reconstruct.budget import (
     choose_scale,
     plan_steps,
     step_seconds,
+    trial_views,
     wanted_steps,
 )
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
@@ -62,6 +63,16 @@ def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:
     assert step_seconds(300_000.0, 60_000.0, CPU, whole) > step_seconds(300_000.0, 60_000.0, CPU, USUAL)
 
 
+def test_on_two_cores_a_step_takes_the_seconds_that_were_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = replace(USUAL, shrinks=(1,), shares=(1.0,))
+    measured = 1.2 * (0.03 + 0.07 + 0.075)
+    for threads, cores, factor in ((2, 2, 1.0), (8, 2, 1.0), (2, 16, 1.0), (4, 4, 2**-0.8), (1, None, 2**0.8)):
+        monkeypatch.setattr("torch.get_num_threads", lambda threads=threads: threads)
+        monkeypatch.setattr("os.cpu_count", lambda cores=cores: cores)
+        assert step_seconds(100_000.0, 60_000.0, CPU, full) == pytest.approx(factor * measured)
+        assert step_seconds(100_000.0, 60_000.0, torch.device("cuda"), full) == pytest.approx(measured / 30)
+
+
 def optimizer(config: OptimizeConfig) -> Optimizer:
     photographs = Photographs(wall_views(depth=True))
     made = np.random.default_rng(0)
@@ -70,6 +81,13 @@ def optimizer(config: OptimizeConfig) -> Optimizer:
     means = np.column_stack((made.uniform(-1, 1, 50), made.uniform(-1, 1, 50), np.full(50, 3.0)))
     adam = RowAdam(parameters_from(replace(splat, means=means.astype(np.float32)), config.sh_degree))
     return Optimizer(adam, photographs, range(len(photographs)), config, prune=PruneConfig())
+
+
+def test_four_views_from_the_first_to_the_last_stand_for_all() -> None:
+    assert trial_views(range(100, 110)) == [100, 103, 106, 109]
+    assert trial_views([2, 3, 5, 8, 13]) == [2, 3, 5, 13]
+    assert trial_views([7, 4]) == [7, 4]
+    assert trial_views([7]) == [7]
 
 
 def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time() -> None:

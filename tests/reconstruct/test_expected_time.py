@@ -75,6 +75,25 @@ def test_what_is_announced_is_the_work_that_is_done(monkeypatch: pytest.MonkeyPa
     assert announced == pytest.approx(work.now - begun + 3 * 500, rel=0.15)
 
 
+@pytest.mark.parametrize(("at", "at_step"), [((0.5,), 10), ((0.5, 0.75), 10), ((0.25, 0.5, 0.75), 5)])
+def test_every_pruning_is_announced_and_steps_after_the_first_are_of_what_it_leaves(
+    monkeypatch: pytest.MonkeyPatch, at: tuple[float, ...], at_step: int
+) -> None:
+    """A step costs as many units as there are Gaussians, a quarter of it at half the size, and a pruning three."""
+    work, one = Work(monkeypatch), optimizer(splat(), at=at)
+    before, left = len(one.raw["means"]), len(one.contributing())
+    assert left < 0.7 * before
+
+    def step(one: Optimizer, shrink: int, view: int) -> None:
+        assert view in TRAINING
+        work.now += len(one.raw["means"]) / shrink**2
+
+    monkeypatch.setattr(expected_time, "_step", step)
+    steps = sum((before if step < at_step else left) / (4 if step < 6 else 1) for step in range(20))
+    prunings = 3 * (before + (len(at) - 1) * left)
+    assert expected_seconds(one, [], 0) == pytest.approx(steps + prunings, rel=1e-6)
+
+
 def test_each_kind_of_work_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     work = Work(monkeypatch)
     one = optimizer(splat(), at=())

@@ -66,6 +66,20 @@ def test_the_error_of_maps_is_that_of_colors() -> None:
     assert map_error(torch.stack((one - other, torch.zeros(3, 4)))) == pytest.approx(float(expected) / 2**0.5, rel=0.01)
 
 
+@pytest.mark.parametrize("row", range(3))
+def test_colors_are_equally_frequent_in_the_error_of_maps(row: int) -> None:
+    """Of independent values from 0 to 1 the mean is 1/2, the mean square 1/3 and the mean product 1/4."""
+    for first in range(4):
+        for second in range(first + 1):
+            difference = torch.zeros(1, 3, 4, dtype=torch.float64)
+            difference[0, row, first] += 1
+            difference[0, row, second] += 2
+            squares = [1.0 if column == 3 else 1 / 3 for column in (first, second)]
+            product = 1 / 4 if first < 3 else 1 / 2
+            expected = 9 * squares[0] if first == second else squares[0] + 4 * squares[1] + 4 * product
+            assert map_error(difference) == pytest.approx((expected / 3) ** 0.5)
+
+
 def test_exposures_that_drift_along_the_recording_are_interpolated() -> None:
     gains = 1 + 0.3 * np.sin(np.arange(COUNT) / 4)
     found = predict_exposures(exposures(gains), cameras(COUNT), HELD_OUT.tolist())
@@ -86,6 +100,16 @@ def test_exposures_that_follow_nothing_are_taken_to_be_the_mean() -> None:
         torch.testing.assert_close(found.maps, IDENTITY.repeat(len(HELD_OUT), 1, 1))
     assert predict_exposures(None, cameras(COUNT), [3, 4]).maps.shape == (2, 3, 4)
     assert predict_exposures(exposures(gains, np.array([1])), cameras(COUNT), []).maps.shape == (0, 3, 4)
+
+
+def test_two_photographs_are_enough_to_predict_from_and_one_is_not() -> None:
+    gains = np.linspace(0.5, 1.5, COUNT)
+    assert predict_exposures(exposures(gains, np.array([4])), cameras(COUNT), [5]).errors == {}
+    two = predict_exposures(exposures(gains, np.array([4, 6])), cameras(COUNT), [5])
+    # Each is the only one that predicts the other, whatever the source.
+    assert two.errors.keys() == {"mean", "order", "cameras"}
+    assert len({round(error, 6) for error in two.errors.values()}) == 1
+    assert two.errors["mean"] > 0
 
 
 def test_where_the_order_is_none_the_nearest_cameras_tell() -> None:

@@ -47,6 +47,27 @@ def test_a_graph_that_pools_itself_is_taken_at_its_word(folder: Path) -> None:
     np.testing.assert_allclose(tower.embed(["red"])[0], unit(table_of(folder)[[2, 4, 3]].sum(0)), atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("mask", "length", "padding"), [(False, "any", 7), (True, 12, 9), (False, 12, 9), (True, "any", 0)]
+)
+def test_phrases_are_padded_where_the_graph_is_of_one_length_or_cannot_tell(
+    folder: Path, mask: bool, length: int | str, padding: int
+) -> None:
+    """The tokenizer pads to ten tokens, and its graph adds up all of them."""
+    save_graph(folder / "model.onnx", output="sentence_embedding", mask=mask, length=length)
+    rows = [2, 4, 3] + [0] * padding
+    tower = OnnxTower(OnnxTextConfig(model=str(folder)))
+    np.testing.assert_allclose(tower.embed(["red"])[0], unit(table_of(folder)[rows].sum(0)), atol=1e-6)
+
+
+def test_an_output_that_does_not_fit_the_pooling_is_refused_with_its_shape(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"shape \[1, 1, 6\], expected \[1, channels\] for pooling=output"):
+        OnnxTower(OnnxTextConfig(model=str(folder), pooling="output"))
+    save_graph(folder / "model.onnx", output="sentence_embedding")
+    with pytest.raises(InputError, match=r"shape \[1, 6\], expected \[1, tokens, channels\] for pooling=mean"):
+        OnnxTower(OnnxTextConfig(model=str(folder), pooling="mean"))
+
+
 def test_the_pooling_is_read_from_the_files_of_sentence_transformers(folder: Path) -> None:
     (folder / "1_Pooling").mkdir()
     (folder / "1_Pooling" / "config.json").write_text('{"pooling_mode_cls_token": true, "word_embedding_dimension": 6}')

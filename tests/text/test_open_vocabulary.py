@@ -2,19 +2,21 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from text_towers import save_graph, save_tokenizer
+from text_towers import WORDS, save_graph, save_tokenizer
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.text.build import find_tower, words_of_table
-from gsencoder.text.embedding_cache import CACHE_VARIABLE, cached_vectors
+from gsencoder.text.build import find_tower, vocabulary_of, words_of_table
+from gsencoder.text.embedding_cache import CACHE_VARIABLE, cache_folder, cached_vectors
 from gsencoder.text.onnx_tower import OnnxTextConfig, OnnxTower
 from gsencoder.text.open_vocabulary import OpenVocabulary, make_vocabulary
 from gsencoder.text.reference_nouns import REFERENCE_NOUNS
 from gsencoder.text.table import TextTable, load_text_table, save_text_table
-from gsencoder.text.towers import embed_in_templates, unit
+from gsencoder.text.towers import TowerRecord, embed_in_templates, unit
+from gsencoder.text.transformers_tower import TransformersTextConfig
 
 
 class HashTower:
@@ -91,6 +93,37 @@ def test_without_the_tower_its_words_work_and_an_error_says_what_to_get(
     assert "known without it: handle, mug, …" in said
 
 
+def test_a_missing_tower_names_three_phrases_and_three_near_names_of_each(
+    tower: HashTower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("GSENCODER_MODELS", raising=False)
+    words = words_of_table(vocabulary(tower).table)
+    phrases = [f"{thing} by the chair, the lamp, the table and the bed" for thing in ("mug", "cup", "sofa", "door")]
+    with pytest.raises(InputError) as error:
+        words.encode(phrases)
+    said = str(error.value)
+    assert [phrase in said for phrase in phrases] == [True, True, True, False]
+    assert said.rpartition("known without it: ")[2].count(", ") == 9
+
+
+def test_the_record_of_a_tower_has_a_known_kind_and_short_texts(no_jaxtyping: None) -> None:
+    good: dict[str, Any] = {"kind": "onnx", "name": "n", "identity": "i", "pooling": "p" * 1000}
+    TowerRecord(**good)
+    for name in good:
+        for wrong in ("", "p" * 1001, 5):
+            with pytest.raises(InputError, match="expected a kind among onnx, transformers, a name"):
+                TowerRecord(**{**good, name: wrong})
+    with pytest.raises(InputError, match="expected a kind among onnx, transformers"):
+        TowerRecord(**{**good, "kind": "table"})
+
+
+@pytest.mark.parametrize("config", [OnnxTextConfig, TransformersTextConfig])
+def test_a_template_needs_one_place_for_the_phrase(config: type) -> None:
+    for wrong in ((), ("a photo",), ("{} and {}",)):
+        with pytest.raises(InputError, match="templates: expected"):
+            config(templates=wrong)
+
+
 def test_a_tower_is_recognized_by_its_files_in_a_folder_of_another_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -106,8 +139,6 @@ def test_a_tower_is_recognized_by_its_files_in_a_folder_of_another_name(
 
 
 def make_record(tower: OnnxTower):
-    from gsencoder.text.towers import TowerRecord
-
     return TowerRecord(kind="onnx", name="original", identity=tower.identity, pooling=tower.pooling)
 
 
@@ -165,6 +196,57 @@ def test_the_cache_answers_what_was_asked_before(tmp_path: Path, monkeypatch: py
     cached_vectors("other identity", ("{}",), ["mug"], tower.embed)
     cached_vectors("identity", ("a {}",), ["mug"], tower.embed)
     assert tower.asked[3:] == ["mug", "mug"]
+
+
+def test_the_cache_lies_where_the_user_says_or_among_the_caches_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert cache_folder() is None
+    monkeypatch.chdir(tmp_path)
+    cached_vectors("identity", ("{}",), ["mug"], HashTower().embed)
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "mine"))
+    assert cache_folder() == tmp_path / "mine" / "text"
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for unset in ("", None):
+        monkeypatch.delenv(CACHE_VARIABLE) if unset is None else monkeypatch.setenv(CACHE_VARIABLE, unset)
+        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        assert cache_folder() == tmp_path / "home" / ".cache" / "gsencoder" / "text"
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+        assert cache_folder() == tmp_path / "caches" / "gsencoder" / "text"
+
+
+def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
+    with pytest.warns(SceneWarning, match=f"text vectors are not cached: .*{CACHE_VARIABLE}=off turns the cache off"):
+        made = cached_vectors("identity", ("{}",), ["mug"], HashTower().embed)
+    np.testing.assert_array_equal(made, HashTower().embed(["mug"]))
+
+
+def test_a_cache_of_too_many_phrases_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setattr("gsencoder.text.embedding_cache.MAX_PHRASES", 3)
+    tower = HashTower()
+    for phrase in ("a", "b", "c", "a", "d", "d", "a"):
+        np.testing.assert_array_equal(
+            cached_vectors("identity", ("{}",), [phrase], tower.embed), HashTower().embed([phrase])
+        )
+    # Three fit; the fourth is alone in the file, and the first has to be computed again.
+    assert tower.asked == ["a", "b", "c", "d", "a"]
+
+
+def test_a_vocabulary_is_made_of_the_tower_and_the_templates_of_its_settings(tmp_path: Path) -> None:
+    save_tokenizer(tmp_path / "tokenizer.json", (*WORDS[:4], *sorted(set(" ".join(REFERENCE_NOUNS).split()))))
+    save_graph(tmp_path / "model.onnx", rows=1000)
+    config = OnnxTextConfig(model=str(tmp_path), pooling="mean", templates=("{} door", "the {}"))
+    words, tower = vocabulary_of(config, ["lamp chair"]), OnnxTower(config)
+    assert words.record == TowerRecord(
+        kind="onnx", name=tmp_path.name, identity=tower.identity, pooling="mean", templates=config.templates
+    )
+    assert words.table.names == (*REFERENCE_NOUNS, "lamp chair")
+    expected = unit(tower.embed(["lamp chair door"]) + tower.embed(["the lamp chair"]))
+    np.testing.assert_allclose(words.table.embeddings[-1:], expected, atol=1e-6)
 
 
 def test_a_damaged_cache_is_replaced_with_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
