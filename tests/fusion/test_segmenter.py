@@ -232,7 +232,7 @@ def test_words_are_those_of_a_table_or_of_the_colors_or_none(tmp_path: Path, rng
     assert isinstance(colors, TextTable)
     assert colors.names == COLOR_NAMES
     np.testing.assert_array_equal(colors.encode(["red"])[0], np.eye(11)[COLOR_NAMES.index("red")])
-    with pytest.raises(InputError, match="text=onnx: teacher=palette has the words of its eleven colors"):
+    with pytest.raises(InputError, match="text=: teacher=palette has the words of its eleven colors"):
         words_of(PaletteConfig(), OnnxTextConfig(model="any"))
 
 

@@ -151,3 +151,31 @@ def test_a_phrase_has_one_vector_whatever_stands_beside_it(shared: Path) -> None
     tower = OnnxTower(OnnxTextConfig(model=str(shared / "models" / "minilm_l6"), pooling="mean"))
     together = tower.embed(["mug", "the long table by the window", "chair"])
     np.testing.assert_array_equal(together[0], tower.embed(["mug"])[0])
+
+
+def test_a_phrase_of_which_a_part_is_unknown_is_refused(folder: Path) -> None:
+    tower = OnnxTower(OnnxTextConfig(model=str(folder), pooling="mean"))
+    with pytest.raises(InputError, match="'red zebra': its tokenizer does not know 1 of its 2 parts"):
+        tower.embed(["red zebra"])
+
+
+def test_what_looks_like_a_special_token_is_text(folder: Path) -> None:
+    """The name of a special token in a phrase does not become that token."""
+    tower = OnnxTower(OnnxTextConfig(model=str(folder), pooling="mean"))
+    with pytest.raises(InputError, match="tokenizer"):
+        tower.embed(["[SEP]"])
+
+
+def test_a_tokenizer_that_breaks_on_a_phrase_is_one_line(folder: Path) -> None:
+    state = json.loads((folder / "tokenizer.json").read_text())
+    del state["model"]["vocab"]["[UNK]"]
+    (folder / "tokenizer.json").write_text(json.dumps(state))
+    tower = OnnxTower(OnnxTextConfig(model=str(folder), pooling="mean"))
+    with pytest.raises(InputError, match=r"tokenizer.json cannot read 'zebra': .*UNK"):
+        tower.embed(["zebra"])
+
+
+def test_a_pointer_of_git_lfs_is_named_as_such(folder: Path) -> None:
+    (folder / "model.onnx").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    with pytest.raises(InputError, match="is a pointer of git-lfs and not the file itself"):
+        OnnxTower(OnnxTextConfig(model=str(folder), pooling="mean"))

@@ -184,3 +184,18 @@ def test_a_phrase_that_would_be_cut_is_refused(saved: Any) -> None:
         tower.embed(["mug " * 20])
     with pytest.raises(InputError, match="holds no word that its tokenizer knows"):
         tower.embed(["zebra"])
+
+
+def test_a_model_without_its_tokenizer_is_named(saved: Any) -> None:
+    folder, _ = saved(bert)
+    for path in folder.glob("tokenizer*"):
+        path.unlink()
+    with pytest.raises(InputError, match="the tokenizer is missing; expected tokenizer.json beside the model"):
+        TransformersTower(TransformersTextConfig(model=str(folder), pooling="mean"))
+
+
+def test_a_model_with_code_of_its_own_is_refused_with_advice(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"model_type": "mystery", "auto_map": {"AutoConfig": "code.Config"}}')
+    (tmp_path / "code.py").write_text("raise SystemExit('the code of a folder was run')")
+    with pytest.raises(InputError, match="needs Python code of its own, which is never run; give a model of a kind"):
+        TransformersTower(TransformersTextConfig(model=str(tmp_path), pooling="mean"))

@@ -95,7 +95,7 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
         (("query=cube", "grid=[3]"), "grid: expected rows and columns"),
         (("query=cube", "grid=[0,3]"), "grid: expected rows and columns of 1 or more"),
         (("query=zebra",), "not among the 4 words"),
-        (("query=pen holder",), "none of pen holder was found"),
+        (("query=pen holder",), "'pen holder' is absent (probability"),
         (("query=cube", "choose.count=99"), "count: expected 1 to candidates"),
         (("query=cube", "choose.source=nowhere"), "choose.source: expected one of both, frames, shells"),
         (("query=cube", "space=other"), "other"),
