@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import check_fetched, find_file
+from gsencoder.core.files.model_files import find_file
+from gsencoder.core.onnx_session import open_session
 from gsencoder.core.pretrained import digest_files
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
@@ -82,7 +83,7 @@ class OnnxTower:
             raise InputError(f"{folder}: {missing} is missing; expected a text tower as optimum exports it")
         self.name, self._folder = folder.resolve().name, folder
         self._tokenizer = _load_tokenizer(tokenizer)
-        self._session = _load_graph(graph, config.threads)
+        self._session = open_session(graph, "text tower", threads=config.threads)
         self._inputs = {tensor.name: tensor.shape for tensor in self._session.get_inputs()}
         unknown = sorted(set(self._inputs) - set(KNOWN_INPUTS))
         if "input_ids" not in self._inputs or unknown:
@@ -212,22 +213,6 @@ def _load_tokenizer(path: Path) -> Any:
         return Tokenizer.from_file(str(path))
     except Exception as error:  # tokenizers raises plain Exceptions
         raise InputError(f"{path}: is no tokenizer: {' '.join(str(error).split())[:120]}") from error
-
-
-def _load_graph(path: Path, threads: int) -> Any:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    # Errors of runs become ours, in one line.
-    options.log_severity_level = 4
-    if threads:
-        options.intra_op_num_threads = threads
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime raises its own classes, which share only this base
-        check_fetched(path)
-        message = " ".join(str(error).replace(str(path), path.name).split())[:120]
-        raise InputError(f"{path}: is no model that onnxruntime reads: {message}") from error
 
 
 def stated_pooling(folder: Path) -> str:

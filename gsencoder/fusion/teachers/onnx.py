@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import check_fetched, find_file
+from gsencoder.core.files.model_files import find_file
 from gsencoder.core.files.npz import read_npz
+from gsencoder.core.onnx_session import open_session
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -83,21 +84,11 @@ class OnnxTeacher:
         Raises:
             InputError: a missing or unreadable model, or names that it does not have.
         """
-        import onnxruntime
-
         self.config = config
         if not config.model:
             raise InputError("teacher onnx: teacher.model= is missing: the .onnx file of the backbone")
         path = find_file(config.model, "teacher.model")
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = 3
-        if config.threads:
-            options.intra_op_num_threads = config.threads
-        try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime raises its own classes, which share only this base
-            check_fetched(path)
-            raise InputError(f"teacher onnx: {path} is no model that onnxruntime reads: {str(error)[:120]}") from error
+        self._session = open_session(path, "teacher onnx", threads=config.threads)
         self._path = path
         inputs = [tensor.name for tensor in self._session.get_inputs()]
         outputs = [tensor.name for tensor in self._session.get_outputs()]

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import check_fetched
+from gsencoder.core.onnx_session import open_session
 from gsencoder.core.pretrained import digest_files
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.fusion.teachers.segmenter_classes import read_classes
@@ -67,18 +67,7 @@ class OnnxSegmenter:
         Raises:
             InputError: it cannot be read, or does not take one picture of three channels.
         """
-        import onnxruntime
-
-        session_options = onnxruntime.SessionOptions()
-        session_options.log_severity_level = 4
-        if options.threads:
-            session_options.intra_op_num_threads = options.threads
-        try:
-            self._session = onnxruntime.InferenceSession(str(path), session_options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime raises its own classes, which share only this base
-            check_fetched(path)
-            message = " ".join(str(error).replace(str(path), path.name).split())[:120]
-            raise InputError(f"teacher segmenter: {path} is no model that onnxruntime reads: {message}") from error
+        self._session = open_session(path, "teacher segmenter", threads=options.threads)
         self.name, self.options = path.stem, options
         inputs = {tensor.name: tensor for tensor in self._session.get_inputs()}
         outputs = [tensor.name for tensor in self._session.get_outputs()]
