@@ -74,15 +74,15 @@ def main() -> None:
         assert shares is not None
         assert views.images is not None
         image = views.images[view]
-        own = shares.argmax(axis=-1).astype(np.uint8)
-        own = np.asarray(Image.fromarray(own).resize(image.shape[1::-1], Image.Resampling.NEAREST)).ravel()
-        agreements.append(float((named == own)[seen].mean()))
+        predicted = shares.argmax(axis=-1).astype(np.uint8)
+        predicted = np.asarray(Image.fromarray(predicted).resize(image.shape[1::-1], Image.Resampling.NEAREST)).ravel()
+        agreements.append(float((named == predicted)[seen].mean()))
         fronts = red_fronts(image).ravel()[seen]
         if fronts.mean() > 0.01:
-            red.append((iou(named[seen] == cabinet, fronts), iou(own[seen] == cabinet, fronts)))
-    fused, own_iou = np.mean(red, axis=0)
+            red.append((iou(named[seen] == cabinet, fronts), iou(predicted[seen] == cabinet, fronts)))
+    fused, network_iou = np.mean(red, axis=0)
     print(f"{len(left_out)} frames left out: {np.mean(agreements):.3f} of the pixels have the network's own class")
-    print(f"red fronts in {len(red)} frames: IoU {fused:.3f} of the fused map, {own_iou:.3f} of the network's own")
+    print(f"red fronts in {len(red)} frames: IoU {fused:.3f} of the fused map, {network_iou:.3f} of the network's own")
 
 
 if __name__ == "__main__":

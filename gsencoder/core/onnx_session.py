@@ -1,7 +1,9 @@
-"""ONNX files as sessions of onnxruntime on the CPU."""
+"""ONNX files of the user under onnxruntime on the CPU: opening them, naming their tensors, running them."""
 
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import check_fetched
@@ -33,3 +35,45 @@ def open_session(path: Path, what: str, *, threads: int = 0) -> Any:
         check_fetched(path)
         message = " ".join(str(error).replace(str(path), path.name).split())[:120]
         raise InputError(f"{what}: {path} is no model that onnxruntime reads: {message}") from error
+
+
+def choose_tensors(session: Any, given_input: str, given_output: str, what: str, advice: str = "") -> tuple[str, str]:
+    """The names of an input and an output of a session: those given, else the first ones.
+
+    Args:
+        session: of a file.
+        given_input: empty = the first.
+        given_output: empty = the first.
+        what: who asks, and which file, for the message.
+        advice: ends the message.
+
+    Raises:
+        InputError: the file has no tensors of these names.
+    """
+    inputs, outputs = ([tensor.name for tensor in side()] for side in (session.get_inputs, session.get_outputs))
+    chosen_input = given_input or (inputs[0] if inputs else "")
+    chosen_output = given_output or (outputs[0] if outputs else "")
+    if chosen_input not in inputs or chosen_output not in outputs:
+        raise InputError(
+            f"{what} has inputs {inputs} and outputs {outputs}, not {chosen_input!r} and {chosen_output!r}{advice}"
+        )
+    return chosen_input, chosen_output
+
+
+def run_on_picture(session: Any, tensors: tuple[str, str], picture: np.ndarray, what: str) -> Any:
+    """The output of a session for one picture.
+
+    Args:
+        session: of a file.
+        tensors: names of its input and its output.
+        picture: the input, with its batch axis.
+        what: who asks, and which file, for the message.
+
+    Raises:
+        InputError: it does not run.
+    """
+    try:
+        return session.run([tensors[1]], {tensors[0]: np.ascontiguousarray(picture)})[0]
+    except Exception as error:  # onnxruntime raises its own classes, which share only this base
+        message = " ".join(str(error).split())[:200]
+        raise InputError(f"{what} does not run on a picture {list(picture.shape)}: {message}") from error

@@ -1,6 +1,5 @@
 """Models of transformers in folders on disk: loaded without a network, without pickles, and without a folder's code."""
 
-import hashlib
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -11,7 +10,6 @@ from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.model_files import check_fetched
 
 EXTRA = "pip install 'gsencoder[teachers]'"
-BLOCK_BYTES = 1 << 24
 
 
 def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = "warn") -> Any:
@@ -82,6 +80,27 @@ def _unreadable(folder: Path, what: str, error: Exception) -> InputError:
     return InputError(f"{what}: {folder} holds no model that transformers reads: {message[:160]}")
 
 
+def load_companion(loader: Any, folder: Path, what: str, noun: str, **options: Any) -> Any:
+    """What belongs to the model of a folder, such as its tokenizer or its preprocessing.
+
+    Args:
+        loader: a class of transformers with `from_pretrained`.
+        folder: of the model.
+        what: who loads it, for messages.
+        noun: what it is, for messages.
+        options: further arguments of `from_pretrained`.
+
+    Raises:
+        InputError: transformers cannot read it.
+    """
+    try:
+        with quiet_transformers():
+            return loader.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False, **options)
+    except Exception as error:  # tokenizers raises plain Exceptions
+        message = " ".join(str(error).split())[:160]
+        raise InputError(f"{what}: {folder} holds no {noun} that transformers reads: {message}") from error
+
+
 @contextmanager
 def quiet_transformers() -> Iterator[None]:
     """Without the progress bar and the table of keys that transformers prints while it loads: `load_pretrained` reports
@@ -123,13 +142,3 @@ def _check_keys(folder: Path, model: Any, report: Mapping[str, Any], what: str, 
             SceneWarning,
             stacklevel=4,
         )
-
-
-def digest_files(*files: Path, settings: object = None) -> str:
-    """A fingerprint of the contents of files, in this order, and of settings; 16 hexadecimal digits."""
-    digest = hashlib.sha256(b"" if settings is None else repr(settings).encode("utf-8", "backslashreplace"))
-    for path in files:
-        with path.open("rb") as stream:
-            while block := stream.read(BLOCK_BYTES):
-                digest.update(block)
-    return digest.hexdigest()[:16]

@@ -68,14 +68,14 @@ def orbit_cameras(
 
 
 def spiral_directions(
-    count: int, up: Float64[np.ndarray, "3"] | None
+    count: int, up: Float64[np.ndarray, "3"] | None, elevations: tuple[float, float] = (-15.0, 60.0)
 ) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "3"]]:
     """Unit vectors from the center to the cameras, evenly spread, and the vertical.
 
     Args:
         count: number of directions, along a golden-angle spiral.
-        up: if known, they are between 15° below and 60° above the horizon; else they cover all directions except the
-            poles of -y.
+        up: if known, they are between two elevations; else they cover all directions except the poles of -y.
+        elevations: lowest and highest angle above the horizon, degrees.
 
     Raises:
         InputError: `up` is not a direction.
@@ -86,7 +86,7 @@ def spiral_directions(
         raise InputError(f"orbit cameras: up must be a direction, got {vertical.tolist()}")
     vertical = vertical / length
     # Equal steps of the sine of the elevation sample the sphere evenly.
-    low, high = (-0.9, 0.9) if up is None else (math.sin(math.radians(-15)), math.sin(math.radians(60)))
+    low, high = (-0.9, 0.9) if up is None else (math.sin(math.radians(degrees)) for degrees in elevations)
     steps = (np.arange(count) + 0.5) / count
     sines, turns = low + (high - low) * steps, GOLDEN_ANGLE * np.arange(count)
     east = perpendicular(vertical)

@@ -22,6 +22,8 @@ MAX_OBSTACLES = 100_000
 CLEARANCE = 0.1
 """Smallest distance to any Gaussian, in half diagonals of the extent."""
 POSITIONS, DIRECTIONS = 24, 8
+ELEVATIONS = (-35.0, 15.0)
+"""Of the looks of level cameras, degrees above the horizon."""
 FILLED = 0.7
 """A photograph of a room shows surfaces nearly everywhere: candidates that fill less of their picture are left out."""
 DISTANCE = 0.3
@@ -111,15 +113,7 @@ def _free_positions(
 def _candidates(centers: Float64[np.ndarray, "P 3"], up: Float64[np.ndarray, "3"] | None) -> Cameras:
     """Cameras at each position, in directions that are spread over all of them together."""
     count = len(centers) * DIRECTIONS
-    outward, vertical = spiral_directions(count, up)
-    if up is not None:
-        # An orbit looks down from above; in a room that is a look between 35° down and 15° up.
-        sines = np.sin(np.deg2rad(-35)) + (np.arange(count) + 0.5) / count * (
-            np.sin(np.deg2rad(15)) - np.sin(np.deg2rad(-35))
-        )
-        level = outward - (outward @ vertical)[:, None] * vertical
-        level /= np.linalg.norm(level, axis=1, keepdims=True)
-        outward = np.sqrt(1 - sines**2)[:, None] * level + sines[:, None] * vertical
+    outward, vertical = spiral_directions(count, up, ELEVATIONS)
     # Neighbors of the spiral go to different positions.
     order = np.argsort(np.tile(np.arange(len(centers)), DIRECTIONS), kind="stable")
     focal = WIDTH / (2 * float(np.tan(FIELD_OF_VIEW / 2)))

@@ -25,11 +25,11 @@ MAX_PHRASES = 20_000
 
 def cache_folder() -> Path | None:
     """The folder of cached vectors, or None where caching is off."""
-    given = os.environ.get(CACHE_VARIABLE, "")
-    if given == OFF:
+    stated = os.environ.get(CACHE_VARIABLE, "")
+    if stated == OFF:
         return None
-    if given:
-        return Path(given) / "text"
+    if stated:
+        return Path(stated) / "text"
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     return Path(base) / "gsencoder" / "text"
 

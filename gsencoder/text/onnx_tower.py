@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.onnx_session import open_session
-from gsencoder.core.pretrained import digest_files
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
 Pooling = Literal["mean", "cls", "eos", "output"]
@@ -153,14 +152,14 @@ class OnnxTower:
             return output[0, :count].mean(axis=0, dtype=np.float64).astype(np.float32)
         return output[0, 0 if self.pooling == "cls" else count - 1].astype(np.float32)
 
-    def _choose_pooling(self, asked: str) -> tuple[Pooling, str]:
+    def _choose_pooling(self, requested: str) -> tuple[Pooling, str]:
         """The pooling, and the output that it takes."""
         outputs = [tensor.name for tensor in self._session.get_outputs()]
         pooled = next((name for name in POOLED_OUTPUTS if name in outputs), None)
         tokens = next((name for name in TOKEN_OUTPUTS if name in outputs), outputs[0])
-        if asked == "auto" and pooled is not None:
+        if requested == "auto" and pooled is not None:
             return "output", pooled
-        pooling = stated_pooling(self._folder) if asked == "auto" else asked
+        pooling = stated_pooling(self._folder) if requested == "auto" else requested
         if pooling == "output":
             return "output", pooled or outputs[0]
         if pooling in ("mean", "cls", "eos"):

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
-from gsencoder.core.pretrained import digest_files, load_pretrained, quiet_transformers, read_config
+from gsencoder.core.files.model_files import digest_files, find_file
+from gsencoder.core.pretrained import load_companion, load_pretrained, read_config
 from gsencoder.text.onnx_tower import Pooling, stated_pooling
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
@@ -109,6 +109,8 @@ class TransformersTower:
         import torch
         import transformers
 
+        from gsencoder.core.runtime.device import choose_device
+
         self.name = folder.resolve().name
         self._kind = JOINT.get(stated.model_type)
         self.pooling = _choose_pooling(folder, stated.model_type, config.pooling)
@@ -123,7 +125,7 @@ class TransformersTower:
                 f"{WHAT}: {folder}: the tokenizer has {len(self._tokenizer)} tokens and the model {rows}; expected "
                 "both of one model"
             )
-        self._device = ("cuda" if torch.cuda.is_available() else "cpu") if config.device == "auto" else config.device
+        self._device = choose_device(config.device)
         self._model = model.to(self._device)
         self._lower = self._kind is not None and self._kind.lower if config.lower == "auto" else config.lower == "yes"
         files = [folder / "config.json", *sorted(folder.glob("*.safetensors"))]
@@ -170,9 +172,9 @@ def canonical(phrase: str) -> str:
     return " ".join(phrase.lower().translate(str.maketrans("", "", string.punctuation)).split())
 
 
-def _choose_pooling(folder: Path, model_type: str, asked: str) -> str:
-    if asked != "auto":
-        return asked
+def _choose_pooling(folder: Path, model_type: str, requested: str) -> str:
+    if requested != "auto":
+        return requested
     pooling = "output" if model_type in JOINT else stated_pooling(folder)
     if not pooling:
         raise InputError(
@@ -188,11 +190,5 @@ def _load_tokenizer(folder: Path) -> Any:
     # Without any of these transformers makes a tokenizer that knows nothing.
     if not any(path for pattern in VOCABULARIES for path in folder.glob(pattern)):
         raise InputError(f"{WHAT}: {folder}: the tokenizer is missing; expected tokenizer.json beside the model")
-    try:
-        with quiet_transformers():
-            # What looks like a special token in a phrase is text.
-            options = {"local_files_only": True, "trust_remote_code": False, "split_special_tokens": True}
-            return AutoTokenizer.from_pretrained(str(folder), **options)
-    except Exception as error:  # tokenizers raises plain Exceptions
-        message = " ".join(str(error).split())[:160]
-        raise InputError(f"{WHAT}: {folder} holds no tokenizer that transformers reads: {message}") from error
+    # What looks like a special token in a phrase is text.
+    return load_companion(AutoTokenizer, folder, WHAT, "tokenizer", split_special_tokens=True)

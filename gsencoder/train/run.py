@@ -1,6 +1,5 @@
 """Training of an encoder from scenes on disk (SplatDistill sec. 3.3): preparation, distillation, validation."""
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,7 +11,7 @@ import torch
 from jaxtyping import Float32
 
 from gsencoder.core.files.json_values import plain
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.teachers.build import text_table_of
@@ -189,7 +188,7 @@ def resume_settings(config: TrainConfig, process: ProcessRank, dataset: Prepared
     shared = {name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
     for name in CHANGEABLE_ON_RESUME:
         del shared["train"][name]
-    heads = hashlib.sha256(find_file(config.heads, "heads").read_bytes()).hexdigest()[:16] if config.heads else ""
+    heads = digest_files(find_file(config.heads, "heads")) if config.heads else ""
     return {
         **shared,
         **{"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": heads},

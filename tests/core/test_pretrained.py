@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from gsencoder.core import pretrained
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.pretrained import digest_files, load_pretrained, read_config
+from gsencoder.core.files import model_files
+from gsencoder.core.files.model_files import digest_files
+from gsencoder.core.pretrained import load_pretrained, read_config
 
 
 def reason(call: Callable[[], Any]) -> str:
@@ -93,7 +94,7 @@ def test_the_fingerprint_is_that_of_settings_and_files_in_their_order(
     first, second = tmp_path / "first", tmp_path / "second"
     first.write_bytes(b"0123456789")
     second.write_bytes(b"abc")
-    monkeypatch.setattr(pretrained, "BLOCK_BYTES", 4)
+    monkeypatch.setattr(model_files, "BLOCK_BYTES", 4)
     assert digest_files(first, second) == hashlib.sha256(b"0123456789abc").hexdigest()[:16]
     assert digest_files(second, first) == hashlib.sha256(b"abc0123456789").hexdigest()[:16]
     assert digest_files(first, settings=("é", 1)) == hashlib.sha256("('é', 1)0123456789".encode()).hexdigest()[:16]

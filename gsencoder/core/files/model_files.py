@@ -1,13 +1,13 @@
-"""Search for the files of models and text tables: at a path, or by name in the folder of models."""
+"""Files of models and text tables: at a path, or by name in the folder of models; and their fingerprints."""
 
+import hashlib
 import os
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
 
 MODELS_VARIABLE = "GSENCODER_MODELS"
-
-
+BLOCK_BYTES = 1 << 24
 POINTER = b"version https://git-lfs"
 """What files begin with that stand for large ones in a repository."""
 
@@ -43,3 +43,13 @@ def find_file(name: str, option: str, *, folder: bool = False) -> Path:
             return path
     hint = "" if models else f", and {MODELS_VARIABLE} is not set (a folder to look for models in)"
     raise InputError(f"{option}: no {'folder' if folder else 'file'} at {' or '.join(map(str, tried))}{hint}")
+
+
+def digest_files(*files: Path, settings: object = None) -> str:
+    """A fingerprint of the contents of files, in this order, and of settings; 16 hexadecimal digits."""
+    digest = hashlib.sha256(b"" if settings is None else repr(settings).encode("utf-8", "backslashreplace"))
+    for path in files:
+        with path.open("rb") as stream:
+            while block := stream.read(BLOCK_BYTES):
+                digest.update(block)
+    return digest.hexdigest()[:16]

@@ -60,10 +60,8 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
 
 def words_beside(teacher: Teacher, words: Words | None) -> TextTable | None:
     """The table that is stored with a teacher's features: of a tower, with the names that the teacher knows."""
-    if isinstance(words, OpenVocabulary) and isinstance(teacher, SegmenterTeacher):
+    if isinstance(words, OpenVocabulary) and isinstance(teacher, (LabelsTeacher, SegmenterTeacher)):
         words = words.including(teacher.kinds)
-    elif isinstance(words, OpenVocabulary) and isinstance(teacher, LabelsTeacher):
-        words = words.including(teacher.names[1:])
     return closed_table(words) if words is not None else None
 
 

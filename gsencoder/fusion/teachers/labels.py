@@ -81,6 +81,7 @@ class LabelsTeacher:
             )
         mean = embeddings.mean(axis=0, dtype=np.float64) if mean is None else mean.astype(np.float64)
         other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)
+        self.kinds = tuple(used)
         self.names = ("other", *used)
         self.vectors = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)
         self.cell = cell

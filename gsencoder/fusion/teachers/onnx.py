@@ -1,6 +1,5 @@
 """The `onnx` teacher: any dense ONNX backbone under onnxruntime, its outputs as they are or as word mixtures."""
 
-import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -9,10 +8,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.files.npz import read_npz
-from gsencoder.core.onnx_session import open_session
-from gsencoder.fusion.teachers.resize import fit_to_patches
+from gsencoder.core.onnx_session import choose_tensors, open_session, run_on_picture
+from gsencoder.fusion.teachers.resize import fit_to_patches, normalized
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 LARGEST_SIDE = 8192
@@ -90,18 +89,12 @@ class OnnxTeacher:
         path = find_file(config.model, "teacher.model")
         self._session = open_session(path, "teacher onnx", threads=config.threads)
         self._path = path
-        inputs = [tensor.name for tensor in self._session.get_inputs()]
-        outputs = [tensor.name for tensor in self._session.get_outputs()]
-        self._input = config.input or (inputs[0] if inputs else "")
-        self._output = config.output or (outputs[0] if outputs else "")
-        if self._input not in inputs or self._output not in outputs:
-            raise InputError(
-                f"teacher onnx: {path.name} has inputs {inputs} and outputs {outputs}, "
-                f"not {self._input!r} and {self._output!r}"
-            )
-        self._digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        self._input, self._output = choose_tensors(
+            self._session, config.input, config.output, f"teacher onnx: {path.name}"
+        )
+        self._digest = digest_files(path)
         self._classes = _load_classes(find_file(config.classes, "teacher.classes")) if config.classes else None
-        shape = self._session.get_outputs()[outputs.index(self._output)].shape
+        shape = next(tensor.shape for tensor in self._session.get_outputs() if tensor.name == self._output)
         stated = shape[-1 if config.layout == "tokens" else 1] if len(shape) == self._axes else None
         if self._classes is not None:
             stated = self._classes.shape[1]
@@ -152,9 +145,7 @@ class OnnxTeacher:
 
     def _run(self, image: np.ndarray) -> Float32[np.ndarray, "h w D"]:
         config = self.config
-        mean, std = np.array(config.mean, np.float32), np.array(config.std, np.float32)
-        tensor = ((image.astype(np.float32) / config.scale - mean) / std).transpose(2, 0, 1)[None]
-        result = self._output_of(np.ascontiguousarray(tensor))
+        result = self._output_of(normalized(image, config.scale, config.mean, config.std).transpose(2, 0, 1)[None])
         if config.layout == "grid":
             result = result.transpose(1, 2, 0)
         else:
@@ -173,11 +164,7 @@ class OnnxTeacher:
     def _output_of(self, tensor: Float32[np.ndarray, "1 3 H W"]) -> np.ndarray:
         """The model's output for one picture, without the batch axis."""
         where = f"teacher onnx: {self._path.name}"
-        try:
-            output = self._session.run([self._output], {self._input: tensor})[0]
-        except Exception as error:  # onnxruntime raises its own classes, which share only this base
-            message = " ".join(str(error).split())[:200]
-            raise InputError(f"{where} does not run on a picture {list(tensor.shape)}: {message}") from error
+        output = run_on_picture(self._session, (self._input, self._output), tensor, where)
         if not isinstance(output, np.ndarray) or output.ndim != self._axes or len(output) != 1:
             wanted = "[1, tokens, channels]" if self.config.layout == "tokens" else "[1, channels, rows, columns]"
             raise InputError(

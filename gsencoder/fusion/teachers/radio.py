@@ -6,8 +6,8 @@ from typing import Any, Literal
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
-from gsencoder.core.pretrained import digest_files, load_pretrained, read_config
+from gsencoder.core.files.model_files import digest_files, find_file
+from gsencoder.core.pretrained import load_pretrained, read_config
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -51,13 +51,14 @@ class RadioTeacher:
             raise InputError("teacher radio: teacher.model= is missing: the folder of a RADIO model")
         folder = find_file(config.model, "teacher.model", folder=True)
         stated = read_config(folder, "teacher radio")
-        import torch
         from transformers import AutoModel
+
+        from gsencoder.core.runtime.device import choose_device
 
         if stated.model_type != "radio":
             raise InputError(f"teacher radio: {folder} holds a {stated.model_type} model, expected radio")
         model = load_pretrained(AutoModel, folder, "teacher radio")
-        device = ("cuda" if torch.cuda.is_available() else "cpu") if config.device == "auto" else config.device
+        device = choose_device(config.device).type
         self._model, self._device, self.config = model.to(device), device, config
         self._digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("config.json")]))
         self.space = FeatureSpace(

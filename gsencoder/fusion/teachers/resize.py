@@ -1,7 +1,9 @@
-"""How a picture is fitted to a backbone of patches: resized as a whole, without a crop."""
+"""How a picture is fitted to a backbone: resized as a whole, without a crop, and normalized."""
+
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
 
@@ -20,3 +22,10 @@ def fit_to_patches(
     rows, columns = max(1, round(height * ratio / patch)), max(1, round(width * ratio / patch))
     resized = Image.fromarray(image).resize((columns * patch, rows * patch), Image.Resampling.BICUBIC)
     return np.asarray(resized), np.array([[columns / width, 0, 0], [0, rows / height, 0]])
+
+
+def normalized(
+    image: UInt8[np.ndarray, "H W 3"], scale: float, mean: Sequence[float], std: Sequence[float]
+) -> Float32[np.ndarray, "H W 3"]:
+    """(image / scale − mean) / std, channel by channel."""
+    return (image.astype(np.float32) / np.float32(scale) - np.array(mean, np.float32)) / np.array(std, np.float32)

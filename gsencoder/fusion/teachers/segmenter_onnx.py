@@ -9,9 +9,9 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.onnx_session import open_session
-from gsencoder.core.pretrained import digest_files
-from gsencoder.fusion.teachers.resize import fit_to_patches
+from gsencoder.core.files.model_files import digest_files
+from gsencoder.core.onnx_session import choose_tensors, open_session, run_on_picture
+from gsencoder.fusion.teachers.resize import fit_to_patches, normalized
 from gsencoder.fusion.teachers.segmenter_classes import read_classes
 
 TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
@@ -69,15 +69,14 @@ class OnnxSegmenter:
         """
         self._session = open_session(path, "teacher segmenter", threads=options.threads)
         self.name, self.options = path.stem, options
-        inputs = {tensor.name: tensor for tensor in self._session.get_inputs()}
-        outputs = [tensor.name for tensor in self._session.get_outputs()]
-        self._input, self._output = options.input or next(iter(inputs), ""), options.output or outputs[0]
-        if self._input not in inputs or self._output not in outputs:
-            raise InputError(
-                f"teacher segmenter: {path.name} has inputs {list(inputs)} and outputs {outputs}, not {self._input!r} "
-                f"and {self._output!r} (teacher.onnx.input, teacher.onnx.output)"
-            )
-        tensor = inputs[self._input]
+        self._input, self._output = choose_tensors(
+            self._session,
+            options.input,
+            options.output,
+            f"teacher segmenter: {path.name}",
+            " (teacher.onnx.input, teacher.onnx.output)",
+        )
+        tensor = next(tensor for tensor in self._session.get_inputs() if tensor.name == self._input)
         shape = tensor.shape
         if len(shape) != 4 or tensor.type not in TYPES or 3 not in (shape[1], shape[3]):
             raise InputError(
@@ -114,11 +113,7 @@ class OnnxSegmenter:
         resized = self._fitted(image)
         feed = resized[None] if not self._channels_first else resized.transpose(2, 0, 1)[None]
         where = f"teacher segmenter: {self.name}"
-        try:
-            output = self._session.run([self._output], {self._input: np.ascontiguousarray(feed)})[0]
-        except Exception as error:  # onnxruntime raises its own classes, which share only this base
-            message = " ".join(str(error).split())[:200]
-            raise InputError(f"{where} does not run on a picture {list(feed.shape)}: {message}") from error
+        output = run_on_picture(self._session, (self._input, self._output), feed, where)
         if not isinstance(output, np.ndarray) or output.ndim != 4 or len(output) != 1 or output.dtype.kind != "f":
             raise InputError(
                 f"{where} gave {self._output!r} of {getattr(output, 'dtype', '?')}{list(np.shape(output))}; expected "
@@ -142,5 +137,4 @@ class OnnxSegmenter:
             resized, _ = fit_to_patches(image, options.size, options.multiple)
         if self._type == np.uint8:
             return resized
-        mean, std = np.array(options.mean, np.float32), np.array(options.std, np.float32)
-        return ((resized.astype(np.float32) / np.float32(options.scale) - mean) / std).astype(self._type)
+        return normalized(resized, options.scale, options.mean, options.std).astype(self._type)

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from gsencoder.core.errors import InputError
-from gsencoder.core.pretrained import digest_files, load_pretrained, quiet_transformers, read_config
+from gsencoder.core.files.model_files import digest_files
+from gsencoder.core.pretrained import load_companion, load_pretrained, quiet_transformers, read_config
+from gsencoder.core.runtime.device_names import Device
 
 WHAT = "teacher segmenter"
 MASK_HEADS = ("mask2former", "oneformer", "maskformer", "eomt", "eomt_dinov3")
@@ -18,27 +19,28 @@ MASK_HEADS = ("mask2former", "oneformer", "maskformer", "eomt", "eomt_dinov3")
 class TransformersSegmenter:
     """See `gsencoder.fusion.teachers.segmenter.Segmenter`."""
 
-    def __init__(self, folder: Path, device: str) -> None:
+    def __init__(self, folder: Path, device: Device) -> None:
         """Loads model and preprocessing; nothing is fetched from anywhere.
 
         Args:
             folder: of the model.
-            device: "auto", "cpu" or "cuda".
+            device: where the model runs.
 
         Raises:
             InputError: transformers is missing, or the folder holds no segmenter with its preprocessing.
         """
         config = read_config(folder, WHAT)
-        import torch
         import transformers
+
+        from gsencoder.core.runtime.device import choose_device
 
         self._kind = config.model_type
         universal = self._kind in MASK_HEADS
         loader = "AutoModelForUniversalSegmentation" if universal else "AutoModelForSemanticSegmentation"
         model = load_pretrained(getattr(transformers, loader), folder, WHAT)
         processor = transformers.OneFormerProcessor if self._kind == "oneformer" else transformers.AutoImageProcessor
-        self._processor = _load_processor(processor, folder)
-        self._device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+        self._processor = load_companion(processor, folder, WHAT, "preprocessing")
+        self._device = choose_device(device)
         self._model = model.to(self._device)
         self.name = folder.resolve().name
         names = getattr(config, "id2label", None) or {}
@@ -59,8 +61,8 @@ class TransformersSegmenter:
         task = {"task_inputs": ["semantic"]} if self._kind == "oneformer" else {}
         with quiet_transformers():
             inputs = self._processor(images=image, return_tensors="pt", **task)
-        given = inputs["pixel_values"].shape[-2:]
-        filled = _filled(inputs.get("pixel_mask"), given)
+        input_size = inputs["pixel_values"].shape[-2:]
+        filled = _filled(inputs.get("pixel_mask"), input_size)
         with torch.inference_mode():
             outputs = self._model(**{name: value.to(self._device) for name, value in inputs.items()})
             are_probabilities = self._kind in MASK_HEADS
@@ -70,7 +72,7 @@ class TransformersSegmenter:
                 scores = outputs.logits[0]
         values = scores.permute(1, 2, 0).float().cpu().numpy()
         # Padding at the right and below is part of the grid, and no part of the picture.
-        rows, columns = (side * share / whole for side, share, whole in zip(values.shape, filled, given, strict=False))
+        rows, columns = (side * used / size for side, used, size in zip(values.shape, filled, input_size, strict=False))
         affine = np.array([[columns / image.shape[1], 0.0, 0.0], [0.0, rows / image.shape[0], 0.0]])
         return np.ascontiguousarray(values), are_probabilities, affine
 
@@ -85,18 +87,9 @@ def _semantic_map(classes: Any, masks: Any) -> Any:
     return scores / scores.sum(dim=0, keepdim=True).clamp(min=1)
 
 
-def _filled(pixel_mask: Any, given: tuple[int, int]) -> tuple[int, int]:
+def _filled(pixel_mask: Any, input_size: tuple[int, int]) -> tuple[int, int]:
     """Rows and columns that the picture fills."""
     if pixel_mask is None:
-        return given[0], given[1]
+        return input_size[0], input_size[1]
     mask = pixel_mask[0].bool()
     return int(mask.any(dim=1).sum()), int(mask.any(dim=0).sum())
-
-
-def _load_processor(loader: Any, folder: Path) -> Any:
-    try:
-        with quiet_transformers():
-            return loader.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
-    except Exception as error:  # tokenizers, which OneFormer has, raises plain Exceptions
-        message = " ".join(str(error).split())[:160]
-        raise InputError(f"{WHAT}: {folder} holds no preprocessing that transformers reads: {message}") from error
