@@ -90,9 +90,9 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         check_question(config.task, config.question)
     with summary.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
-        words = (
-            load_words(folder, config.words, config.text) if config.words or (folder / WORDS_FILE).is_file() else None
-        )
+        # A box can be asked about without words.
+        stated = config.words or not isinstance(config.text, TableTextConfig)
+        words = load_words(folder, config.words, config.text) if stated or (folder / WORDS_FILE).is_file() else None
     asker = Asker(
         scene,
         words,

@@ -101,6 +101,16 @@ def test_a_dry_run_writes_prompt_and_pictures_and_asks_nobody(features: Path, tm
     assert {path.name for path in out.iterdir()} >= {"request.json", "sheet.png", "view_00.png", "summary.json"}
 
 
+def test_a_tower_is_not_ignored_where_the_file_of_words_was_lost(
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(features, tmp_path / "features")
+    (folder / "words.safetensors").unlink()
+    words = ("question=Where is it?", "dry_run=true", "text=onnx", "text.model=nowhere")
+    assert ask(folder, tmp_path / "out", *words) == 2
+    assert "text.model: no folder at nowhere" in capsys.readouterr().err
+
+
 def test_grounding_gives_the_box_of_the_mark_that_is_named(features: Path, tmp_path: Path) -> None:
     with serving(answer("Mark 2.")) as server:
         out = tmp_path / "ground"
