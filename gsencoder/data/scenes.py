@@ -1,9 +1,7 @@
 """Loading of scenes in any supported layout, or of a splat alone."""
 
 import math
-import warnings
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -11,26 +9,15 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import even_indices
-from gsencoder.data.readers.background import find_background
+from gsencoder.core.errors import InputError
+from gsencoder.data.posed_views import make_views
 from gsencoder.data.readers.frames import pinhole_of
 from gsencoder.data.readers.images import (
-    DepthFiles,
     DepthMeasure,
-    DepthSensor,
-    ImageFiles,
-    InstanceFiles,
-    PixelGrid,
-    is_deep_grey,
-    picture_info,
-    picture_size,
-    read_integers,
 )
 from gsencoder.data.readers.layouts import ReadOptions, describe_layouts, layout_of, read_transforms_file
-from gsencoder.data.readers.masks import EmptyFiles, MaskFiles
 from gsencoder.data.readers.objects_json import read_objects
-from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin, rigid_pose
+from gsencoder.data.readers.posed import PosedImage, PosedImages, rigid_pose
 from gsencoder.data.readers.scene_splat import (
     SPLAT_SUFFIXES,
     file_of_scene,
@@ -39,16 +26,8 @@ from gsencoder.data.readers.scene_splat import (
     warn_of_unused_splat,
 )
 from gsencoder.data.readers.transforms_json import TRANSFORMS
-from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.data.splats import load_splat
-from gsencoder.types import Cameras, Scene, Views
-from gsencoder.types.poses import invert_rigid, move_origin
-
-FEW_CAMERAS = 8
-FEWEST_STEPS = 64
-"""Integer depth images whose largest value is smaller have lost most of what was measured."""
-MEASURED = 0.05
-"""Where depth was measured on a larger share of it, what looks like a background is a wall."""
+from gsencoder.types import Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -345,163 +324,3 @@ def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
         rows = np.vstack((np.array(options.depth_from_color).reshape(-1, 4)[:3], (0, 0, 0, 1)))
         image = replace(image, depth_from_color=rigid_pose(rows, "data.depth_from_color"))
     return image
-
-
-def make_views(
-    posed: PosedImages, *, max_views: int = 0, image_scale: float = 1.0, mask_background: bool = False
-) -> tuple[Views, Float64[np.ndarray, "3"]]:
-    """Cameras without distortion and lazy pictures, and the origin that was subtracted from the cameras.
-
-    Args:
-        posed: views as their files describe them.
-        max_views: see SceneConfig.
-        image_scale: see SceneConfig.
-        mask_background: whether a background of one color is looked for, and masked with a warning.
-
-    Raises:
-        InputError: no picture, a picture or depth of the wrong size, a camera that cannot be undistorted.
-    """
-    chosen = posed.images
-    if not chosen:
-        raise InputError(f"{posed.source}: no view")
-    if max_views:
-        chosen = tuple(chosen[row] for row in even_indices(len(chosen), max_views))
-    cam_from_world = np.stack([image.cam_from_world for image in chosen])
-    origin = choose_origin(invert_rigid(cam_from_world)[:, :3, 3])
-    pinholes: dict[CameraModel, Pinhole] = {}
-    grids, depth_grids = [], []
-    transparent: list[Path | None] = []
-    for image in chosen:
-        where = f"{posed.source}: view {image.name[:120]!r}"
-        if image.camera not in pinholes:
-            pinholes[image.camera] = pinhole_for(image.camera, where)
-        pinhole = pinholes[image.camera]
-        width = max(1, round(pinhole.width * image_scale))
-        height = max(1, round(pinhole.height * image_scale))
-        grids.append(PixelGrid(source=image.camera, pinhole=pinhole, width=width, height=height))
-        depth_camera = image.depth_camera or image.camera
-        depth_grids.append(PixelGrid(source=depth_camera, pinhole=pinhole, width=width, height=height))
-        transparent.append(image.image if _check_sizes(image, depth_camera, where) else None)
-    remaps = RemapCache()
-    cameras = Cameras(
-        cam_from_world=move_origin(cam_from_world, origin).astype(np.float32),
-        Ks=np.array([grid.pinhole.matrix(grid.width, grid.height) for grid in grids]).astype(np.float32),
-        widths=np.array([grid.width for grid in grids], np.int32),
-        heights=np.array([grid.height for grid in grids], np.int32),
-    )
-    depths = [image.depth for image in chosen]
-    masks = [image.mask for image in chosen]
-    instances = [image.instance for image in chosen]
-    partial = _have_empty_pixels(list({(grid.pinhole, grid.source): grid for grid in grids}), remaps)
-    background = None
-    if mask_background and not _any(masks) and not _any(transparent) and not any(map(_is_fisheye, chosen)):
-        background = find_background([image.image for image in chosen])
-    outlined = transparent if background is None else [image.image for image in chosen]
-    has_outlines = _any(outlined)
-    views = Views(
-        cameras=cameras,
-        names=tuple(image.name for image in chosen),
-        images=ImageFiles([image.image for image in chosen], grids, remaps),
-        depths=DepthFiles(depths, depth_grids, remaps, [_depth_sensor(image) for image in chosen])
-        if _any(depths)
-        else None,
-        masks=MaskFiles(masks, grids, remaps, outlined, background) if _any(masks) or has_outlines or partial else None,
-        empty=EmptyFiles(masks, grids, remaps, outlined, background) if has_outlines else None,
-        instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
-    )
-    _warn_of_odd_files(posed.source, chosen)
-    if background is not None:
-        if _is_measured(views):
-            return make_views(posed, max_views=max_views, image_scale=image_scale)
-        _warn(
-            f"{posed.source}: the photographs have a background of one color ({background.describe()}); it is masked "
-            "and taken for empty space (data.background=none uses it)"
-        )
-    return views, origin
-
-
-def _warn_of_odd_files(source: str, images: Sequence[PosedImage]) -> None:
-    """Warns if photographs look like depth images, or depth images like meters in integers; one file of each is
-    looked at."""
-    middle = images[len(images) // 2]
-    if is_deep_grey(middle.image):
-        _warn(
-            f"{source}: {middle.image.name} has one channel of 16 bits, as depth images have; is it listed as a "
-            "photograph by mistake?"
-        )
-    depths = [image.depth for image in images if image.depth is not None and image.depth.suffix.lower() != ".npy"]
-    if depths:
-        file = depths[len(depths) // 2]
-        largest = 0
-        # A file that cannot be read is an error when the depth of its view is.
-        with suppress(InputError):
-            largest = int(read_integers(file, "depth", wide=True).max(initial=0))
-        if 0 < largest < FEWEST_STEPS:
-            _warn(
-                f"{source}: {file.name} holds depths of at most {largest} steps; if these are meters, the rest was "
-                "lost when they were saved as integers: save millimeters in 16 bits, or floating-point numbers as .npy"
-            )
-
-
-def _is_fisheye(image: PosedImage) -> bool:
-    """Whether the picture may be a disc in a black frame."""
-    return "FISHEYE" in image.camera.model
-
-
-def _is_measured(views: Views) -> bool:
-    """Whether a sensor saw surfaces where the background is."""
-    if views.depths is None or views.empty is None:
-        return False
-    rows = even_indices(len(views), 4)
-    shares = [float((views.depths[int(row)][views.empty[int(row)]] > 0).mean()) for row in rows]
-    return float(np.nan_to_num(shares).mean()) > MEASURED
-
-
-def _depth_sensor(image: PosedImage) -> DepthSensor:
-    transform = image.depth_from_color
-    return DepthSensor(
-        scale=image.depth_scale,
-        no_depth=image.no_depth,
-        measure=image.depth_measure,
-        color_from_depth=None if transform is None else invert_rigid(transform),
-    )
-
-
-def _any(paths: Sequence[Path | None]) -> bool:
-    return any(path is not None for path in paths)
-
-
-def _check_sizes(image: PosedImage, depth_camera: CameraModel, where: str) -> bool:
-    """Checks the sizes in the headers of the files; returns whether the photograph has transparency."""
-    camera = image.camera
-    if image.depth is not None and image.depth == image.image:
-        raise InputError(f"{where}: {image.image} is listed as photograph and as depth image; list the photograph")
-    size, transparent = picture_info(image.image)
-    if size != (camera.width, camera.height):
-        raise InputError(
-            f"{where}: {image.image} has {size[0]}×{size[1]} pixels but its camera {camera.width}×{camera.height}; "
-            "give the images at the size of the intrinsics (image_scale makes them smaller on load)"
-        )
-    for file, wanted in ((image.depth, depth_camera), (image.mask, camera), (image.instance, camera)):
-        if file is not None:
-            actual = picture_size(file)
-            if actual != (wanted.width, wanted.height):
-                raise InputError(
-                    f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
-                    "both must have the same size"
-                )
-    return transparent
-
-
-def _have_empty_pixels(cameras: list[tuple[Pinhole, CameraModel]], remaps: RemapCache) -> bool:
-    """Whether some pixel of a pinhole camera is outside the distorted picture. With many cameras the check would cost
-    more than masks do, and the result is True."""
-    distorted = [camera for camera in cameras if not camera[1].is_pinhole]
-    if len(distorted) > FEW_CAMERAS:
-        return True
-    maps = [remaps.get(*camera) for camera in distorted]
-    return any(remap is not None and not remap.valid.all() for remap in maps)
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, SceneWarning, stacklevel=3)
