@@ -82,9 +82,18 @@ class GaussianEncoder(nn.Module):
         tokens = tokens.to(self.head.weight.dtype)
         x = functional.gelu(self.stem_norm(self.stem(tokens, plan.levels[0].neighbors)))
         x = self.transformer(x, plan)
-        features = self.head(self.head_norm(x))
-        features = features.to(torch.promote_types(features.dtype, torch.float32))
+        features = self._output_features(x)
         return features.index_select(0, plan.token_of)
+
+    def _output_features(self, x: Float[Tensor, "T C"]) -> Float[Tensor, "T channels"]:
+        """The last norm and linear layer, in float32 under autocast: in bfloat16 the outputs would be rounded to 8
+        bits."""
+        if torch.is_autocast_enabled(x.device.type):
+            with torch.autocast(x.device.type, enabled=False):
+                features: Tensor = self.head(self.head_norm(x.to(self.head.weight.dtype)))
+        else:
+            features = self.head(self.head_norm(x))
+        return features.to(torch.promote_types(features.dtype, torch.float32))
 
 
 def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan) -> Float[Tensor, "T A"]:

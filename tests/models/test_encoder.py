@@ -191,6 +191,31 @@ def test_in_bfloat16_features_stay_close_and_come_as_float32() -> None:
     assert torch.cosine_similarity(rough, exact, dim=1).mean() > 0.99
 
 
+def test_in_bfloat16_the_last_linear_layer_computes_in_float32() -> None:
+    network, one = encoder(), splat(300)
+    inputs: list[torch.Tensor] = []
+    network.head_norm.register_forward_hook(lambda module, given, out: inputs.append(out))
+    with torch.autocast("cpu", torch.bfloat16):
+        features = run(network, one)
+    _, _, cloud = encoder_inputs(one, network.config, 0.1)
+    expected = torch.nn.functional.linear(inputs[0], network.head.weight, network.head.bias)
+    assert inputs[0].dtype == torch.float32
+    assert torch.equal(features, expected.index_select(0, network.join([cloud]).token_of))
+    # Values of bfloat16 have 8 significant bits.
+    assert (features != features.bfloat16().float()).float().mean() > 0.9
+
+
+def test_the_last_linear_layer_has_gradients_of_float32_under_autocast() -> None:
+    network = encoder().train()
+    attributes, opacities, cloud = encoder_inputs(splat(100), CONFIG, 0.1)
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = network(attributes, opacities, network.join([cloud])).square().mean()
+    loss.backward()
+    gradient = network.head.weight.grad
+    assert gradient is not None
+    assert (gradient != gradient.bfloat16().float()).float().mean() > 0.9
+
+
 # torch's own compiler instantiates an autograd function, and warns that one should not.
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 @pytest.mark.slow
