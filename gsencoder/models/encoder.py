@@ -12,7 +12,7 @@ from torch.nn import functional
 from gsencoder.core.errors import InputError
 from gsencoder.models.embed import ATTRIBUTE_CHANNELS, Attribute, embed, input_channels
 from gsencoder.models.grid.curves import SceneCurves
-from gsencoder.models.grid.neighbors import NeighborConv
+from gsencoder.models.grid.neighbors import KernelSize, NeighborConv
 from gsencoder.models.grid.plan import CloudPlan, Plan, join_plans, plan_cloud
 from gsencoder.models.point_transformer import PointTransformer, TransformerConfig
 from gsencoder.types import Gaussians
@@ -30,11 +30,16 @@ class EncoderConfig:
         default=("offset", "color", "opacity", "scale", "rotation"),
         metadata={"help": "Gaussian attributes that the encoder sees"},
     )
+    stem: KernelSize = field(
+        default=3, metadata={"help": "edge of the first convolution's neighborhood in cells: 3, or 5 as in PTv3"}
+    )
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
 
     def __post_init__(self) -> None:
         if not 0 < self.voxel < math.inf:
             raise InputError(f"voxel: expected a positive length in metres, got {self.voxel}")
+        if self.stem not in (3, 5):
+            raise InputError(f"stem: expected 3 or 5 cells, got {self.stem}")
         unknown = [name for name in self.inputs if name not in ATTRIBUTE_CHANNELS]
         if not self.inputs or unknown or len(set(self.inputs)) < len(self.inputs):
             raise InputError(
@@ -54,7 +59,7 @@ class GaussianEncoder(nn.Module):
         super().__init__()
         self.config, self.channels = config, channels
         width, out = config.transformer.encoder_channels[0], config.transformer.channels_out
-        self.stem = NeighborConv(input_channels(config.inputs), width)
+        self.stem = NeighborConv(input_channels(config.inputs), width, config.stem)
         self.stem_norm = nn.LayerNorm(width)
         self.transformer = PointTransformer(config.transformer)
         self.head_norm = nn.LayerNorm(out)
@@ -80,7 +85,8 @@ class GaussianEncoder(nn.Module):
             tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
         # Tokens are merged in float32, also for an encoder in half precision.
         tokens = tokens.to(self.head.weight.dtype)
-        x = functional.gelu(self.stem_norm(self.stem(tokens, plan.levels[0].neighbors)))
+        neighbors = plan.levels[0].neighbors if plan.stem_neighbors is None else plan.stem_neighbors
+        x = functional.gelu(self.stem_norm(self.stem(tokens, neighbors)))
         x = self.transformer(x, plan)
         features = self._output_features(x)
         return features.index_select(0, plan.token_of)
@@ -148,5 +154,7 @@ def encoder_inputs(
         attributes=config.inputs,
     )
     network = config.transformer
-    plan = plan_cloud(means, voxel, levels=network.levels, orders=network.orders, scene_curves=scene_curves)
+    plan = plan_cloud(
+        means, voxel, levels=network.levels, orders=network.orders, scene_curves=scene_curves, stem=config.stem
+    )
     return attributes, opacities, plan

@@ -1,6 +1,7 @@
 """The point transformer: an encoder and a decoder over the levels of a voxel grid (PTv3, Wu et al. 2024)."""
 
 from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,8 @@ from gsencoder.models.grid.serialize import ALIGN, Order
 MAX_CHANNELS, MAX_BLOCKS, MAX_MLP_RATIO = 1 << 14, 1000, 64
 """Limits beyond any network that was ever trained on points; larger sizes are typing errors, or damaged files that
 would fill the memory."""
+
+Shuffle = Literal["once", "pooling", "never"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +43,13 @@ class TransformerConfig:
     orders: tuple[Order, ...] = field(
         default=ORDERS,
         metadata={"help": "space-filling curves along which patches are cut; blocks use them in turn"},
+    )
+    shuffle_orders: Shuffle = field(
+        default="once",
+        metadata={
+            "help": "in training, draw a random permutation of the orders: once for all levels, or at each pooling too, "
+            "as PTv3; outside training they are never permuted"
+        },
     )
     mlp_ratio: float = field(
         default=4.0, metadata={"help": "hidden channels of a block's MLP, as a multiple of its channels"}
@@ -82,6 +92,8 @@ class TransformerConfig:
                 )
         if not self.orders:
             raise InputError("orders: expected at least one of z, z-trans, hilbert, hilbert-trans")
+        if self.shuffle_orders not in get_args(Shuffle):
+            raise InputError(f"shuffle_orders: expected once, pooling or never, got {self.shuffle_orders!r}")
         if not 0 <= self.drop_path < 1:
             raise InputError(f"drop_path: expected a number in [0, 1), got {self.drop_path}")
         if not 0 < self.mlp_ratio <= MAX_MLP_RATIO:
@@ -134,27 +146,37 @@ class PointTransformer(nn.Module):
             self.up.append(_make_blocks(config, up[level], [config.drop_path * level / config.levels] * depth))
 
     def forward(self, x: Float[Tensor, "T C"], plan: Plan) -> Float[Tensor, "T D"]:
-        """Runs all blocks; they follow the orders in turn, and in training in a new random permutation of them.
+        """Runs all blocks; they follow the orders in turn, in training permuted as `shuffle_orders` says.
+
+        The permutations are drawn from torch's generator on the CPU, which the training loop seeds by the step.
 
         Args:
             x: embedded tokens, C = encoder_channels[0].
             plan: made with the levels, patch and orders of the configuration.
         """
-        count = len(self.config.orders)
-        permutation = torch.randperm(count).tolist() if self.training else list(range(count))
+        permutations = self._permutations()
         skips: list[Tensor] = []
         first_block = 0
         for level, blocks in enumerate(self.down):
             if level:
                 skips.append(x)
                 x = self.pools[level - 1](x, plan.levels[level - 1].children)
-            x = self._run(blocks, x, plan.levels[level], permutation, first_block)
+            x = self._run(blocks, x, plan.levels[level], permutations[level], first_block)
             first_block += self.config.encoder_depths[level]
         for level in reversed(range(len(self.up))):
             x = self.unpools[level](x, skips[level], plan.levels[level].parents)
-            x = self._run(self.up[level], x, plan.levels[level], permutation, first_block)
+            x = self._run(self.up[level], x, plan.levels[level], permutations[level], first_block)
             first_block += self.config.decoder_depths[level]
         return x
+
+    def _permutations(self) -> list[list[int]]:
+        """For each level, the permutation of the orders that its blocks follow in encoder and decoder."""
+        count, levels = len(self.config.orders), self.config.levels
+        if not self.training or self.config.shuffle_orders == "never":
+            return [list(range(count))] * levels
+        if self.config.shuffle_orders == "once":
+            return [torch.randperm(count).tolist()] * levels
+        return [torch.randperm(count).tolist() for _ in range(levels)]
 
     def _run(self, blocks: nn.Module, x: Tensor, level: Level, permutation: list[int], first_block: int) -> Tensor:
         assert isinstance(blocks, nn.ModuleList)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsencoder.models.embed import embed
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.grid.neighbors import FORWARD_COLUMNS
+from gsencoder.models.grid.neighbors import KernelSize, forward_columns
 from gsencoder.models.grid.plan import Level, Plan
 from gsencoder.models.grid.serialize import (
     ALIGN,
@@ -82,12 +82,14 @@ class RawEncoder(nn.Module):
         """
         config = self.encoder.config
         attributes = embed(means, quats, scales, opacities, sh_dc, voxel=voxel, attributes=config.inputs)
-        plan = _plan_cloud(means, voxel, corner, starts, config.transformer)
+        plan = _plan_cloud(means, voxel, corner, starts, config.transformer, config.stem)
         standard: Tensor = self.encoder(attributes, opacities, plan)
         return standard * self.unit + self.get_buffer("space_mean")
 
 
-def _plan_cloud(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, config: TransformerConfig) -> Plan:
+def _plan_cloud(
+    means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, config: TransformerConfig, stem: KernelSize
+) -> Plan:
     """The twin of `plan.plan_cloud` and `plan.join_plans`."""
     scaled = torch.floor(means.double() / voxel)
     low = torch.minimum(scaled.amin(dim=0), torch.floor(corner.double() / voxel))
@@ -97,6 +99,7 @@ def _plan_cloud(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, co
     morton = codes.index_select(0, first)
     curve_codes = {order: _curve_codes(morton, order) for order in config.orders}
     tokens = TokenLevel(cells.index_select(0, members.index_select(0, first)), morton, curve_codes)
+    stem_neighbors = _neighbor_table(tokens.cells, stem) if stem != 3 else None
     levels = []
     for level in range(config.levels):
         neighbors = _neighbor_table(tokens.cells)
@@ -127,6 +130,7 @@ def _plan_cloud(means: Tensor, voxel: Tensor, corner: Tensor, starts: Tensor, co
         members=members,
         counts=_run_lengths(first, members.shape[0]),
         levels=tuple(levels),
+        stem_neighbors=stem_neighbors,
     )
 
 
@@ -165,34 +169,54 @@ def _children(first: Int64[Tensor, " M"], total: int) -> Int64[Tensor, "M 8"]:
     return first[:, None] + torch.where(step < _run_lengths(first, total)[:, None], step, 0)
 
 
-def _neighbor_table(cells: Int64[Tensor, "T 3"]) -> Int32[Tensor, "T 27"]:
+def _neighbor_table(cells: Int64[Tensor, "T 3"], size: KernelSize = 3) -> Int32[Tensor, "T cube"]:
     """The twin of `neighbors.neighbor_table`, without strides that Python would have to read."""
-    count = cells.shape[0]
+    count, radius, columns = cells.shape[0], size // 2, forward_columns(size)
     low, high = cells.amin(dim=0), cells.amax(dim=0)
-    sizes = high - low + 3
+    sizes = high - low + 1 + 2 * radius
     strides = torch.stack((sizes[1] * sizes[2], sizes[2], torch.ones_like(sizes[0])))
-    keys, order = torch.sort(((cells - low + 1) * strides).sum(dim=1), stable=True)
+    keys, order = torch.sort(((cells - low + radius) * strides).sum(dim=1), stable=True)
     positions = torch.arange(count, device=cells.device, dtype=torch.int32)
-    steps = torch.tensor([[dx, dy, -1] for dx, dy in FORWARD_COLUMNS], device=cells.device)
+    # Padded, so that a walk along a column may run past the end.
+    padded = torch.cat((keys, keys.new_full((size,), INVALID_CODE)))
+    # Cells of the center's column above it, then all cells of the forward columns.
+    after = _walk_columns(padded, positions[None] + 1, keys[None] + 1, radius, count)
+    steps = torch.tensor([[dx, dy, -radius] for dx, dy in columns], device=cells.device)
     target_keys = keys + (steps * strides).sum(dim=1, keepdim=True)
-    position = torch.searchsorted(keys, target_keys).int()
-    padded = torch.cat((keys, keys.new_full((3,), INVALID_CODE)))
+    first = torch.searchsorted(keys, target_keys).int()
+    forward = torch.cat((after, _walk_columns(padded, first, target_keys, size, count)))
+    # Cell o of the second half is opposite cell −1 − o of the first.
+    missing = torch.full_like(forward[:, :1], count)
+    opposite = torch.cat((torch.full_like(forward, count), missing), dim=1).scatter(
+        1, forward.long(), positions.expand(forward.shape[0], -1)
+    )
+    table = torch.cat((opposite[:, :-1].flip(0), positions[None], forward))
+    rows = _take(torch.cat((order.int(), torch.full_like(positions[:1], count))), table)
+    return rows.T.index_select(0, torch.empty_like(positions).scatter(0, order, positions))
+
+
+def _walk_columns(
+    padded: Int64[Tensor, " padded"],
+    position: Int32[Tensor, "columns T"],
+    target_keys: Int64[Tensor, "columns T"],
+    steps: int,
+    count: int,
+) -> Int32[Tensor, "cells T"]:
+    """The positions of successive cells of columns among sorted keys; `count` for cells that are not occupied.
+
+    Args:
+        padded: the sorted keys, with padding at the end.
+        position: where each column's first cell would be.
+        target_keys: the key of each column's first cell.
+        steps: number of cells of a column.
+        count: number of keys.
+    """
     matches = []
-    for _ in range(3):
+    for _ in range(steps):
         hit = _take(padded, position) == target_keys
         matches.append(torch.where(hit, position, count))
         position, target_keys = position + hit.int(), target_keys + 1
-    # Cells 15 to 26 of the neighborhood; cells 11 to 0 are opposite them.
-    forward = torch.stack(matches, dim=1).view(12, -1)
-    missing = torch.full_like(forward[:, :1], count)
-    opposite = torch.cat((torch.full_like(forward, count), missing), dim=1).scatter(
-        1, forward.long(), positions.expand(12, -1)
-    )
-    next_cell = torch.where(_take(padded, positions + 1) == keys + 1, positions + 1, count)
-    previous_cell = torch.where(keys.roll(1) == keys - 1, positions - 1, count)
-    table = torch.cat((opposite[:, :-1].flip(0), torch.stack((previous_cell, positions, next_cell)), forward))
-    rows = _take(torch.cat((order.int(), torch.full_like(positions[:1], count))), table)
-    return rows.T.index_select(0, torch.empty_like(positions).scatter(0, order, positions))
+    return torch.stack(matches, dim=1).view(len(matches) * position.shape[0], -1)
 
 
 def _take(values: Integer[Tensor, " n"], indices: Int32[Tensor, "..."]) -> Integer[Tensor, "..."]:

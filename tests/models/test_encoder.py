@@ -65,6 +65,33 @@ def test_the_order_of_gaussians_orders_the_output_and_does_nothing_else() -> Non
     torch.testing.assert_close(run(network, one.select(order)), run(network, one)[order], rtol=1e-5, atol=1e-5)
 
 
+def test_orders_shuffled_at_each_pooling_make_a_function_that_does_not_depend_on_the_order_of_gaussians() -> None:
+    shape = replace(TINY, shuffle_orders="pooling", drop_path=0.0)
+    network, one = encoder(replace(CONFIG, transformer=shape)).train(), splat(500)
+    order = np.random.default_rng(1).permutation(500)
+    for seed in range(3):
+        torch.manual_seed(seed)
+        straight = run(network, one)
+        torch.manual_seed(seed)
+        torch.testing.assert_close(run(network, one.select(order)), straight[order], rtol=1e-5, atol=1e-5)
+
+
+def test_each_level_has_a_permutation_of_its_own_only_if_orders_are_shuffled_at_each_pooling() -> None:
+    counts = {}
+    for shuffle in ("once", "pooling", "never"):
+        network = encoder(replace(CONFIG, transformer=replace(TINY, shuffle_orders=shuffle))).train().transformer
+        torch.manual_seed(0)
+        drawn = [network._permutations() for _ in range(20)]
+        assert all(sorted(order) == [0, 1, 2, 3] for levels in drawn for order in levels)
+        torch.manual_seed(0)
+        assert [network._permutations() for _ in range(20)] == drawn
+        counts[shuffle] = sum(len({tuple(order) for order in levels}) for levels in drawn)
+        assert network.eval()._permutations() == [[0, 1, 2, 3]] * 3
+    assert counts["once"] == 20
+    assert counts["never"] == 20
+    assert counts["pooling"] > 50
+
+
 def test_a_rerun_gives_the_same_bits() -> None:
     network, one = encoder(), splat(400)
     first = run(network, one)
@@ -241,6 +268,33 @@ def test_compiled_it_gives_the_same_and_is_not_compiled_for_every_number_of_cell
     assert graphs_after[1] == graphs_after[2]
 
 
+WIDE_STEM = replace(CONFIG, stem=5)
+
+
+def test_a_wide_stem_sees_two_cells_away() -> None:
+    """Without attention and further levels, the features of a token depend on what is within the stem's reach."""
+    shape = TransformerConfig(
+        encoder_depths=(0,), encoder_channels=(16,), decoder_depths=(), decoder_channels=(), head_channels=16
+    )
+    for stem, reach in ((3, 1), (5, 2)):
+        network = encoder(replace(CONFIG, stem=stem, transformer=shape))
+        one = splat(5)
+        centers = 0.05 + 0.1 * np.array([[0, 0, 0], [1, 0, 1], [2, 2, 0], [0, 2, 2], [3, 0, 0]])
+        one = replace(one, means=centers.astype(np.float32))
+        changed = replace(one, sh=one.sh + np.array([0, 0, 0, 0, 1.0], np.float32)[:, None, None])
+        differs = (run(network, one) != run(network, changed)).any(dim=1)
+        assert differs.tolist() == [max(abs(center - centers[4])) <= 0.1 * reach + 0.01 for center in centers]
+
+
+def test_a_wide_stem_keeps_the_laws_of_batches_and_of_order() -> None:
+    network, splats = encoder(WIDE_STEM), [splat(300, 1), splat(41, 2), splat(1, 3)]
+    alone = torch.cat([run(network, one) for one in splats])
+    for round_up in (False, True):
+        torch.testing.assert_close(run(network, *splats, round_up=round_up), alone, rtol=1e-5, atol=1e-5)
+    order = np.random.default_rng(1).permutation(300)
+    torch.testing.assert_close(run(network, splats[0].select(order)), alone[:300][order], rtol=1e-5, atol=1e-5)
+
+
 def test_merging_gives_the_weighted_mean_of_a_cells_gaussians() -> None:
     means = torch.tensor([[0.01, 0.01, 0.01], [0.05, 0.05, 0.05], [0.95, 0.95, 0.95]])
     plan = join_plans([plan_cloud(means, 0.1, levels=1)], 8)
@@ -269,6 +323,7 @@ def test_thousands_of_coincident_gaussians_are_one_token() -> None:
         ({"patch": 0}, "patch"),
         ({"orders": ()}, "orders"),
         ({"drop_path": 1.0}, "drop_path"),
+        ({"shuffle_orders": "often"}, "shuffle_orders: expected once, pooling or never, got 'often'"),
         ({"encoder_depths": (1, -1, 1)}, "encoder_depths"),
         ({"encoder_depths": ()}, "encoder_depths: expected one entry per level"),
         ({"encoder_depths": (1,) * 8}, "1 to 7 levels, got 8"),
@@ -280,7 +335,7 @@ def test_a_shape_that_cannot_be_is_refused(change: dict, message: str, no_jaxtyp
         replace(TINY, **change)
 
 
-@pytest.mark.parametrize("change", [{"voxel": 0.0}, {"inputs": ()}, {"inputs": ("color", "color")}])
-def test_an_encoder_of_nothing_is_refused(change: dict) -> None:
+@pytest.mark.parametrize("change", [{"voxel": 0.0}, {"stem": 4}, {"inputs": ()}, {"inputs": ("color", "color")}])
+def test_an_encoder_of_nothing_is_refused(change: dict, no_jaxtyping: None) -> None:
     with pytest.raises(InputError):
         replace(CONFIG, **change)

@@ -52,15 +52,16 @@ def search(keys: INT64, wanted: INT64, more: INT64) -> INT64:
 
 @script(OURS, default_opset=op)
 def in_blocks(neighbors: INT32) -> INT32:
-    """Neighborhoods in blocks of some rows, [blocks, rows, 27], so that what a block takes stays in the cache."""
-    first = op.Constant(value_ints=[0])
-    rows = op.Gather(op.Shape(neighbors), first)
+    """Neighborhoods of n cells in blocks of some rows, [blocks, rows, n], so that what a block takes stays in the
+    cache."""
+    shape = op.Shape(neighbors)
+    rows, cells = op.Gather(shape, op.Constant(value_ints=[0])), op.Gather(shape, op.Constant(value_ints=[1]))
     blocks = (rows + (ROWS_AT_ONCE - 1)) / ROWS_AT_ONCE
     size = (rows + blocks - 1) / blocks
     # Rows that fill up the last block have no neighbors: they read the row of zeros, as missing cells do.
-    missing = op.Concat(blocks * size - rows, op.Constant(value_ints=[27]), axis=0)
+    missing = op.Concat(blocks * size - rows, cells, axis=0)
     filled = op.Concat(neighbors, op.Expand(op.CastLike(rows, neighbors), missing), axis=0)
-    return op.Reshape(filled, op.Concat(blocks, size, op.Constant(value_ints=[27]), axis=0))
+    return op.Reshape(filled, op.Concat(blocks, size, cells, axis=0))
 
 
 @script(OURS, default_opset=op)
@@ -98,7 +99,7 @@ def convolve(x: FLOAT, neighbors: INT32, weight: FLOAT) -> FLOAT:
 
 @script(OURS, default_opset=op)
 def convolve_int8(x: UINT8, step: FLOAT, zero: UINT8, neighbors: INT32, weight: INT8, scale: FLOAT) -> FLOAT:
-    """The same on integers: x stands for step · (x − zero), and weight [27·C, D] for scale[D] · weight.
+    """The same on integers: x stands for step · (x − zero), and weight [n·C, D] for scale[D] · weight.
 
     Bytes are gathered, a quarter of what `convolve` moves, and their products are summed in int32."""
     table = in_blocks(neighbors)

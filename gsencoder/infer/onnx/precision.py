@@ -25,12 +25,14 @@ class Product(NamedTuple):
         x: what is multiplied.
         weight: name of the weights.
         matrix: the same, a column for each output channel.
+        cells: cells of a convolution's neighborhood; 1 for a linear layer.
     """
 
     node: onnx.NodeProto
     x: str
     weight: str
     matrix: Float32[np.ndarray, "rows columns"]
+    cells: int = 1
 
     @property
     def convolves(self) -> bool:
@@ -47,8 +49,8 @@ def weights_in_int8(model: onnx.ModelProto) -> onnx.ModelProto:
         product = products.get(node.output[0])
         if product is not None:
             rounded, scale = round_columns(product.matrix)
-            # As its operator has them: [27, C, D] for a convolution, [D, C] for a linear layer.
-            shaped = rounded.reshape(27, -1, rounded.shape[1]) if product.convolves else rounded.T
+            # As its operator has them: [cells, C, D] for a convolution, [D, C] for a linear layer.
+            shaped = rounded.reshape(product.cells, -1, rounded.shape[1]) if product.convolves else rounded.T
             names = _store(done.graph, product.weight, rounded=shaped, scale=scale)
             wide = f"{product.weight}.float32"
             axis = 2 if product.convolves else 0
@@ -87,7 +89,7 @@ def _products(graph: onnx.GraphProto) -> Iterator[Product]:
     for node in graph.node:
         if node.domain == OURS.domain and node.op_type == convolve.name and node.input[2] in known:
             weight = known[node.input[2]]
-            yield Product(node, node.input[0], node.input[2], weight.reshape(-1, weight.shape[2]))
+            yield Product(node, node.input[0], node.input[2], weight.reshape(-1, weight.shape[2]), len(weight))
         elif node.op_type == "Gemm" and node.input[1] in known:
             given = {each.name: helper.get_attribute_value(each) for each in node.attribute}
             if given.get("transB", 0) == 1 and not given.get("transA", 0) and len(node.input) == 3:

@@ -1,36 +1,43 @@
-"""Table of the 27 cells around each occupied cell, and the sparse convolution over them."""
+"""Table of the cells around each occupied cell, and the sparse convolution over them."""
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int32, Int64, Integer
 from torch import Tensor, nn
 
-NEIGHBORHOOD = 27
-"""Cells of a 3×3×3 neighborhood. Cell o = 9·(dx+1) + 3·(dy+1) + (dz+1): 13 is the center, and 26 − o is opposite o."""
+KernelSize = Literal[3, 5]
+"""Edge k of the cube of k³ cells around a cell. Cell o = k²·(dx + r) + k·(dy + r) + (dz + r) with r = (k − 1) / 2: the
+center is (k³ − 1) / 2, and k³ − 1 − o is opposite o."""
+
+OCCUPIED: dict[int, int] = {3: 10, 5: 28}
+"""Cells of a neighborhood that are occupied on a surface, approximately, by the edge of the neighborhood."""
 
 CPU_BLOCK_ROWS = 8192
 """Rows whose neighborhoods are gathered together on a CPU, few enough that what they gather stays in its cache."""
 
 
-FORWARD_COLUMNS = ((0, 1), (1, -1), (1, 0), (1, 1))
-"""Steps (dx, dy) to the columns of the neighborhood that come after the center's; the other four are opposite them."""
+def forward_columns(size: KernelSize) -> tuple[tuple[int, int], ...]:
+    """Steps (dx, dy) to the columns of a neighborhood that come after the center's; the others are opposite them."""
+    radius = size // 2
+    steps = range(-radius, radius + 1)
+    return tuple((dx, dy) for dx in steps for dy in steps if (dx, dy) > (0, 0))
 
 
-def neighbor_table(cells: Int64[Tensor, "N 3"]) -> Int32[Tensor, "N 27"]:
-    """For each of N distinct cells, the rows of the 27 cells around it; N for cells that are not occupied.
+def neighbor_table(cells: Int64[Tensor, "N 3"], size: KernelSize = 3) -> Int32[Tensor, "N cube"]:
+    """For each of N distinct cells, the rows of the size³ cells around it; N for cells that are not occupied.
 
-    Cells are sorted by column. For each of the four forward columns one binary search finds where the three cells of
-    the neighborhood would begin; the three follow one another from there. Each match is entered at both cells.
+    Cells are sorted by column. For each forward column one binary search finds where the cells of the neighborhood
+    would begin; they follow one another from there. Each match is entered at both cells.
     """
-    n = len(cells)
+    n, cube, radius = len(cells), size**3, size // 2
     if n == 0:
-        return torch.zeros((0, NEIGHBORHOOD), dtype=torch.int32, device=cells.device)
+        return torch.zeros((0, cube), dtype=torch.int32, device=cells.device)
     low, high = cells.aminmax(dim=0)
-    # A border of one empty cell on each side keeps the end of one column apart from the start of the next.
-    sizes = (high - low + 3).tolist()
+    # A border of empty cells on each side keeps the end of one column apart from the start of the next.
+    sizes = (high - low + 1 + 2 * radius).tolist()
     stride_y, stride_x = sizes[2], sizes[2] * sizes[1]
-    x, y, z = (cells - low + 1).unbind(dim=1)
+    x, y, z = (cells - low + radius).unbind(dim=1)
     keys = x * stride_x + y * stride_y + z
     # The keys of a room fit into half the bits, which are sorted in a quarter of the time.
     keys, order = torch.sort(keys.int() if sizes[0] * stride_x < 2**31 else keys)
@@ -38,26 +45,30 @@ def neighbor_table(cells: Int64[Tensor, "N 3"]) -> Int32[Tensor, "N 27"]:
     missing = positions.new_full((), n)
     # Entry [o, i] is the position among the sorted cells of neighbor o of the cell at position i. Column n takes the
     # writes of cells that are missing.
-    table = positions.new_full((NEIGHBORHOOD, n + 1), n)
-    table[13, :n] = positions
-    adjacent = keys[1:] == keys[:-1] + 1
-    table[14, : n - 1] = torch.where(adjacent, positions[1:], missing)
-    table[12, 1:n] = torch.where(adjacent, positions[:-1], missing)
+    table = positions.new_full((cube, n + 1), n)
+    table[cube // 2, :n] = positions
     # Two entries that no key equals let the walk along a column run past the end.
     padded = torch.cat((keys, keys.new_full((2,), torch.iinfo(keys.dtype).max)))
-    offsets = keys.new_tensor([dx * stride_x + dy * stride_y - 1 for dx, dy in FORWARD_COLUMNS])
+    above = positions + 1
+    for step in range(1, radius + 1):
+        hit = padded.index_select(0, above) == keys + step
+        table[cube // 2 + step, :n] = torch.where(hit, above, missing)
+        table[cube // 2 - step].scatter_(0, table[cube // 2 + step, :n].long(), positions)
+        above = above + hit
+    columns = forward_columns(size)
+    offsets = keys.new_tensor([dx * stride_x + dy * stride_y - radius for dx, dy in columns])
     target_keys = keys + offsets[:, None]
     position = torch.searchsorted(keys, target_keys, out_int32=True)
-    for step in range(3):
-        hit = padded.index_select(0, position.flatten()).view(len(FORWARD_COLUMNS), n) == target_keys
+    for step in range(size):
+        hit = padded.index_select(0, position.flatten()).view(len(columns), n) == target_keys
         neighbor = torch.where(hit, position, missing)
-        for column, (dx, dy) in enumerate(FORWARD_COLUMNS):
-            cell = 9 * (dx + 1) + 3 * (dy + 1) + step
+        for column, (dx, dy) in enumerate(columns):
+            cell = size**2 * (dx + radius) + size * (dy + radius) + step
             table[cell, :n] = neighbor[column]
-            table[NEIGHBORHOOD - 1 - cell].scatter_(0, neighbor[column].long(), positions)
+            table[cube - 1 - cell].scatter_(0, neighbor[column].long(), positions)
         position += hit
         target_keys += 1
-    rows = torch.cat((order.int(), missing[None])).index_select(0, table.flatten()).view(NEIGHBORHOOD, n + 1)
+    rows = torch.cat((order.int(), missing[None])).index_select(0, table.flatten()).view(cube, n + 1)
     position_of_row = torch.empty_like(order)
     position_of_row[order] = torch.arange(n, device=order.device)
     return rows[:, :n].T.contiguous().index_select(0, position_of_row)
@@ -70,14 +81,13 @@ class NeighborConv(nn.Module):
     gradient is the same convolution with the weights of opposite cells swapped, so that no atomics are needed.
     """
 
-    def __init__(self, channels_in: int, channels_out: int) -> None:
+    def __init__(self, channels_in: int, channels_out: int, size: KernelSize = 3) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.empty(NEIGHBORHOOD, channels_in, channels_out))
+        self.weight = nn.Parameter(torch.empty(size**3, channels_in, channels_out))
         self.bias = nn.Parameter(torch.zeros(channels_out))
-        # On a surface about ten of the 27 cells are occupied.
-        nn.init.normal_(self.weight, std=(10 * channels_in) ** -0.5)
+        nn.init.normal_(self.weight, std=(OCCUPIED[size] * channels_in) ** -0.5)
 
-    def forward(self, x: Float[Tensor, "N C"], neighbors: Integer[Tensor, "N 27"]) -> Float[Tensor, "N D"]:
+    def forward(self, x: Float[Tensor, "N C"], neighbors: Integer[Tensor, "N cube"]) -> Float[Tensor, "N D"]:
         weight: Tensor = self.weight
         bias: Tensor = self.bias
         if torch.is_autocast_enabled(x.device.type):
@@ -87,7 +97,7 @@ class NeighborConv(nn.Module):
 
 
 def convolve_reference(
-    x: Float[Tensor, "N C"], neighbors: Int32[Tensor, "N 27"], weight: Float[Tensor, "27 C D"]
+    x: Float[Tensor, "N C"], neighbors: Int32[Tensor, "N cube"], weight: Float[Tensor, "cube C D"]
 ) -> Float[Tensor, "N D"]:
     """The plain twin of `NeighborConv` without bias: one gather and one product, differentiated by autograd."""
     padded = torch.cat((x, x.new_zeros(1, x.shape[1])))
@@ -113,7 +123,7 @@ def _(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
 
 @torch.library.custom_op("gsencoder::convolve_weight_gradient", mutates_args=())
 def convolve_weight_gradient(x: Tensor, neighbors: Tensor, grad: Tensor) -> Tensor:
-    """The gradient of `convolve` with respect to its weight, (27, C, D), from that with respect to its result.
+    """The gradient of `convolve` with respect to its weight, (cube, C, D), from that with respect to its result.
 
     It is summed in float32 at least.
     """
@@ -137,7 +147,7 @@ def _save_inputs(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None: 
 def _gradients(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None]:
     x, neighbors, weight = ctx.saved_tensors
     grad = grad.contiguous()
-    # Cell j is neighbor o of i exactly where i is neighbor 26 − o of j.
+    # Cell j is neighbor o of i exactly where i is the neighbor of j on the opposite side.
     grad_x = convolve(grad, neighbors, weight.flip(0).transpose(1, 2)) if ctx.needs_input_grad[0] else None
     grad_weight = convolve_weight_gradient(x, neighbors, grad) if ctx.needs_input_grad[2] else None
     return grad_x, None, grad_weight

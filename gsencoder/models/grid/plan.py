@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsencoder.models.grid.cells import grid_coords
 from gsencoder.models.grid.curves import SceneCurves
-from gsencoder.models.grid.neighbors import neighbor_table
+from gsencoder.models.grid.neighbors import KernelSize, neighbor_table
 from gsencoder.models.grid.serialize import Order, coordinate_bits, curve_from_morton, morton_codes
 
 ORDERS: tuple[Order, ...] = ("z", "z-trans", "hilbert", "hilbert-trans")
@@ -52,12 +52,15 @@ class Plan(NamedTuple):
         members: the Gaussians sorted by token.
         counts: number of Gaussians of each token.
         levels: finest first.
+        stem_neighbors: the 125 cells around each token of the finest level, for a stem of 5³ cells; T where a cell is
+            not occupied. None for a stem of 3³, which uses `neighbors` of that level.
     """
 
     token_of: Int64[Tensor, " N"]
     members: Int64[Tensor, " N"]
     counts: Int64[Tensor, " T"]
     levels: tuple[Level, ...]
+    stem_neighbors: Integer[Tensor, "T 125"] | None = None
 
     def to(self, device: str | torch.device) -> "Plan":
         """The plan with all its tensors on another device."""
@@ -79,7 +82,8 @@ class Plan(NamedTuple):
             for level in self.levels
         )
         token_of, members, counts = map(move, (self.token_of, self.members, self.counts))
-        return self._replace(token_of=token_of, members=members, counts=counts, levels=levels)
+        stem = move(self.stem_neighbors) if self.stem_neighbors is not None else None
+        return self._replace(token_of=token_of, members=members, counts=counts, levels=levels, stem_neighbors=stem)
 
 
 class CloudLevel(NamedTuple):
@@ -106,6 +110,7 @@ class CloudPlan(NamedTuple):
     members: Int64[Tensor, " N"]
     counts: Int64[Tensor, " T"]
     levels: tuple[CloudLevel, ...]
+    stem_neighbors: Int32[Tensor, "T 125"] | None = None
 
 
 def plan_cloud(
@@ -115,6 +120,7 @@ def plan_cloud(
     levels: int,
     orders: Sequence[Order] = ORDERS,
     scene_curves: SceneCurves | None = None,
+    stem: KernelSize = 3,
 ) -> CloudPlan:
     """Computes the plan of one cloud.
 
@@ -126,6 +132,7 @@ def plan_cloud(
         scene_curves: patch boundaries of the full scene, made with the same voxel, levels, orders and patch as here and
             in `join_plans`. The cloud is then cut where the scene is, so that its tokens share a patch exactly where
             they do in the scene. None = the cloud is the full scene.
+        stem: edge of the neighborhood of the encoder's first convolution, cells.
 
     Raises:
         InputError: positions that are not finite, or that spread over too many cells.
@@ -139,6 +146,7 @@ def plan_cloud(
     cells = cells[members[counts.cumsum(0) - counts]]
     bits, morton = coordinate_bits(cells), codes[counts.cumsum(0) - counts]
     curve_codes = torch.stack([curve_from_morton(morton, order, bits) for order in orders])
+    stem_neighbors = neighbor_table(cells, stem) if stem != 3 else None
     cloud_levels = []
     for level in range(levels):
         parents, children, first = _pool_tokens(morton) if level + 1 < levels else _no_pooling(morton)
@@ -149,7 +157,7 @@ def plan_cloud(
             scene_patches = torch.searchsorted(starts, codes, right=True) - 1
         cloud_levels.append(CloudLevel(neighbor_table(cells), sorted_tokens, parents, children, scene_patches))
         cells, morton, curve_codes = cells[first] >> 1, morton[first] >> 3, curve_codes[:, first] >> 3
-    return CloudPlan(token_of, members, counts, tuple(cloud_levels))
+    return CloudPlan(token_of, members, counts, tuple(cloud_levels), stem_neighbors)
 
 
 def _pool_tokens(morton: Int64[Tensor, " T"]) -> tuple[Int64[Tensor, " T"], Int64[Tensor, "M 8"], Int64[Tensor, " M"]]:
@@ -184,11 +192,13 @@ def join_plans(clouds: Sequence[CloudPlan], patch: int, *, round_up: bool = True
     for level in range(len(clouds[0].levels)):
         cloud_levels = [cloud.levels[level] for cloud in clouds]
         levels.append(_join_levels(cloud_levels, patch, _round_up_size if round_up else int))
+    stems = [cloud.stem_neighbors for cloud in clouds if cloud.stem_neighbors is not None]
     return Plan(
         token_of=_concat_indices([cloud.token_of for cloud in clouds], tokens),
         members=_concat_indices([cloud.members for cloud in clouds], gaussians),
         counts=torch.cat([cloud.counts for cloud in clouds]),
         levels=tuple(levels),
+        stem_neighbors=_join_neighbors(stems, len(levels[0].neighbors)) if stems else None,
     )
 
 
@@ -213,23 +223,28 @@ def _pad_to(rows: Tensor, size: int, value: int = 0, dim: int = 0) -> Tensor:
     return torch.cat((rows, rows.new_full(shape, value)), dim=dim)
 
 
+def _join_neighbors(tables: Sequence[Int32[Tensor, "_T cube"]], total: int) -> Int32[Tensor, "total cube"]:
+    """Neighbors of the tokens of several clouds as rows of their concatenation, which is padded to `total` tokens."""
+    if len(tables) == 1 and len(tables[0]) == total:
+        return tables[0]
+    joined, begin = tables[0].new_full((total, tables[0].shape[1]), total), 0
+    for table in tables:
+        rows = joined[begin : begin + len(table)]
+        torch.add(table, begin, out=rows).masked_fill_(table == len(table), total)
+        begin += len(table)
+    return joined
+
+
 def _join_levels(levels: Sequence[CloudLevel], patch: int, round_size: Callable[[int], int]) -> Level:
     sizes = [len(level.neighbors) for level in levels]
     total, coarser_sizes = round_size(sum(sizes)), [len(level.children) for level in levels]
-    neighbors = levels[0].neighbors
-    if len(levels) > 1 or total != len(neighbors):
-        neighbors, begin = neighbors.new_full((total, neighbors.shape[1]), total), 0
-        for level, count in zip(levels, sizes, strict=True):
-            rows = neighbors[begin : begin + count]
-            torch.add(level.neighbors, begin, out=rows).masked_fill_(level.neighbors == count, total)
-            begin += count
     sorted_tokens = _concat_indices([level.sorted_tokens for level in levels], sizes, dim=1)
     positions, slots, used = _pack_patches(_patch_lengths(levels, patch), round_size)
     scatter_index = torch.empty_like(sorted_tokens).scatter_(1, sorted_tokens, slots.expand_as(sorted_tokens))
     # Unused tokens have no neighbors, are in no patch, and are not children of used tokens. What is computed for them
     # is never read.
     return Level(
-        neighbors=neighbors,
+        neighbors=_join_neighbors([level.neighbors for level in levels], total),
         gather_index=sorted_tokens.gather(1, positions.expand(len(sorted_tokens), -1)),
         scatter_index=_pad_to(scatter_index, total, dim=1),
         attn_mask=None if bool(used.all()) else used[:, :, None, None].expand(len(sorted_tokens), -1, -1, -1, -1),
