@@ -109,6 +109,7 @@ def validate_encoder(
         predicted_codes = nearest_classes(predicted, codebook, choices)
         correct += np.bincount(true_codes, weights=predicted_codes == true_codes, minlength=len(codebook))
         total += np.bincount(true_codes, minlength=len(codebook))
+        targets, predicted = outputs.standard_units(targets), outputs.standard_units(predicted)
         lengths = np.sqrt(np.square(targets).sum(axis=1))
         named = lengths >= 0.5 * outputs.channels**0.5
         dots = (targets[named] * predicted[named]).sum(axis=1)

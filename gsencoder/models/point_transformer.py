@@ -47,8 +47,8 @@ class TransformerConfig:
     shuffle_orders: Shuffle = field(
         default="once",
         metadata={
-            "help": "in training, draw a random permutation of the orders: once for all levels, or at each pooling too, "
-            "as PTv3; outside training they are never permuted"
+            "help": "in training, permute the orders at random: once for all levels, or again at each pooling, as PTv3 "
+            "does; outside training they are never permuted"
         },
     )
     mlp_ratio: float = field(

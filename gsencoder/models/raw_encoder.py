@@ -52,8 +52,7 @@ class RawEncoder(nn.Module):
     def __init__(self, encoder: GaussianEncoder, outputs: OutputSpace) -> None:
         super().__init__()
         self.encoder, self.unit = encoder, outputs.unit
-        mean = torch.zeros(outputs.channels) if outputs.basis is not None else torch.from_numpy(outputs.mean)
-        self.register_buffer("space_mean", mean, persistent=False)
+        self.register_buffer("offset", torch.from_numpy(outputs.offset), persistent=False)
 
     def forward(
         self,
@@ -84,7 +83,7 @@ class RawEncoder(nn.Module):
         attributes = embed(means, quats, scales, opacities, sh_dc, voxel=voxel, attributes=config.inputs)
         plan = _plan_cloud(means, voxel, corner, starts, config.transformer, config.stem)
         standard: Tensor = self.encoder(attributes, opacities, plan)
-        return standard * self.unit + self.get_buffer("space_mean")
+        return standard * self.unit + self.get_buffer("offset")
 
 
 def _plan_cloud(

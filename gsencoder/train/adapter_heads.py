@@ -31,7 +31,7 @@ LAYER_TYPES: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
 
 
 class FeatureDecoder(nn.Module):
-    """Decodes features in standard units to vectors of the teacher's space; differentiable."""
+    """Decodes outputs of the encoder to vectors of the teacher's space; differentiable."""
 
     mean: Tensor
     components: Tensor
@@ -39,7 +39,8 @@ class FeatureDecoder(nn.Module):
     def __init__(self, outputs: OutputSpace) -> None:
         super().__init__()
         rows = np.eye(outputs.channels, dtype=np.float32) if outputs.basis is None else outputs.basis.components
-        self.register_buffer("mean", torch.from_numpy(outputs.mean.copy()))
+        mean = outputs.mean if outputs.centered else np.zeros_like(outputs.mean)
+        self.register_buffer("mean", torch.from_numpy(mean.copy()))
         self.register_buffer("components", torch.from_numpy(rows * np.float32(outputs.unit)))
 
     def forward(self, standard: Float[Tensor, "n channels"]) -> Float[Tensor, "n D"]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import Archive, first_difference, open_archive, write_archive
 
@@ -72,7 +73,7 @@ def load_checkpoint(
             that differs is named.
     """
     with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
-        stored_settings = file.value("settings", dict)
+        stored_settings = with_added_options(file.value("settings", dict))
         if stored_settings != settings:
             raise InputError(
                 f"{path}: was made with {first_difference(stored_settings, settings)}; "

@@ -1,6 +1,7 @@
 """The output space of a dataset: mean, scale and basis that all its scenes share."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,8 @@ def dataset_space(
     config: FuseConfig,
     *,
     views: int,
+    center: bool = True,
+    scale: bool = True,
 ) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
     """Computes the output space of a dataset.
 
@@ -37,6 +40,8 @@ def dataset_space(
         config: share of the energy that the basis keeps, its largest rank, and the number of channels up to which there
             is no basis.
         views: number of maps of a dense teacher to use.
+        center: subtract the mean from targets.
+        scale: divide targets by the root mean square distance from the mean.
 
     Returns:
         The space, and for a coded teacher its vectors in standard units, else None.
@@ -68,9 +73,11 @@ def dataset_space(
         _add_maps(moments, teacher, scene.views, max(1, int(view_bounds[number + 1] - view_bounds[number])))
     assert teacher is not None
     if tables:
-        return _coded_space(np.unique(np.concatenate(tables), axis=0), teacher, config)
+        table = np.unique(np.concatenate(tables), axis=0)
+        space = replace(_coded_space(table, teacher, config), centered=center, scaled=scale)
+        return space, space.standardize(to_coordinates(space.basis, table) if space.basis is not None else table)
     assert moments is not None
-    return _dense_space(moments, teacher, config), None
+    return replace(_dense_space(moments, teacher, config), centered=center, scaled=scale), None
 
 
 def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:
@@ -81,15 +88,12 @@ def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> N
         moments.add(rows[:: max(1, len(rows) // MAX_CELLS_PER_MAP)])
 
 
-def _coded_space(
-    table: Float32[np.ndarray, "C D"], teacher: Teacher, config: FuseConfig
-) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"]]:
+def _coded_space(table: Float32[np.ndarray, "C D"], teacher: Teacher, config: FuseConfig) -> OutputSpace:
     mean = teacher.mean if teacher.mean is not None else table.mean(axis=0)
     scale = _scale(np.square(table - mean, dtype=np.float64).sum(axis=1).mean(), teacher)
     use_basis = config.basis and teacher.space.channels > config.narrow
     basis = table_basis(table, mean, teacher.space, energy=config.table_energy) if use_basis else None
-    space = OutputSpace(space=teacher.space, mean=mean, scale=scale, basis=basis)
-    return space, space.standardize(to_coordinates(basis, table) if basis is not None else table)
+    return OutputSpace(space=teacher.space, mean=mean, scale=scale, basis=basis)
 
 
 def _dense_space(moments: Moments, teacher: Teacher, config: FuseConfig) -> OutputSpace:

@@ -1,7 +1,7 @@
 """The losses of distillation (SplatDistill Eqs. 3–5), as weighted sums, so that a step divides once by global weights.
 
-All losses work in standard units about the mean of the space (`OutputSpace`): raw CLIP-like vectors are nearly
-parallel, and the cosine between them hardly distinguishes names.
+Losses work in the units of the encoder's outputs (`OutputSpace`): by default standard units about the mean of the
+space, since raw CLIP-like vectors are nearly parallel, and the cosine between them hardly distinguishes names.
 
 Eq. 4 of the paper is written with the render of G_fused, which has no parameters. It is computed here with the render
 of the predicted features, which can be trained.
@@ -29,6 +29,10 @@ class LossConfig:
 
     cosine: float = field(default=0.9, metadata={"help": "α: weight of 1 − cosine in the matching loss"})
     smooth_l1: float = field(default=0.1, metadata={"help": "β: weight of the smooth L1 distance in the matching loss"})
+    confidence: bool = field(
+        default=True,
+        metadata={"help": "weight the cosine of a target near the mean by the target's length; false = Eq. 3 as it is"},
+    )
     field_weight: float = field(default=1.0, metadata={"help": "λ of the loss on Gaussians (L_3D)"})
     render_weight: float = field(default=0.2, metadata={"help": "λ of the loss on rendered cells (L_render); 0 = off"})
     contrast_weight: float = field(
@@ -42,6 +46,10 @@ class LossConfig:
         metadata={
             "help": "power p of class weights: targets of a class with n Gaussians are weighted by n^−p; 0 = equally"
         },
+    )
+    divide_by_alpha: bool = field(
+        default=True,
+        metadata={"help": "compare rendered features divided by the cell's opacity; false = as they are composited"},
     )
     min_alpha: float = field(default=0.5, metadata={"help": "smallest opacity that a cell must have to enter L_render"})
     min_kept: float = field(
@@ -104,17 +112,20 @@ class AdapterHead(nn.Module):
 def match_loss(
     predicted: Float[Tensor, "n C"], target: Float[Tensor, "n C"], config: LossConfig
 ) -> Float[Tensor, " n"]:
-    """The matching loss of each row (Eq. 3): α·(1 − cos)·min(1, |target| / √C) + β·smooth-L1, averaged over channels.
+    """The matching loss of each row (Eq. 3): α·(1 − cos)·c + β·smooth-L1, averaged over channels.
 
-    √C is the root mean square length of targets in standard units. Near the mean, where "other" lies, the direction of
-    a target is mostly noise, so its cosine is weighted by the target's relative length.
+    With `config.confidence` the factor c is min(1, |target| / √C), and else 1, as in the paper. √C is the root mean
+    square length of targets in standard units. Near the mean, where "other" lies, the direction of a target is mostly
+    noise, so its cosine is weighted by the target's relative length.
     """
     predicted, target = predicted.float(), target.float()
     lengths = torch.sqrt((target * target).sum(dim=1) + EPS)
     cosines = (predicted * target).sum(dim=1) / (lengths * torch.sqrt((predicted * predicted).sum(dim=1) + EPS))
-    confidence = (lengths / target.shape[1] ** 0.5).clamp(max=1)
+    directions = 1 - cosines
+    if config.confidence:
+        directions = directions * (lengths / target.shape[1] ** 0.5).clamp(max=1)
     distance = functional.smooth_l1_loss(predicted, target, reduction="none").mean(dim=1)
-    return config.cosine * (1 - cosines) * confidence + config.smooth_l1 * distance
+    return config.cosine * directions + config.smooth_l1 * distance
 
 
 def field_loss(
@@ -140,7 +151,7 @@ def contrast_loss(
     moves the prediction towards the likelier of the two, so that it is also the nearest vector of the codebook.
 
     Args:
-        predicted: predicted features, standard units.
+        predicted: predicted features, units of the outputs.
         codes: for each Gaussian, the class of its target, which is a row of the codebook.
         weights: weights in the loss; 0 for Gaussians without a target, whose codes are ignored.
         codebook: vectors c_k of the target classes, standard units.
@@ -163,7 +174,8 @@ def render_loss(
 ) -> Float[Tensor, ""]:
     """L_render (Eq. 4) before division: Σ_p w_p · match((B f)_p / alpha_p, t_p) over cells of the teacher's grid.
 
-    alpha_p is the weight of the crop's Gaussians in cell p, so the rendered features are weighted means.
+    alpha_p is the weight of the crop's Gaussians in cell p, so the rendered features are weighted means. Without
+    `config.divide_by_alpha` it is 1, and they are the composited features.
 
     Args:
         predicted: predicted features f of the Gaussians of the sample, standard units.
@@ -174,8 +186,9 @@ def render_loss(
         heads: adapter heads, each with a decoder from standard units to its input; the loss is summed over the outputs
             of the heads. Without heads the features themselves are compared.
     """
-    alpha = blend.alpha.clamp(min=EPS).unsqueeze(1)
-    rendered = blend.render(predicted.float()) / alpha
+    rendered = blend.render(predicted.float())
+    if config.divide_by_alpha:
+        rendered = rendered / blend.alpha.clamp(min=EPS).unsqueeze(1)
     if not heads:
         losses = match_loss(rendered, target, config)
     else:

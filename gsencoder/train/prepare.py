@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
@@ -54,7 +55,19 @@ class PrepareConfig:
         default=256, metadata={"help": "number of maps from which the basis of a dense teacher is computed"}
     )
 
+    center: bool = field(
+        default=True, metadata={"help": "subtract the teacher's mean from targets; false needs fusion.basis=false"}
+    )
+    scale: bool = field(
+        default=True,
+        metadata={"help": "divide targets by their typical distance from the mean; false = in the teacher's units"},
+    )
+
     def __post_init__(self) -> None:
+        if not self.center and self.fusion.basis:
+            raise InputError(
+                "center: expected fusion.basis=false with center=false; coordinates in a basis are about the mean"
+            )
         if self.render_cell < 1 or self.basis_views < 1:
             raise InputError(
                 f"render_cell and basis_views: expected 1 or more, got {self.render_cell} and {self.basis_views}"
@@ -97,6 +110,7 @@ class PreparedDataset:
                 f"{folder}: holds something else than prepared scenes (no {DATASET_SETTINGS_FILE}); "
                 "give another folder as prepared="
             )
+        stored = None if stored is None else with_added_options(stored)
         expected: dict[str, Any] = stored if settings is None else json.loads(json.dumps(settings, default=str))
         self.settings = expected
         if stored is not None and stored != expected:
@@ -121,7 +135,9 @@ class PreparedDataset:
                 f"{self.folder}: holds scenes, but not the space that they were prepared for ({SPACE_FILE}); give "
                 "another folder as prepared="
             )
-        outputs, codebook = dataset_space(scenes, open_scene, config.fusion, views=config.basis_views)
+        outputs, codebook = dataset_space(
+            scenes, open_scene, config.fusion, views=config.basis_views, center=config.center, scale=config.scale
+        )
         arrays, header = output_space_parts(outputs)
         if codebook is not None:
             arrays["codebook"] = codebook

@@ -225,6 +225,11 @@ def write_prepared(
             f"prepare: expected features of ({outputs.space.describe()}), got ({features.space.describe()})"
         )
     gaussians = scene.gaussians
+    targets = [np.where(features.seen[:, None], outputs.standardize(features.features), 0)]
+    targets += [view.targets for view in views]
+    largest = max(float(np.abs(values).max(initial=0)) for values in targets)
+    if not largest <= np.finfo(np.float16).max:
+        raise InputError(f"prepare: targets of up to {largest:.3g} do not fit into float16; use prepare.scale=true")
     sizes = [len(view.valid) for view in views]
     entries = np.cumsum([0, *(len(view.col) for view in views)])
     arrays = {
@@ -233,7 +238,7 @@ def write_prepared(
         "scales": gaussians.scales,
         "opacities": gaussians.opacities,
         "sh_dc": gaussians.sh[:, 0],
-        "targets": np.where(features.seen[:, None], outputs.standardize(features.features), 0).astype(np.float16),
+        "targets": targets[0].astype(np.float16),
         "weights": features.weights,
         "rows": np.cumsum([0, *sizes]).astype(np.int64),
         "crow": np.concatenate(
@@ -241,7 +246,7 @@ def write_prepared(
         ).astype(np.int64),
         "col": np.concatenate([view.col for view in views]),
         "weight": np.concatenate([view.weight for view in views]).astype(np.float16),
-        "row_targets": np.concatenate([view.targets for view in views]).astype(np.float16),
+        "row_targets": np.concatenate(targets[1:]).astype(np.float16),
         "row_valid": np.concatenate([view.valid for view in views]).astype(np.uint8),
         **camera_arrays(scene.views.cameras),
     }

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.runtime.device_names import Device
@@ -52,6 +53,18 @@ class TrainConfig(SourceConfig):
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     train: TrainerConfig = field(default_factory=TrainerConfig)
+
+    def __post_init__(self) -> None:
+        SourceConfig.__post_init__(self)
+        if self.loss.confidence and not (self.prepare.center and self.prepare.scale):
+            raise InputError(
+                "loss.confidence: weights by distances from the mean in typical ones; give loss.confidence=false with "
+                "prepare.center=false or prepare.scale=false"
+            )
+        if self.loss.contrast_weight and not self.prepare.scale:
+            raise InputError(
+                "loss.contrast_weight: compares distances with typical ones; expected 0 with prepare.scale=false"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

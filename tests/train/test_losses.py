@@ -33,6 +33,39 @@ def test_the_matching_loss_is_equation_three_for_typical_targets() -> None:
     torch.testing.assert_close(match_loss(predicted, target, CONFIG), expected)
 
 
+def equation_three(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """L_match(x, y) of each row as SplatDistill prints it: α(1 − cos(x, y)) + β · smooth L1, averaged over channels."""
+    cosines = (x * y).sum(axis=1) / (np.linalg.norm(x, axis=1) * np.linalg.norm(y, axis=1))
+    difference = np.abs(x - y)
+    smooth = np.where(difference < 1, 0.5 * difference**2, difference - 0.5)
+    return np.asarray(0.9 * (1 - cosines) + 0.1 * smooth.mean(axis=1))
+
+
+@pytest.mark.parametrize("size", [0.01, 1.0, 30.0])
+def test_without_confidence_the_matching_loss_is_equation_three_for_targets_of_any_length(size: float) -> None:
+    config = replace(CONFIG, confidence=False)
+    target = torch.randn(7, 8, generator=torch.Generator().manual_seed(1)) * size
+    predicted = torch.randn(7, 8, generator=torch.Generator().manual_seed(2), requires_grad=True)
+    loss = match_loss(predicted, target, config)
+    x, y = predicted.detach().double().numpy(), target.double().numpy()
+    np.testing.assert_allclose(loss.detach().numpy(), equation_three(x, y), rtol=1e-5)
+    (gradient,) = torch.autograd.grad(loss.sum(), [predicted])
+    step = 1e-6
+    for row, channel in np.ndindex(x.shape):
+        moved = np.zeros_like(x)
+        moved[row, channel] = step
+        slope = (equation_three(x + moved, y) - equation_three(x - moved, y)).sum() / (2 * step)
+        assert gradient[row, channel].item() == pytest.approx(slope, rel=1e-3, abs=1e-5)
+
+
+def test_without_division_by_alpha_composited_features_are_compared() -> None:
+    b = blend(random_gaussians(60), front_camera(), patch=8)
+    predicted, target, weights = torch.randn(60, 8), typical(b.rows), (b.alpha > 0.3).float()
+    found = render_loss(predicted, b, target, weights, replace(CONFIG, divide_by_alpha=False))
+    torch.testing.assert_close(found, (match_loss(b.render(predicted), target, CONFIG) * weights).sum())
+    assert not torch.isclose(found, render_loss(predicted, b, target, weights, CONFIG))
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0, 3.0])
 def test_near_the_mean_the_direction_counts_in_proportion_and_beyond_it_not_more(share: float) -> None:
     target, predicted = typical(4) * share, torch.randn(4, 8)

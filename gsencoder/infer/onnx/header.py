@@ -146,12 +146,15 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
                 mean=arrays["words_mean"],
                 tower=tower_from_json(values["words"]["tower"]) if "tower" in values["words"] else None,
             )
+        switches = {name: values[name] for name in ("centered", "scaled") if name in values}
         return OnnxHeader(
             voxel=float(values["voxel"]),
             levels=values["levels"],
             orders=tuple(values["orders"]),
             patch=values["patch"],
-            outputs=OutputSpace(space=space, mean=arrays["mean"], scale=float(values["scale"]), basis=basis),
+            outputs=OutputSpace(
+                space=space, mean=arrays["mean"], scale=float(values["scale"]), basis=basis, **switches
+            ),
             words=words,
             precision=values["precision"],
             made_by=values["made_by"],

@@ -1,0 +1,40 @@
+"""Options that were added after settings had been stored in files, each with the value that says what was done before.
+
+Prepared scenes and checkpoints are used only with the settings that they were made with. Files that are older than an
+option do not have it, and are compared as if they had this value.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+ADDED_OPTIONS: Mapping[str, Any] = {
+    "model.stem": 3,
+    "model.transformer.shuffle_orders": "once",
+    "loss.confidence": True,
+    "loss.divide_by_alpha": True,
+    "prepare.center": True,
+    "prepare.scale": True,
+}
+
+
+def with_added_options(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Stored settings with the added options that they lack, in the sections that they have.
+
+    Args:
+        stored: settings by section, as JSON values; in those of a training the section `prepared` holds those of its
+            prepared scenes.
+    """
+    settings = _copy(stored)
+    for key, value in ADDED_OPTIONS.items():
+        *sections, name = key.split(".")
+        for root in (settings, settings.get("prepared")):
+            section: Any = root
+            for part in sections:
+                section = section.get(part) if isinstance(section, dict) else None
+            if isinstance(section, dict):
+                section.setdefault(name, value)
+    return settings
+
+
+def _copy(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _copy(value) if isinstance(value, Mapping) else value for name, value in settings.items()}

@@ -1,0 +1,32 @@
+"""Settings of older files are completed by what was done before an option existed."""
+
+from gsencoder.core.added_options import ADDED_OPTIONS, with_added_options
+
+
+def test_sections_get_the_options_that_they_lack_and_keep_those_that_they_have() -> None:
+    stored = {"model": {"transformer": {"patch": 8}}, "loss": {"confidence": False}}
+    completed = with_added_options(stored)
+    assert completed["model"] == {"stem": 3, "transformer": {"patch": 8, "shuffle_orders": "once"}}
+    assert completed["loss"] == {"confidence": False, "divide_by_alpha": True}
+    assert stored == {"model": {"transformer": {"patch": 8}}, "loss": {"confidence": False}}
+
+
+def test_settings_of_prepared_scenes_inside_those_of_a_training_are_completed_too() -> None:
+    completed = with_added_options({"prepared": {"prepare": {"render_cell": 8}}, "run": 1})
+    assert completed == {"prepared": {"prepare": {"render_cell": 8, "center": True, "scale": True}}, "run": 1}
+
+
+def test_sections_that_are_missing_are_not_made_up() -> None:
+    assert with_added_options({"run": 1, "model": None}) == {"run": 1, "model": None}
+
+
+def test_each_added_option_exists_and_its_default_is_what_was_done_before() -> None:
+    from gsencoder.core.files.json_values import plain
+    from gsencoder.train.run import TrainConfig
+
+    settings = plain(TrainConfig())
+    for key, value in ADDED_OPTIONS.items():
+        section = settings
+        for part in key.split("."):
+            section = section[part]
+        assert section == value
