@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsencoder.app.settings.config import CommonConfig, typed
-from gsencoder.app.settings.config_store import groups_of, store_settings
+from gsencoder.app.settings.config_store import EXPERIMENT, groups_of, store_settings
 from gsencoder.app.settings.options import (
     Option,
     is_list_of_words,
@@ -193,9 +193,14 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
         written = value
         if key in choices.groups:
             names = choices.groups[key]
+            # Hydra merges several experiments in the order in which they are listed.
+            several = re.fullmatch(r"\[(.*)\]", value) if key == EXPERIMENT else None
             secret = any(name.startswith(f"{key}.") and each.secret for name, each in choices.options.items())
-            if value not in names and (secret or not sweep):
-                got = "" if secret else f", got {value!r}{near(value, names)}"
+            unknown = [
+                name for name in (several[1].replace(" ", "").split(",") if several else [value]) if name not in names
+            ]
+            if unknown and (secret or not sweep):
+                got = "" if secret else f", got {unknown[0]!r}{near(unknown[0], names)}"
                 raise InputError(f"{key}: expected one of {', '.join(names)}{got}")
         elif option is not None and option.kind != "value":
             if not (sweep and SWEPT_TEXT.fullmatch(value)):
