@@ -20,6 +20,7 @@ from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.clock import Clock, timed
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
+from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.fusion.checkpoint import open_checkpoint, remaining_views
 from gsencoder.fusion.lift import FeatureSums, map_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
@@ -65,6 +66,8 @@ class Fusion:
         seconds: by step.
         truncation: 1 − centered cosine between teacher vectors and their projections on the basis, averaged over the
             cells of all views with each cell weighted by its distance from the mean; 0 without a basis.
+        projections: how well a basis that was given represents the teacher's vectors in the views that this call added;
+            None if the scene has a basis of its own, or none.
     """
 
     features: GaussianFeatures
@@ -72,6 +75,7 @@ class Fusion:
     tested: tuple[str, ...]
     seconds: dict[str, float]
     truncation: float
+    projections: ProjectionSums | None = None
 
 
 def fuse(
@@ -118,6 +122,7 @@ def fuse(
             subspace = find_subspace(teacher, maps, rows, config, track, one_pass=checkpoint is None)
         # Where the mean alone is unknown, it is computed along the way; never in a run that may start in the middle.
         moments = Moments(teacher.space.channels, second=False) if subspace.mean is None else None
+        projections = ProjectionSums() if basis is not None else None
         columns = subspace.basis.rank if subspace.basis is not None else teacher.space.channels
         sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table)
         for view in remaining_views(rows, sums, checkpoint, track):
@@ -134,6 +139,8 @@ def fuse(
             sums.add(matrix, feature_map, views.masks[view] if views.masks is not None else None)
             if moments is not None:
                 _add_cells(moments, feature_map)
+            if projections is not None and basis is not None:
+                timed("basis")(projections.add_map)(basis, feature_map)
         features, weights = sums.finish()
     if not (weights > 0).any():
         raise InputError(f"fuse: none of {len(rows)} views of {scene.name} sees any Gaussian; check poses and units")
@@ -148,6 +155,7 @@ def fuse(
         tested=config.visibility.against,
         seconds=clock.seconds,
         truncation=subspace.truncation,
+        projections=projections,
     )
 
 

@@ -268,7 +268,7 @@ def prepare_scene(
     assert scene.gaussians is not None
     assert scene.views is not None
     fusion = replace(config.fusion, basis=outputs.basis is not None)
-    fused = fuse(scene, teacher, fusion, basis=outputs.basis).features
+    fused = fuse(scene, teacher, fusion, basis=outputs.basis)
     blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
     rows = []
     for view in range(len(scene.views)):
@@ -278,7 +278,7 @@ def prepare_scene(
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
         arrays = (b.crow.numpy(), b.col.numpy(), b.weight.numpy())
         rows.append(ViewRows(crow=arrays[0], col=arrays[1], weight=arrays[2], targets=targets, valid=valid))
-    write_prepared(path, scene, fused, outputs, rows, source=source)
+    write_prepared(path, scene, fused.features, outputs, rows, source=source, projections=fused.projections)
 
 
 def _pool_map(

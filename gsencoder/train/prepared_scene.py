@@ -18,6 +18,7 @@ from gsencoder.core.errors import InputError, about, advised
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.mapped_arrays import MappedArrays
 from gsencoder.data.archive_records import camera_arrays, read_cameras
+from gsencoder.fusion.basis_fit import BINS, ProjectionSums
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene
 
@@ -94,6 +95,15 @@ class PreparedScene:
         """Adds the path and the remedy to errors of reading."""
         with about(self.path), advised("remove the file to prepare the scene again"):
             yield
+
+    def projections(self) -> ProjectionSums | None:
+        """How well the basis represents the teacher's vectors in this scene; None without a basis, or if the scene was
+        prepared before this was computed."""
+        with self._error_context(), open_archive(self.path) as file:
+            if "sums_of_projections" not in file:
+                return None
+            histogram = file.array("cosines_of_projections", "float64", (BINS,))
+            return ProjectionSums(histogram, file.array("sums_of_projections", "float64", (3,)))
 
     def close(self) -> None:
         """Closes the file; the next access opens it again."""
@@ -204,6 +214,7 @@ def write_prepared(
     views: list[ViewRows],
     *,
     source: Path,
+    projections: ProjectionSums | None = None,
 ) -> None:
     """Writes a prepared scene.
 
@@ -214,6 +225,7 @@ def write_prepared(
         outputs: output space of the dataset.
         views: matrix and teacher's vectors for each camera.
         source: the path that the scene was read from.
+        projections: how well the basis represents the teacher's vectors in this scene; None without a basis.
 
     Raises:
         InputError: the features are of another space, or the disk is full.
@@ -256,4 +268,6 @@ def write_prepared(
         "metres_per_unit": scene.metres_per_unit,
         "up": None if scene.up is None else scene.up.tolist(),
     }
+    if projections is not None:
+        arrays |= {"cosines_of_projections": projections.histogram, "sums_of_projections": projections.sums}
     write_archive(path, arrays, header)
