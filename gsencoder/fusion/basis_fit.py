@@ -39,6 +39,10 @@ class BasisFit:
     worst: float
     vectors: int
 
+    def figures(self) -> dict[str, float]:
+        """The figures by name, as summaries and weights state them: of other vectors than the basis was fitted to."""
+        return {"other_energy": self.energy, "other_cosine": self.cosine, "other_worst": self.worst}
+
 
 class ProjectionSums:
     """Running sums over vectors, from which a `BasisFit` is computed; those of several scenes can be added.

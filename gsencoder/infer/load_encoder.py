@@ -1,7 +1,8 @@
 """Loading an encoder: trained weights, which need torch, or an exported ONNX graph, which does not."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
@@ -22,6 +23,10 @@ class Encoder(Protocol):
     @property
     def words(self) -> TextTable | None:
         """Text table of the features' space; None where none lies beside the encoder."""
+
+    @property
+    def made_by(self) -> Mapping[str, Any]:
+        """Settings and results of the training, as JSON values."""
 
     def encode(
         self,

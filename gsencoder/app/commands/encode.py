@@ -3,13 +3,14 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsencoder.app.commands.basis_figures import basis_figures, describe_basis
 from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import about
+from gsencoder.app.settings.config import CommonConfig, settings, typed
+from gsencoder.core.errors import InputError, about
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -19,7 +20,7 @@ from gsencoder.fusion.store.folder import WORDS_FILE, save_features
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder, load_encoder
 from gsencoder.text.table import save_text_table
-from gsencoder.types import Scene
+from gsencoder.types import GaussianFeatures, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +36,13 @@ class EncodeCommandConfig(CommonConfig):
         metadata={"help": "folder or file written by `train` or `export`, or the name of shipped weights"},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
+    basis_views: int = field(
+        default=0,
+        metadata={
+            "help": "views in which the encoder's teacher is run, to show what the basis keeps of its vectors "
+            "there; 0 = none"
+        },
+    )
     worker: int = field(
         default=0,
         metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
@@ -42,6 +50,10 @@ class EncodeCommandConfig(CommonConfig):
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     encode: EncodeConfig = field(default_factory=EncodeConfig)
+
+    def __post_init__(self) -> None:
+        if self.basis_views < 0:
+            raise InputError(f"basis_views: expected 0 or more, got {self.basis_views}")
 
 
 def run(config: EncodeCommandConfig, summary: Summary) -> None:
@@ -65,6 +77,8 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
             if encoder.words is not None:
                 save_text_table(folder / WORDS_FILE, encoder.words)
         screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
+        where = "this scene" if config.basis_views else "the scenes held out of the training"
+        screen.print(f"{out}: basis of the encoder: {describe_basis(one.results['basis'], where)}")
 
     run_scenes(
         paths,
@@ -91,6 +105,12 @@ def _encode_into(
         features = encoder.encode(
             scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
         )
+    basis = basis_figures(features.basis, features.features.shape[1])
+    if config.basis_views:
+        with summary.step("basis"):
+            basis |= _figures_of_scene(scene, features, encoder, config.basis_views)
+    else:
+        basis |= {name: value for name, value in encoder.made_by.get("basis", {}).items() if name.startswith("other_")}
     with summary.step("write"):
         save_features(folder, scene, features, {"encode": settings(config.encode), "weights": config.weights})
     summary.results.update(
@@ -99,7 +119,31 @@ def _encode_into(
         views=len(scene.views) if scene.views is not None else 0,
         channels=features.space.channels,
         rank=features.features.shape[1],
+        basis=basis,
         metres_per_unit=unit,
         space=features.space.describe(),
         features="features.safetensors",
     )
+
+
+def _figures_of_scene(scene: Scene, features: GaussianFeatures, encoder: Encoder, count: int) -> dict[str, float]:
+    """How well the encoder's basis represents its teacher's maps of some of a scene's views.
+
+    Raises:
+        InputError: the encoder has no basis, the scene no views, or the teacher is not known or cannot be loaded.
+    """
+    # Teachers need torch, which encoding with an exported graph does without.
+    from gsencoder.fusion.basis_fit import basis_fit
+    from gsencoder.fusion.teachers.build import build_teacher, text_table_of
+    from gsencoder.train.prepare_scenes import SourceConfig
+
+    if features.basis is None:
+        raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
+    if scene.views is None:
+        raise InputError("basis_views: the scene has no views in which the teacher could be run; leave it out")
+    stored = encoder.made_by.get("settings", {}).get("teacher")
+    if stored is None:
+        raise InputError("basis_views: the weights do not say which teacher they were made with; leave it out")
+    config = typed(SourceConfig, {"teacher": stored}).teacher
+    teacher = build_teacher(config, scene, text_table_of(config))
+    return basis_fit(features.basis, teacher, scene.views, count).figures()

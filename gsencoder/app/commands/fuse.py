@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsencoder.app.commands.basis_figures import describe_basis
 from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
@@ -25,7 +26,7 @@ from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import TextTable, save_text_table
-from gsencoder.types import Scene
+from gsencoder.types import FeatureBasis, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +42,12 @@ class FuseCommandConfig(CommonConfig):
     cameras: CamerasOfSplat = field(
         default="auto",
         metadata={"help": "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"},
+    )
+    basis: str = field(
+        default="",
+        metadata={
+            "help": "weights in whose basis features are fused, as encoded ones are; empty = a basis of the scene"
+        },
     )
     worker: int = field(
         default=0,
@@ -61,6 +68,7 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     paths = find_scenes(config.paths)
     with summary.step("teacher"):
         words = words_of(config.teacher, config.text)
+    basis = basis_of(config.basis) if config.basis else None
     screen = console(config.quiet)
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
@@ -68,13 +76,13 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             scene = load_fusable(path, config, one)
             with one.step("teacher"):
                 teacher = build_teacher(config.teacher, scene, words)
-            fusion = fuse_scene(scene, teacher, config, one, out)
+            fusion = fuse_scene(scene, teacher, config, one, out, basis=basis)
             write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
         seen, total = one.results["seen"], one.results["gaussians"]
         screen.print(
             f"{out}: {seen:,} of {total:,} Gaussians have features, {one.results['channels']} channels "
-            f"(rank {one.results['rank']}, keeps {one.results['energy_kept']:.4f} of the energy), "
+            f"({describe_basis(one.results, 'this scene')}), "
             f"from {one.results['views']} views"
         )
 
@@ -88,6 +96,20 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
         worker=config.worker,
         screen=screen,
     )
+
+
+def basis_of(weights: str) -> FeatureBasis:
+    """The basis of an encoder's weights.
+
+    Raises:
+        InputError: no such weights, or they have none.
+    """
+    from gsencoder.models.weights import load_weights
+
+    basis = load_weights(weights)[1].basis
+    if basis is None:
+        raise InputError(f"basis: the encoder of {weights} gives all channels; leave basis= out, or give other weights")
+    return basis
 
 
 def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Scene:
@@ -127,10 +149,12 @@ def fuse_scene(
     config: FuseCommandConfig,
     summary: Summary,
     out: Path,
+    *,
+    basis: FeatureBasis | None = None,
 ) -> Fusion:
-    """Fuses, and adds the seconds of the steps to the summary."""
+    """Fuses, in a given basis or in one of the scene's own, and adds the seconds of the steps to the summary."""
     work = None if teacher.cheap else work_folder(out)
-    fusion = fuse(scene, teacher, config.fusion, work=work, track=Progress(quiet=config.quiet))
+    fusion = fuse(scene, teacher, config.fusion, basis=basis, work=work, track=Progress(quiet=config.quiet))
     summary.add_seconds(fusion.seconds)
     return fusion
 
@@ -153,6 +177,7 @@ def write_features(
         channels=features.space.channels,
         rank=features.features.shape[1],
         energy_kept=features.basis.energy_kept if features.basis is not None else 1.0,
+        **(fusion.projections.fit().figures() if fusion.projections is not None else {}),
         truncation=fusion.truncation,
         median_weight=float(np.median(features.weights[features.seen])),
         space=features.space.describe(),

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from gsencoder.app.commands.basis_figures import basis_figures, describe_basis
 from gsencoder.app.runs.output_folder import lies_in, output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
@@ -21,13 +22,16 @@ from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
+from gsencoder.fusion.basis_fit import total_fit
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.text.table import save_text_table
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.run import TrainConfig, Training, fit
 
 
@@ -101,10 +105,13 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
             )
         if folder is None:
             return
-        write_results(folder, state.path, done, config, summary)
+        figures = encoder_basis_figures(done.outputs, dataset.scenes(names(held_out)))
+        write_results(folder, state.path, done, figures, config, summary)
     scores = ", ".join(f"{name} {value:.3f}" for name, value in done.scores.items()) or "not validated"
     minutes = done.state.seconds / 60
-    console(config.quiet).print(f"{out}: {done.state.step} steps in {minutes:.1f} minutes; {scores}")
+    screen = console(config.quiet)
+    screen.print(f"{out}: {done.state.step} steps in {minutes:.1f} minutes; {scores}")
+    screen.print(f"{out}: basis: {describe_basis(figures, 'held-out scenes')}")
 
 
 def names(paths: Sequence[Path]) -> list[str]:
@@ -112,10 +119,26 @@ def names(paths: Sequence[Path]) -> list[str]:
     return [path.name for path in paths]
 
 
-def write_results(folder: Path, work: Path, done: Training, config: TrainCommandConfig, summary: Summary) -> None:
-    """Writes weights, words, log and pictures; the scores go into the summary."""
+def encoder_basis_figures(outputs: OutputSpace, held_out: Sequence[PreparedScene]) -> dict[str, int | float]:
+    """The figures of an encoder's basis, with those of the teacher's vectors in held-out scenes, which it was not
+    fitted to; scenes that were prepared without such figures are left out."""
+    sums = [each for scene in held_out if (each := scene.projections()) is not None]
+    of_others = total_fit(sums).figures() if sums and outputs.basis is not None else {}
+    return {**basis_figures(outputs.basis, outputs.channels), **of_others}
+
+
+def write_results(
+    folder: Path,
+    work: Path,
+    done: Training,
+    figures: dict[str, int | float],
+    config: TrainCommandConfig,
+    summary: Summary,
+) -> None:
+    """Writes weights, words, log and pictures; scores and the figures of the basis go into weights and summary."""
     steps, seconds = done.state.step, done.state.seconds
     made_by = {"settings": settings(config), "steps": steps, "seconds": seconds, "validation": done.scores}
+    made_by["basis"] = figures
     save_weights(folder / WEIGHTS_FILE, done.encoder, done.outputs, made_by, dtype=config.store)
     if done.words is not None:
         save_text_table(folder / WORDS_FILE, done.words, dtype=config.store)
@@ -128,6 +151,7 @@ def write_results(folder: Path, work: Path, done: Training, config: TrainCommand
         seconds=seconds,
         parameters=sum(value.numel() for value in done.encoder.parameters()),
         validation=done.scores,
+        basis=figures,
         weights=WEIGHTS_FILE,
         log=LOG_FILE,
     )

@@ -1,6 +1,7 @@
 """The exported encoder under onnxruntime: features of a splat, and words for them, without torch."""
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,11 @@ class OnnxEncoder:
     def voxel(self) -> float:
         """Edge of the finest grid in metres."""
         return self.header.voxel
+
+    @property
+    def made_by(self) -> Mapping[str, Any]:
+        """Settings and results of training and export, as JSON values."""
+        return self.header.made_by
 
     @property
     def words(self) -> TextTable | None:

@@ -1,0 +1,122 @@
+"""`train`, `encode` and `fuse basis=` state what the encoder's basis keeps, of its own scenes and of others."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsencoder.app import cli
+from gsencoder.app.commands.basis_figures import describe_basis
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.splats import save_splat
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+from gsencoder.fusion.basis_fit import basis_fit
+from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
+from gsencoder.infer.onnx.export import random_cloud
+from gsencoder.models.weights import load_weights
+
+pytestmark = pytest.mark.slow
+
+TRAIN = (
+    "teacher=palette",
+    "prepare.fusion.narrow=2",
+    "prepare.fusion.max_rank=3",
+    "holdout=room_1",
+    "model.transformer.encoder_depths=[1]",
+    "model.transformer.encoder_channels=[32]",
+    "model.transformer.decoder_depths=[]",
+    "model.transformer.decoder_channels=[]",
+    "train.steps=2",
+    "train.warmup=1",
+    "sampling.gaussians=500",
+    "tensorboard=false",
+)
+
+
+def results_of(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two rooms, and an encoder trained on the first."""
+    folder = tmp_path_factory.mktemp("basis")
+    for number in range(2):
+        write_room(make_room(number, objects=2, views=3, width=80, height=60), folder / f"room_{number}")
+    words = [str(folder / f"room_{number}") for number in range(2)]
+    assert cli.main(["train", *words, *TRAIN, f"out={folder / 'encoder'}", "quiet=true"]) == 0
+    return folder
+
+
+def test_training_states_what_the_basis_keeps_of_its_scenes_and_of_held_out_ones(folder: Path) -> None:
+    _, outputs, made_by = load_weights(folder / "encoder")
+    figures = results_of(folder / "encoder")["basis"]
+    assert made_by["basis"] == figures
+    assert outputs.basis is not None
+    assert (figures["rank"], figures["energy_kept"]) == (3, outputs.basis.energy_kept)
+    views = load_scene(folder / "room_1").views
+    assert views is not None
+    direct = basis_fit(outputs.basis, PaletteTeacher(PaletteConfig()), views, len(views))
+    assert {name: figures[name] for name in direct.figures()} == pytest.approx(direct.figures(), abs=1e-3)
+
+
+def test_encoding_shows_the_figures_of_the_weights_or_those_of_the_scene(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained = results_of(folder / "encoder")["basis"]
+    encode = ["encode", str(folder / "room_0"), f"weights={folder / 'encoder'}"]
+    assert cli.main([*encode, f"out={tmp_path / 'plain'}"]) == 0
+    assert results_of(tmp_path / "plain")["basis"] == trained
+    printed = capsys.readouterr().out.replace("\n", " ")
+    assert "basis of the encoder: rank 3, keeps" in printed
+    assert "in the scenes held out of the training" in printed
+    assert cli.main([*encode, f"out={tmp_path / 'measured'}", "basis_views=2"]) == 0
+    measured = results_of(tmp_path / "measured")["basis"]
+    assert "in this scene" in capsys.readouterr().out.replace("\n", " ")
+    assert measured["rank"] == 3
+    assert measured["other_energy"] != trained["other_energy"]
+
+
+def test_fusing_in_the_basis_of_weights_gives_features_that_compare_with_encoded_ones(
+    folder: Path, tmp_path: Path
+) -> None:
+    words = [str(folder / "room_0"), "teacher=palette", f"basis={folder / 'encoder'}", f"out={tmp_path / 'fused'}"]
+    assert cli.main(["fuse", *words, "quiet=true"]) == 0
+    basis = load_weights(folder / "encoder")[1].basis
+    (features,) = load_features(tmp_path / "fused").features.values()
+    fused = features.basis
+    assert basis is not None
+    assert fused is not None
+    np.testing.assert_array_equal(fused.components, basis.components)
+    assert 0 < results_of(tmp_path / "fused")["other_energy"] <= 1
+
+
+def test_where_there_is_nothing_to_measure_one_line_says_so(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_splat(tmp_path / "bare.ply", random_cloud(50, 0.02))
+    out = [f"out={tmp_path / 'out'}", "quiet=true", "data.metres_per_unit=1"]
+    weights = f"weights={folder / 'encoder'}"
+    for words, message in (
+        (["encode", str(tmp_path / "bare.ply"), weights, "basis_views=2", *out], "the scene has no views in which"),
+        (["encode", str(tmp_path / "bare.ply"), weights, "basis_views=-1", *out], "basis_views: expected 0 or more"),
+        (["fuse", str(folder / "room_0"), "teacher=palette", "basis=nothing", *out], "nothing"),
+    ):
+        capsys.readouterr()
+        assert cli.main(words) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert "Traceback" not in error
+
+
+def test_a_phrase_states_what_is_known() -> None:
+    figures = {"rank": 128, "energy_kept": 0.99123}
+    assert describe_basis(figures, "this scene") == "rank 128, keeps 0.9912 of the energy"
+    figures |= {"other_energy": 0.915, "other_cosine": 0.93, "other_worst": 0.82}
+    expected = "rank 128, keeps 0.9912 of the energy, and 0.9150 in this scene (cosine 0.930, worst 5 % below 0.820)"
+    assert describe_basis(figures, "this scene") == expected
