@@ -13,8 +13,9 @@ rooms:
 - wrong names: for each object of an unseen kind, every other unseen kind that its room lacks; a hit is a first box that
   overlaps the object by 0.25,
 
-with the fixed threshold of 0.5 and with the adaptive default, and with `localize.min_probability` of 0 and 0.02.
-Standard errors are over rooms.
+with the fixed threshold of 0.5 and with the adaptive default, and with several levels of `localize.min_probability`. It
+also prints how well the probability of a word's best box tells unseen kinds that are in a room from those that are not,
+and how it is calibrated on them. Standard errors are over rooms.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,8 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.boxes import queryable_objects, score_boxes
+from gsencoder.evaluate.boxes import aabb_iou, queryable_objects
+from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, with_features
 from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -46,12 +48,34 @@ from gsencoder.types import Scene
 
 RIM = 2
 """Pixels around an object that are masked with it: compressed photographs mix colors across outlines."""
-SETTINGS = {
-    "fixed": LocalizeConfig(threshold=ThresholdConfig(kind="fixed")),
-    "fixed, every box": LocalizeConfig(threshold=ThresholdConfig(kind="fixed"), min_probability=0),
-    "adaptive": LocalizeConfig(),
-    "adaptive, every box": LocalizeConfig(min_probability=0),
-}
+THRESHOLDS = {"fixed": ThresholdConfig(kind="fixed"), "adaptive": ThresholdConfig()}
+LEVELS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+"""Levels of `localize.min_probability`; the default is among them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """A word asked about an object.
+
+    Attributes:
+        room: number of the room.
+        word: what was asked.
+        right: whether it is the object's name.
+        boxes: probability and IoU with the object (or, for its own name, with the best of that name), best box first.
+    """
+
+    room: int
+    word: str
+    right: bool
+    boxes: tuple[tuple[float, float], ...]
+
+    def iou(self, level: float) -> float:
+        """IoU of the first box that is at least as probable as `level`; 0 without one."""
+        return next((iou for probability, iou in self.boxes if probability >= level), 0.0)
+
+    @property
+    def probability(self) -> float:
+        return max((probability for probability, _ in self.boxes), default=0.0)
 
 
 def write_without(source: Path, target: Path, kinds: Sequence[str]) -> int:
@@ -72,69 +96,91 @@ def write_without(source: Path, target: Path, kinds: Sequence[str]) -> int:
     return len(left_out)
 
 
-def hits_of(scene: Scene, words: Words, kinds: Sequence[str], *, unseen: bool) -> dict[str, list[tuple[str, float]]]:
-    """For each setting, and for wrong names, the name and IoU of each queried object of a scene with features."""
+def ask(
+    scene: Scene, words: Words, kinds: Sequence[str], threshold: ThresholdConfig, room: int, *, unseen: bool
+) -> list[Asked]:
+    """Asks the names of the objects of unseen kinds, and of each wrong names; or the names of the other objects."""
     targets = [
         each
         for each in queryable_objects(scene.objects, min_views=5, min_pixels=60)
         if each.name is not None and (each.name in kinds) == unseen
     ]
-    if not targets:
-        return {}
     present = {each.name for each in scene.objects}
     wrong = [kind for kind in kinds if kind not in present] if unseen else []
     names = sorted({str(each.name) for each in targets})
-    rows: dict[str, list[tuple[str, float]]] = {}
-    for setting, config in SETTINGS.items():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", SceneWarning)
-            found = localize(scene, [*names, *wrong], words, config)
-        rows[setting] = [(str(hit.name), hit.iou) for hit in score_boxes(scene, found, targets)]
-        rows[f"{setting}: wrong names"] = [
-            (str(target.name), hit.iou)
-            for word in wrong
-            for target in targets
-            for renamed in [replace(target, name=word)]
-            for hit in score_boxes(replace(scene, objects=(renamed,)), found, [renamed])
-        ]
-    return rows
+    if not names:
+        return []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)
+        boxes = localize(scene, [*names, *wrong], words, LocalizeConfig(threshold=threshold, min_probability=0)).boxes
+    asked = []
+    for target in targets:
+        for word in [str(target.name), *wrong]:
+            right = word == target.name
+            same = [each for each in scene.objects if each.name == word] if right else [target]
+            ious = tuple(
+                (box.probability, max(aabb_iou(box.aabb_min, box.aabb_max, o.aabb_min, o.aabb_max) for o in same))
+                for box in sorted(boxes, key=lambda box: box.rank)
+                if box.query == word
+            )
+            asked.append(Asked(room=room, word=word, right=right, boxes=ious))
+    return asked
 
 
-def report(title: str, rooms: list[dict[str, list[tuple[str, float]]]]) -> None:
-    """Prints Acc@0.25 and Acc@0.5 of each setting over all objects, with the standard error over rooms."""
-    for setting in sorted({setting for room in rooms for setting in room}):
-        parts = [np.array([iou for _, iou in room[setting]]) for room in rooms if room.get(setting)]
-        if not parts:
-            continue
-        ious = np.concatenate(parts)
-        accuracy = float((ious >= 0.25).mean())
-        spread = [float(((part >= 0.25) - accuracy).sum()) for part in parts]
-        error = float(np.sqrt(np.square(spread).sum())) / len(ious)
+def share(asked: Sequence[Asked], level: float, least: float) -> tuple[float, float]:
+    """The share of words whose first box has at least the IoU `least`, and its standard error over rooms."""
+    hits = np.array([each.iou(level) >= least for each in asked])
+    _, room = np.unique([each.room for each in asked], return_inverse=True)
+    deviations = np.bincount(room, weights=hits - hits.mean())
+    return float(hits.mean()), float(np.sqrt(np.square(deviations).sum())) / len(hits)
+
+
+def report(title: str, asked: Sequence[Asked]) -> None:
+    """Prints the shares of right and wrong names at every level."""
+    right, wrong = ([each for each in asked if each.right == kind] for kind in (True, False))
+    print(f"\n{title}: {len(right)} objects, {len(wrong)} wrong names")
+    for level in LEVELS:
+        (near, error), (half, _) = share(right, level, 0.25), share(right, level, 0.5)
+        line = f"  min_probability {level}: Acc@0.25 {near:.3f} ± {error:.3f}, Acc@0.5 {half:.3f}"
+        if wrong:
+            value, error = share(wrong, level, 0.25)
+            line += f"; by wrong names {value:.3f} ± {error:.3f}"
+        print(line)
+    names = sorted({each.word for each in right})
+    hits = {name: [each.iou(0) >= 0.25 for each in right if each.word == name] for name in names}
+    print("  every box: " + ", ".join(f"{name} {sum(each)}/{len(each)}" for name, each in hits.items()))
+    if wrong:
+        keys = {(each.room, each.word): each for each in asked}
+        present = np.array([each.right for each in keys.values()])
+        probability = np.array([each.probability for each in keys.values()])
+        rooms = np.array([each.room for each in keys.values()])
+        error = auroc_standard_error(present, probability, rooms)
+        boxed = probability >= LocalizeConfig().min_probability
         print(
-            f"{title}, {setting}: {len(ious)} in {len(parts)} rooms, Acc@0.25 {accuracy:.3f} ± {error:.3f}, "
-            f"Acc@0.5 {(ious >= 0.5).mean():.3f}"
+            f"  words in a room or not: {present.sum()} and {(~present).sum()}, AUROC "
+            f"{auroc(present, probability):.3f} ± {error:.3f}, calibration error "
+            f"{calibration_error(present, probability):.3f}; boxed by default "
+            f"{boxed[present].mean():.3f} and {boxed[~present].mean():.3f}"
         )
-    adaptive = [hit for room in rooms for hit in room.get("adaptive, every box", [])]
-    by_name = {
-        name: [iou >= 0.25 for other, iou in adaptive if other == name] for name in sorted({hit[0] for hit in adaptive})
-    }
-    print(f"{title}, adaptive, every box: " + ", ".join(f"{k} {sum(v)}/{len(v)}" for k, v in by_name.items()))
 
 
 def score(paths: Sequence[Path], held_out: str, source: FeatureSource, words: Words, kinds: Sequence[str]) -> None:
-    unseen, seen = [], []
-    for path in paths:
+    asked: dict[str, list[Asked]] = {}
+    for room, path in enumerate(paths):
         scene = load_scene(path)
         test = fnmatch.fnmatch(path.name, held_out)
         if not test and not any(each.name in kinds for each in scene.objects):
             continue
         scene, features, _ = with_features(scene, source, SeedConfig())
         scene = replace(scene, features={features.space.name: features})
-        unseen.append(hits_of(scene, words, kinds, unseen=True))
-        if test:
-            seen.append(hits_of(scene, words, kinds, unseen=False))
-    report("unseen kinds", unseen)
-    report("other kinds", seen)
+        for name, threshold in THRESHOLDS.items():
+            rows = ask(scene, words, kinds, threshold, room, unseen=True)
+            asked.setdefault(f"unseen kinds, {name}", []).extend(rows)
+            if test:
+                rows = ask(scene, words, kinds, threshold, room, unseen=False)
+                asked.setdefault(f"other kinds, {name}", []).extend(rows)
+    for title in sorted(asked):
+        report(title, asked[title])
 
 
 def main() -> None:
