@@ -114,4 +114,5 @@ def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfac
         facing = np.abs(np.einsum("ni,ni->n", local, normals)) / np.linalg.norm(local, axis=1)
         areas = np.square(z) / np.prod(depth.Ks[view].diagonal()[:2]) / np.maximum(facing, 0.1)
         parts.append((transform(world_from_cam[view], local), normals @ depth.cam_from_world[view, :3, :3], areas))
-    return Surfaces(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    means, directions, sizes = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return Surfaces(means, directions, sizes)
