@@ -10,6 +10,7 @@ from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.model_files import check_fetched
 
 EXTRA = "pip install 'gsencoder[teachers]'"
+VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
 
 
 def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = "warn") -> Any:
@@ -99,6 +100,20 @@ def load_companion(loader: Any, folder: Path, what: str, noun: str, **options: A
     except Exception as error:  # tokenizers raises plain Exceptions
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{what}: {folder} holds no {noun} that transformers reads: {message}") from error
+
+
+def load_tokenizer(folder: Path, what: str, **options: Any) -> Any:
+    """The tokenizer of a folder; arguments are those of `load_companion`.
+
+    Raises:
+        InputError: the folder holds no vocabulary, or transformers cannot read it.
+    """
+    # Without any vocabulary transformers makes a tokenizer that knows nothing.
+    if not any(path for pattern in VOCABULARIES for path in folder.glob(pattern)):
+        raise InputError(f"{what}: {folder}: the tokenizer is missing; expected tokenizer.json beside the model")
+    from transformers import AutoTokenizer
+
+    return load_companion(AutoTokenizer, folder, what, "tokenizer", **options)
 
 
 @contextmanager

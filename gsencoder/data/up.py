@@ -5,23 +5,21 @@ In rooms, floors, tables and ceilings have normals parallel to up, and walls and
 Manhattan world, Coughlan and Yuille 1999). People hold cameras level: their right axes are horizontal, and their own
 up directions say which end of the axis is up. Of a bare splat that end is the one from which the largest flat surface
 at an end of the scene is seen, since things stand on floors.
+
+Seeds have the normals of the surfaces that they come from. Photographs determine the colors of a fitted splat, and the
+orientation of its Gaussians hardly: there planes through neighboring means say more.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
-from gsencoder.data.check.depth_agreement import SAMPLES, depth_views
-from gsencoder.types import Cameras, Gaussians, Scene, Views
-from gsencoder.types.cameras import unproject_points
-from gsencoder.types.poses import invert_rigid, transform
+from gsencoder.data.surfaces import Surfaces, planes_of_gaussians, surfaces_of_depth, surfaces_of_gaussians
+from gsencoder.types import Cameras, Scene
 
-MAX_SAMPLES = 20_000
-"""So many Gaussians are looked at."""
 ALIGNED = np.deg2rad(6.0)
 """Width of the bell by which normals count as parallel or perpendicular."""
 STANDING_WEIGHT = 0.5
@@ -31,15 +29,18 @@ MAX_TILT = np.deg2rad(40.0)
 DIRECTIONS = 4000
 """Candidates on the sphere, about 3° apart."""
 REFINEMENTS = 10
-FLAT = 0.5
-"""Gaussians whose thinnest axis is above this share of the middle one have no normal."""
 MIN_CONFIDENCE = 0.1
 """Below this, surfaces alone say nothing about up."""
 MIN_CONFIDENCE_NEAR_USUAL = 0.05
 """The same within `MAX_TILT` of -y, which is up in the worlds of COLMAP and of most splats, and what is assumed where
 surfaces say nothing."""
+ENOUGH_CONFIDENCE = 0.3
+"""With this confidence in the normals of Gaussians, planes through their means are not looked at."""
 FLOOR_THICKNESS = 0.01
 """Thickness of the slices in which floors are sought, as a share of the scene's extent along up."""
+NEAR_USUAL_WEIGHT = 2.0
+"""Factor of the floor of an axis of a bare splat within `MAX_TILT` of -y. In rooms the true floor has more than three
+times the area of the largest wall at an end; where hardly any floor was photographed, this decides."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,77 +87,11 @@ def up_of_cameras(cameras: Cameras) -> Float64[np.ndarray, "3"]:
     return axis if axis @ mean_up >= 0 else -axis
 
 
-class Surfaces(NamedTuple):
-    """Oriented pieces of surfaces.
-
-    Attributes:
-        means: positions in the world.
-        normals: unit; either side.
-        areas: in any unit.
-    """
-
-    means: Float64[np.ndarray, "n 3"]
-    normals: Float64[np.ndarray, "n 3"]
-    areas: Float64[np.ndarray, " n"]
-
-
-def surfaces_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
-    """A random choice of the flat Gaussians; areas are times opacity.
-
-    Args:
-        gaussians: a splat or seeds.
-        seed: of the choice.
-    """
-    from scipy.spatial.transform import Rotation
-
-    rows = np.random.default_rng(seed).permutation(len(gaussians))[: 4 * MAX_SAMPLES]
-    scales = gaussians.scales[rows].astype(np.float64)
-    order = np.argsort(scales, axis=1)
-    ordered = np.take_along_axis(scales, order, axis=1)
-    flat = ordered[:, 0] <= FLAT * ordered[:, 1]
-    rows, order, ordered = rows[flat][:MAX_SAMPLES], order[flat][:MAX_SAMPLES], ordered[flat][:MAX_SAMPLES]
-    if not len(rows):
-        return Surfaces(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    matrices = Rotation.from_quat(gaussians.quats[rows].astype(np.float64), scalar_first=True).as_matrix()
-    normals = np.take_along_axis(matrices, order[:, None, :1], axis=2)[..., 0]
-    areas = ordered[:, 1] * ordered[:, 2] * gaussians.opacities[rows].astype(np.float64)
-    return Surfaces(gaussians.means[rows].astype(np.float64), normals, areas)
-
-
-def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfaces:
-    """Samples of the surfaces that depth images show.
-
-    Args:
-        views: with depth.
-        limit: largest number of views to look at, evenly spaced.
-        seed: of the choice of samples.
-    """
-    # Its kernels load numba, which a scene that states its up does without.
-    from gsencoder.data.seeding.depth import surface_pixels
-
-    depth = depth_views(views, even_indices(len(views), limit), seed=seed)
-    made = np.random.default_rng(seed)
-    world_from_cam = invert_rigid(depth.cam_from_world)
-    parts = []
-    for view in range(len(depth)):
-        pixels = surface_pixels(depth.depths[view], depth.Ks[view].astype(np.float32))
-        rows, columns = np.nonzero(pixels.use)
-        picked = made.permutation(len(rows))[:SAMPLES]
-        rows, columns = rows[picked], columns[picked]
-        z, normals = pixels.depth[rows, columns].astype(np.float64), pixels.normals[rows, columns].astype(np.float64)
-        local = unproject_points(np.stack((columns, rows), axis=1) + 0.5, z, depth.Ks[view])
-        facing = np.abs(np.einsum("ni,ni->n", local, normals)) / np.linalg.norm(local, axis=1)
-        areas = np.square(z) / np.prod(depth.Ks[view].diagonal()[:2]) / np.maximum(facing, 0.1)
-        parts.append(
-            Surfaces(transform(world_from_cam[view], local), normals @ depth.cam_from_world[view, :3, :3], areas)
-        )
-    return Surfaces(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-
 def up_of_scene(scene: Scene) -> Up | None:
     """Up of a scene, as its files state it or estimated from what it holds; None where nothing says.
 
-    Surfaces are those of the Gaussians, else of the depth images.
+    Surfaces are those of the Gaussians, else those of the depth images. Where the normals of Gaussians agree on little,
+    planes through their means are looked at as well, and the estimate with more confidence is taken.
     """
     if scene.up is not None:
         return Up(direction=scene.up, confidence=1.0, source="stated", from_cameras=None)
@@ -166,11 +101,16 @@ def up_of_scene(scene: Scene) -> Up | None:
         surfaces = surfaces_of_gaussians(scene.gaussians)
     elif scene.views is not None and scene.views.depths is not None:
         surfaces = surfaces_of_depth(scene.views)
-    if surfaces is None or not len(surfaces.areas):
-        surfaces = None
-    if surfaces is None and cameras is None:
-        return None
-    return estimate_up(surfaces, cameras)
+    up = None
+    if cameras is not None or (surfaces is not None and surfaces.areas.sum() > 0):
+        up = estimate_up(surfaces, cameras)
+    if scene.gaussians is None or (up is not None and up.confidence >= ENOUGH_CONFIDENCE):
+        return up
+    planes = planes_of_gaussians(scene.gaussians)
+    if not planes.areas.sum() > 0:
+        return up
+    other = estimate_up(planes, cameras)
+    return other if up is None or other.confidence > up.confidence else up
 
 
 def with_up(scene: Scene) -> tuple[Scene, Up | None]:
@@ -197,10 +137,10 @@ def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:
         if prior is None:
             raise InputError("up: there are neither cameras nor flat surfaces to estimate it from; give up=")
         return Up(direction=prior, confidence=_level(cameras, prior), source="cameras", from_cameras=0.0)
-    means, normals, areas = surfaces
+    means, normals, areas, rest = surfaces
     # A few huge Gaussians, such as a sky's, must not outvote the scene.
     areas = np.minimum(areas, np.quantile(areas, 0.95))
-    areas = areas / areas.sum()
+    areas = areas / (areas.sum() + rest)
     candidates = _sphere(DIRECTIONS)
     if prior is not None:
         candidates = np.concatenate((prior[None], candidates[candidates @ prior >= np.cos(MAX_TILT)]))
@@ -274,14 +214,20 @@ def _upright_axis(
     normals: Float64[np.ndarray, "n 3"],
     areas: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "3"]:
-    """Of the three axes of a Manhattan world and their opposites, the one with the largest floor."""
+    """Of the three axes of a Manhattan world and their opposites, the one with the largest floor; see
+    `NEAR_USUAL_WEIGHT`."""
     across = np.linalg.svd(direction[None])[2][1:]
     turns = np.deg2rad(np.arange(0, 90, 3.0))
     circle = np.cos(turns)[:, None] * across[0] + np.sin(turns)[:, None] * across[1]
     second = _refine(circle[_support(circle, normals, areas).argmax()], normals, areas)
     third = np.cross(direction, second)
     axes = [sign * axis for axis in (direction, second, third / np.linalg.norm(third)) for sign in (1.0, -1.0)]
-    return max(axes, key=lambda axis: _floor_area(axis, means, normals, areas))
+
+    def weighted_floor(axis: Float64[np.ndarray, "3"]) -> float:
+        area = _floor_area(axis, means, normals, areas)
+        return area * NEAR_USUAL_WEIGHT if area > 0 and -axis[1] >= np.cos(MAX_TILT) else area
+
+    return max(axes, key=weighted_floor)
 
 
 def _floor_area(

@@ -21,9 +21,9 @@ SAMPLES = 3000
 MAX_OBSTACLES = 100_000
 CLEARANCE = 0.1
 """Smallest distance to any Gaussian, in half diagonals of the extent."""
-POSITIONS, DIRECTIONS = 24, 8
-ELEVATIONS = (-35.0, 15.0)
-"""Of the looks of level cameras, degrees above the horizon."""
+POSITIONS, DIRECTIONS = 96, 8
+ELEVATIONS = (-35.0, -5.0)
+"""Of the looks of level cameras, degrees above the horizon: people who photograph a room look down a little."""
 FILLED = 0.7
 """A photograph of a room shows surfaces nearly everywhere: candidates that fill less of their picture are left out."""
 DISTANCE = 0.3
@@ -60,7 +60,7 @@ def interior_views(
     Args:
         gaussians: of a room or of anything else.
         count: largest number of cameras.
-        up: if known, cameras are level and look between 35° down and 15° up; else in all directions, and -y is upward
+        up: if known, cameras are level and look between 35° and 5° down; else in all directions, and -y is upward
             in the pictures, as in COLMAP's worlds.
 
     Returns:

@@ -11,12 +11,11 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import digest_files, find_file
-from gsencoder.core.pretrained import load_companion, load_pretrained, read_config
+from gsencoder.core.pretrained import load_pretrained, load_tokenizer, read_config
 from gsencoder.text.onnx_tower import Pooling, stated_pooling
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
 WHAT = "text tower"
-VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
 TOKENIZER_FILES = ("tokenizer*.json", "vocab*", "merges.txt", "*.model", "special_tokens_map.json")
 
 
@@ -116,7 +115,8 @@ class TransformersTower:
         self.pooling = _choose_pooling(folder, stated.model_type, config.pooling)
         text = getattr(stated, "text_config", stated)
         self._longest = int(getattr(text, "max_position_embeddings", 0) or 0)
-        self._tokenizer = _load_tokenizer(folder)
+        # What looks like a special token in a phrase is text.
+        self._tokenizer = load_tokenizer(folder, WHAT, split_special_tokens=True)
         loader = getattr(transformers, self._kind.loader if self._kind else "AutoModel")
         model = load_pretrained(loader, folder, WHAT, other_parts="ignore" if self._kind else "warn")
         rows = model.get_input_embeddings().num_embeddings
@@ -182,13 +182,3 @@ def _choose_pooling(folder: Path, model_type: str, requested: str) -> str:
             "(1_Pooling/config.json); give text.pooling=mean, cls or eos as the model's card says"
         )
     return pooling
-
-
-def _load_tokenizer(folder: Path) -> Any:
-    from transformers import AutoTokenizer
-
-    # Without any of these transformers makes a tokenizer that knows nothing.
-    if not any(path for pattern in VOCABULARIES for path in folder.glob(pattern)):
-        raise InputError(f"{WHAT}: {folder}: the tokenizer is missing; expected tokenizer.json beside the model")
-    # What looks like a special token in a phrase is text.
-    return load_companion(AutoTokenizer, folder, WHAT, "tokenizer", split_special_tokens=True)

@@ -10,9 +10,10 @@ from textured_box import box_views, write_box
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.seeding.seed import with_gaussians
+from gsencoder.data.surfaces import Surfaces, surfaces_of_depth, surfaces_of_gaussians
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.up import (
-    Surfaces,
     Up,
     _bells,
     _floor_area,
@@ -20,13 +21,11 @@ from gsencoder.data.up import (
     _sphere,
     _support,
     estimate_up,
-    surfaces_of_depth,
-    surfaces_of_gaussians,
     up_of_cameras,
     up_of_scene,
     with_up,
 )
-from gsencoder.types import Cameras, Gaussians, Scene, Views
+from gsencoder.types import Cameras, Gaussians, Scene
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -125,7 +124,10 @@ def test_a_splat_without_directions_has_no_up() -> None:
     assert (scene.up, up) == (None, None)
     balls = replace(ball, scales=np.full((count, 3), 0.1, np.float32))
     assert len(surfaces_of_gaussians(balls).areas) == 0
-    assert up_of_scene(Scene(name="balls", gaussians=balls)) is None
+    # Planes through means that fill a volume are accidents.
+    by_planes = up_of_scene(Scene(name="balls", gaussians=balls))
+    assert by_planes is None or by_planes.confidence < 0.05
+    assert with_up(Scene(name="balls", gaussians=balls))[1] is None
     with pytest.raises(InputError, match="neither cameras nor flat surfaces"):
         estimate_up(None, None)
 
@@ -181,49 +183,6 @@ def test_a_refined_direction_is_what_floors_and_walls_agree_on() -> None:
     assert degrees(_refine(UP, normals, np.array([1.0, 1.0])), UP) == pytest.approx(2 / 3, abs=0.02)
 
 
-def test_surfaces_of_gaussians_are_their_thin_axes_and_areas_count_opacity() -> None:
-    rotations = Rotation.random(3, random_state=0)
-    scales = np.array([[0.01, 0.2, 0.3], [0.2, 0.01, 0.5], [0.2, 0.3, 0.11]], np.float32)
-    some = Gaussians(
-        means=np.arange(9, dtype=np.float32).reshape(3, 3),
-        quats=rotations.as_quat(scalar_first=True).astype(np.float32),
-        scales=scales,
-        opacities=np.array([0.5, 1.0, 1.0], np.float32),
-        sh=np.zeros((3, 1, 3), np.float32),
-    )
-    found = surfaces_of_gaussians(some)
-    order = np.argsort(found.means[:, 0])
-    # The third is thicker than half of its middle axis.
-    np.testing.assert_allclose(found.means[order], some.means[:2])
-    axes = rotations.as_matrix()
-    for row, axis in ((0, axes[0][:, 0]), (1, axes[1][:, 1])):
-        assert abs(found.normals[order][row] @ axis) == pytest.approx(1, abs=1e-6)
-    np.testing.assert_allclose(found.areas[order], (0.2 * 0.3 * 0.5, 0.2 * 0.5), rtol=1e-6)
-
-
-def test_areas_of_depth_samples_are_those_of_the_surfaces(room: Scene) -> None:
-    """Of a plane across the view, seen by all pixels, z² / (fx fy) each; of a slanted one more by its cosine."""
-    width, height, focal = 64, 48, 60.0
-    cameras = Cameras(
-        cam_from_world=np.eye(4, dtype=np.float32)[None],
-        Ks=np.array([[[focal, 0, 32], [0, focal, 24], [0, 0, 1]]], np.float32),
-        widths=np.array([width], np.int32),
-        heights=np.array([height], np.int32),
-    )
-    columns = np.tile((np.arange(width) + 0.5 - 32) / focal, (height, 1))
-    for slope in (0.0, 1.0):
-        depth = (2 / (1 - slope * columns)).astype(np.float32)
-        views = Views(cameras=cameras, names=("a",), depths=[depth])
-        found = surfaces_of_depth(views)
-        normal = np.array([slope, 0, -1]) / np.hypot(1, slope)
-        np.testing.assert_allclose(np.abs(found.normals @ normal), 1, atol=1e-3)
-        z = found.means[:, 2]
-        rays = found.means / z[:, None]
-        exact = z**2 / focal**2 / np.abs(rays @ normal) * np.linalg.norm(rays, axis=1)
-        np.testing.assert_allclose(found.areas, exact, rtol=0.01)
-        np.testing.assert_allclose(z, 2 + slope * found.means[:, 0], rtol=2e-3)
-
-
 def test_the_side_of_a_bare_splat_with_the_floor_is_down() -> None:
     """A floor, a smaller table top and walls on all sides, upside down or not."""
     made = np.random.default_rng(0)
@@ -243,6 +202,45 @@ def test_the_side_of_a_bare_splat_with_the_floor_is_down() -> None:
     assert area == pytest.approx((800 - 0.5 * 300) / 1500, abs=0.01)
     assert _floor_area(-UP, means, normals, areas / 1500) == pytest.approx((300 - 0.5 * 800) / 1500, abs=0.01)
     assert _floor_area(UP, means[:1], normals[:1], areas[:1]) == 0
+
+
+def test_a_fitted_splat_whose_gaussians_are_turned_anyhow_has_the_up_of_its_surfaces(room: Scene) -> None:
+    """Photographs determine colors, and the orientation of small Gaussians hardly."""
+    bare = replace(with_gaussians(room), views=None)
+    assert bare.gaussians is not None
+    count = len(bare.gaussians)
+    anyhow = Rotation.random(count, random_state=0).as_quat(scalar_first=True).astype(np.float32)
+    scales = np.tile(np.array([0.01, 0.01, 0.001], np.float32), (count, 1))
+    fitted = replace(bare, gaussians=replace(bare.gaussians, quats=anyhow, scales=scales))
+    for number in range(2):
+        rotation = Rotation.random(random_state=number).as_matrix()
+        _, up = with_up(turned(fitted, rotation))
+        assert up is not None
+        assert degrees(up.direction, rotation @ UP) < 1
+
+
+def test_of_two_floors_the_one_below_the_usual_up_counts_twice_as_much() -> None:
+    """A floor across -y, and across z one of 1.5 or 3 times its area."""
+    made = np.random.default_rng(0)
+    usual = np.stack((made.uniform(0, 2, 300), np.full(300, 2.0), made.uniform(0, 2, 300)), axis=1)
+    ceiling = np.array([[0.0, -1.0, 5.0]])
+    for factor, direction in ((1.5, (0, -1, 0)), (3.0, (0, 0, 1))):
+        count = round(300 * factor)
+        other = np.stack((made.uniform(0, 2, count), made.uniform(0, 1.5, count), np.zeros(count)), axis=1)
+        means = np.concatenate((usual, other, ceiling))
+        normals = np.repeat([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], (300, count, 1), axis=0)
+        up = estimate_up(Surfaces(means, normals, np.ones(len(means))), None)
+        assert degrees(up.direction, np.array(direction)) < 1
+
+
+def test_surfaces_without_a_normal_lower_confidence(room: Scene) -> None:
+    surfaces = surfaces_of_depth(room.views)  # type: ignore[arg-type]
+    alone = estimate_up(surfaces, None)
+    with_rest = estimate_up(
+        surfaces._replace(rest=float(np.minimum(surfaces.areas, np.quantile(surfaces.areas, 0.95)).sum())), None
+    )
+    np.testing.assert_allclose(with_rest.direction, alone.direction)
+    assert 0.3 * alone.confidence < with_rest.confidence < 0.6 * alone.confidence
 
 
 def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room: Scene) -> None:

@@ -13,6 +13,7 @@ import torch
 import transformers
 from onnx import TensorProto, helper, numpy_helper
 from splats import front_camera, random_gaussians
+from text_towers import save_tokenizer
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import FuseConfig, fuse
@@ -394,6 +395,71 @@ def small_mask2former() -> Any:
         label2id={name: row for row, name in enumerate(NAMES)},
     )
     return transformers.Mask2FormerForUniversalSegmentation(config)
+
+
+def save_oneformer(folder: Path) -> tuple[Any, Any]:
+    """A small OneFormer; its preprocessing names a list of classes in another repository, as published ones do."""
+    config = transformers.OneFormerConfig(
+        backbone_config=small_mask2former().config.backbone_config,
+        hidden_dim=32,
+        conv_dim=32,
+        mask_dim=32,
+        encoder_layers=1,
+        decoder_layers=2,
+        encoder_feedforward_dim=16,
+        dim_feedforward=16,
+        num_attention_heads=2,
+        num_queries=5,
+        query_dec_layers=1,
+        text_encoder_width=16,
+        text_encoder_num_layers=1,
+        text_encoder_vocab_size=30,
+        text_encoder_n_ctx=4,
+        task_seq_len=12,
+        id2label=dict(enumerate(NAMES)),
+        label2id={name: row for row, name in enumerate(NAMES)},
+    )
+    model = transformers.OneFormerForUniversalSegmentation(config).eval()
+    model.save_pretrained(folder)
+    save_tokenizer(folder / "tokenizer.json", ("[PAD]", "[UNK]", "[CLS]", "[SEP]", "the", "task", "is", "semantic"))
+    (folder / "tokenizer_config.json").write_text(
+        json.dumps({"tokenizer_class": "PreTrainedTokenizerFast", "pad_token": "[PAD]", "unk_token": "[UNK]"})
+    )
+    images = transformers.OneFormerImageProcessorPil(size={"shortest_edge": 40, "longest_edge": 80})
+    images.save_pretrained(folder)
+    written = folder / "preprocessor_config.json"
+    named = {"repo_path": "shi-labs/oneformer_demo", "class_info_file": "ade20k_panoptic.json"}
+    written.write_text(json.dumps({**json.loads(written.read_text()), **named}))
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder)
+    return model, transformers.OneFormerProcessor(images, tokenizer, task_seq_length=12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(40, 64), (64, 48)])
+def test_a_oneformer_gives_the_semantic_map_of_its_library_and_fetches_no_list_of_classes(
+    tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]
+) -> None:
+    torch.manual_seed(0)
+    model, processor = save_oneformer(tmp_path)
+    image = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
+    made = SegmenterTeacher(SegmenterConfig(model=str(tmp_path)), words(rng)).feature_map(views_of(image), 0)
+    inputs = processor(images=image, task_inputs=["semantic"], return_tensors="pt")
+    assert (inputs["task_inputs"] > 0).sum() >= 4
+    with torch.inference_mode():
+        outputs = model(**inputs)
+    classes = outputs.class_queries_logits[0].softmax(-1)[:, :-1]
+    semantic = torch.einsum("qc,qhw->hwc", classes, outputs.masks_queries_logits[0].sigmoid())
+    expected = semantic / semantic.sum(-1, keepdim=True).clamp(min=1)
+    np.testing.assert_allclose(made.shares, expected.numpy(), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_oneformer_without_its_tokenizer_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    save_oneformer(tmp_path)
+    for path in tmp_path.glob("tokenizer*"):
+        path.unlink()
+    with pytest.raises(InputError, match="the tokenizer is missing; expected tokenizer.json"):
+        SegmenterTeacher(SegmenterConfig(model=str(tmp_path)), words(rng))
 
 
 @pytest.mark.parametrize("size", [(40, 64), (64, 48)])

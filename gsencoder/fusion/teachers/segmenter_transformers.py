@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.files.model_files import digest_files
-from gsencoder.core.pretrained import load_companion, load_pretrained, quiet_transformers, read_config
+from gsencoder.core.pretrained import load_companion, load_pretrained, load_tokenizer, quiet_transformers, read_config
 from gsencoder.core.runtime.device_names import Device
 
 WHAT = "teacher segmenter"
@@ -38,8 +38,10 @@ class TransformersSegmenter:
         universal = self._kind in MASK_HEADS
         loader = "AutoModelForUniversalSegmentation" if universal else "AutoModelForSemanticSegmentation"
         model = load_pretrained(getattr(transformers, loader), folder, WHAT)
-        processor = transformers.OneFormerProcessor if self._kind == "oneformer" else transformers.AutoImageProcessor
-        self._processor = load_companion(processor, folder, WHAT, "preprocessing")
+        if self._kind == "oneformer":
+            self._processor = _oneformer_processor(folder, config.task_seq_len)
+        else:
+            self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
         self._device = choose_device(device)
         self._model = model.to(self._device)
         self.name = folder.resolve().name
@@ -75,6 +77,18 @@ class TransformersSegmenter:
         rows, columns = (side * used / size for side, used, size in zip(values.shape, filled, input_size, strict=False))
         affine = np.array([[columns / image.shape[1], 0.0, 0.0], [0.0, rows / image.shape[0], 0.0]])
         return np.ascontiguousarray(values), are_probabilities, affine
+
+
+def _oneformer_processor(folder: Path, task_tokens: int) -> Any:
+    """OneFormer's preprocessing, which also tokenizes its task.
+
+    Its files name a list of classes that lies in another repository and serves training alone; without this override
+    transformers would fetch it.
+    """
+    from transformers import AutoImageProcessor, OneFormerProcessor
+
+    images = load_companion(AutoImageProcessor, folder, WHAT, "preprocessing", class_info_file=None)
+    return OneFormerProcessor(images, load_tokenizer(folder, WHAT), task_seq_length=task_tokens)
 
 
 def _semantic_map(classes: Any, masks: Any) -> Any:
