@@ -33,11 +33,12 @@ from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.grid.neighbors import _append_zero_row, _gather_neighborhoods, _row_blocks
 from gsencoder.models.grid.plan import plan_cloud
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.train import samples
 from gsencoder.train.distill import Distillation
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.samples import SampleDataset, SampleRecipe
+from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import FeatureSpace, Gaussians
 
 CHANNELS = 64
@@ -178,10 +179,11 @@ def step_parts(config: TrainCommandConfig, prepared: Path, steps: int) -> dict[s
         sampling=config.sampling,
         augmentation=config.augment,
         losses=config.loss,
-        class_balance=folder.load_class_balance(),
+        teachers=(samples.TeacherRecipe(name="teacher", class_balance=folder.load_class_balance()),),
         seed=0,
     )
-    dataset = SampleDataset(folder.scenes(sorted(path.stem for path in (prepared / "scenes").iterdir())), recipe)
+    scenes = folder.scenes(sorted(path.stem for path in (prepared / "scenes").iterdir()))
+    dataset = SampleDataset([TrainingScene([scene]) for scene in scenes], recipe)
     spent: dict[str, float] = {}
     timed(samples, "choose_crop", spent, "selection")
     timed(samples, "augment", spent, "augmentation")
@@ -189,7 +191,7 @@ def step_parts(config: TrainCommandConfig, prepared: Path, steps: int) -> dict[s
     timed(samples, "restrict_rows", spent, "rows of B")
     encoder = GaussianEncoder(config.model, outputs.channels).train()
     optimizer = torch.optim.AdamW(encoder.parameters(), lr=1e-3, fused=True)
-    distillation = Distillation(encoder, config.loss, torch.from_numpy(recipe.class_balance.codebook))
+    distillation = Distillation(encoder, config.loss, recipe.teachers)
     dtype = autocast_dtype(config.train.precision, torch.device("cpu"))
     gaussians = 0
     # The first visit to a scene opens its file and looks up the classes of its targets.
@@ -245,8 +247,9 @@ def main() -> None:
         config = replace(config, model=replace(config.model, transformer=shape))
     if chosen.chunked:
         splat = surface(chosen.chunked)
-        outputs = OutputSpace(
-            space=FeatureSpace(name="s", channels=CHANNELS), mean=np.zeros(CHANNELS, np.float32), scale=1.0
+        space = FeatureSpace(name="s", channels=CHANNELS)
+        outputs = OutputSpaces(
+            by_teacher={"s": OutputSpace(space=space, mean=np.zeros(CHANNELS, np.float32), scale=1.0)}
         )
         start = time.perf_counter()
         encode(

@@ -24,7 +24,7 @@ from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint
 from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_package
 from gsencoder.fusion.teacher_maps import read_map, write_map
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.reconstruct.anchor import anchor_at
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
@@ -72,8 +72,9 @@ def words_of_numpy(folder: Path) -> Made:
     return folder / "w.npz", lambda: load_text_table(folder / "w.npz")
 
 
-def an_output_space() -> OutputSpace:
-    return OutputSpace(space=FeatureSpace(name="s", channels=4), mean=np.arange(4, dtype=np.float32), scale=2.0)
+def an_output_space() -> OutputSpaces:
+    mean = np.arange(4, dtype=np.float32)
+    return OutputSpaces(by_teacher={"s": OutputSpace(space=FeatureSpace(name="s", channels=4), mean=mean, scale=2.0)})
 
 
 def encoder(folder: Path) -> Made:

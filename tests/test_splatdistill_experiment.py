@@ -98,7 +98,8 @@ def trained(scenes: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.mark.slow
 def test_its_encoder_gives_the_teachers_vectors_themselves(trained: Path) -> None:
-    encoder, outputs, _ = load_weights(trained)
+    encoder, spaces, _ = load_weights(trained)
+    outputs = spaces.select()
     assert encoder.stem.weight.shape[0] == 125
     assert (outputs.basis, outputs.centered, outputs.scaled) == (None, False, False)
     assert outputs.channels == outputs.space.channels
@@ -153,5 +154,5 @@ def test_an_output_space_without_centering_passes_through_an_exported_header(tra
     from gsencoder.infer.onnx.export import header_of
     from gsencoder.infer.onnx.header import from_metadata, to_metadata
 
-    outputs: OutputSpace = from_metadata(to_metadata(header_of(TorchEncoder(str(trained))))).outputs
+    outputs: OutputSpace = from_metadata(to_metadata(header_of(TorchEncoder(str(trained))))).outputs.select()
     assert (outputs.centered, outputs.scaled) == (False, False)

@@ -85,7 +85,8 @@ def test_training_leaves_weights_words_a_log_and_pictures(trained: Path) -> None
     assert 0 <= results["validation"]["names"] <= 1
     encoder, outputs, made_by = load_weights(trained / results["weights"])
     assert made_by["steps"] == 6
-    assert outputs.space.text_encoder == "room-words"
+    assert list(outputs) == ["labels"]
+    assert outputs["labels"].space.text_encoder == "room-words"
     assert encoder.channels == outputs.channels
     assert (trained / "words.safetensors").is_file()
     assert (trained / "log.csv").read_text().splitlines()[0].startswith("step,loss")
@@ -102,8 +103,7 @@ def test_the_python_call_trains_the_same_encoder_as_the_command(rooms: Path, tra
     result = train(scenes, config, held_out=[rooms / "room_2"], validate=validate_names, **places)
     assert result.state.step == 6
     assert result.scores == summary_of(trained)["results"]["validation"]
-    assert result.words is not None
-    assert result.words.names == load_text_table(rooms / "words.safetensors").names
+    assert result.tables["labels"].names == load_text_table(rooms / "words.safetensors").names
     by_command, _, _ = load_weights(trained / "encoder.safetensors")
     for name, value in result.encoder.state_dict().items():
         # The command stores float16.
@@ -139,7 +139,7 @@ def test_a_training_goes_on_only_with_heads_of_the_same_content(
     def interrupted(*arguments: Any) -> None:
         raise KeyboardInterrupt
 
-    channels = load_weights(trained / "encoder.safetensors")[1].space.channels
+    channels = load_weights(trained / "encoder.safetensors")[1].channels
     save_heads(tmp_path / "heads", head(0.1))
     save_heads(tmp_path / "moved", head(0.1))
     scenes = [str(rooms / f"room_{number}") for number in range(3)]
@@ -306,7 +306,7 @@ def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(roo
     assert cli.main([*asked, *less, "tensorboard=false", f"out={out}", "quiet=true"]) == 0
     encoder, outputs, _ = load_weights(out / "encoder.safetensors")
     assert sum(value.numel() for value in encoder.parameters()) > 40e6
-    assert outputs.space.teacher == "radio"
+    assert outputs["radio"].space.teacher == "radio"
     assert summary_of(out)["results"]["steps"] == 2
 
 

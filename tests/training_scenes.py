@@ -15,8 +15,9 @@ from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.crops import SamplingConfig
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
-from gsencoder.train.samples import SampleDataset, SampleRecipe
+from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
 from gsencoder.train.trainer import TrainerConfig
+from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
 TABLE = np.array([[0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]], np.float32)
@@ -120,10 +121,11 @@ def samples(dataset: PreparedDataset, names: Sequence[str], **changes: Any) -> S
         "sampling": SamplingConfig(views=2, gaussians=200),
         "augmentation": AugmentConfig(turn=10.0),
         "losses": LOSSES,
-        "class_balance": dataset.load_class_balance(),
+        "teachers": (TeacherRecipe(name="sides", class_balance=dataset.load_class_balance()),),
         "seed": 3,
     }
-    return SampleDataset(dataset.scenes(names), SampleRecipe(**{**recipe, **changes}))
+    scenes = [TrainingScene([scene]) for scene in dataset.scenes(names)]
+    return SampleDataset(scenes, SampleRecipe(**{**recipe, **changes}))
 
 
 def small_encoder(channels: int = 4) -> GaussianEncoder:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -35,16 +36,42 @@ def fusion_source(teacher: TeacherConfig, words: Words | None, config: FuseConfi
     return source
 
 
-def encoder_source(encoder: Encoder, config: EncodeConfig = EncodeConfig()) -> FeatureSource:
-    """A source that runs an encoder."""
+def encoder_source(encoder: Encoder, config: EncodeConfig = EncodeConfig(), space: str | None = None) -> FeatureSource:
+    """A source that runs an encoder.
+
+    Args:
+        encoder: the encoder.
+        config: settings of encoding.
+        space: of an encoder with several teachers, the one whose features are evaluated; None = the only one.
+    """
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         assert scene.gaussians is not None
         start = time.perf_counter()
-        features = encoder.encode(scene.gaussians, config, metres_per_unit=unit_of(scene, encoder.voxel))
+        unit = unit_of(scene, encoder.voxel)
+        features = encoder.encode(scene.gaussians, config, space=space, metres_per_unit=unit)
         return features, {"encode": time.perf_counter() - start}
 
     return source
+
+
+def space_of_words(encoder: Encoder, words: Words) -> str | None:
+    """The teacher of an encoder in whose space words are; None if it has one teacher.
+
+    Raises:
+        InputError: of several teachers, none or more than one has this text encoder.
+    """
+    if len(encoder.spaces) == 1:
+        return None
+    text_encoder = words.space.text_encoder
+    fitting = [name for name, space in encoder.spaces.items() if space.text_encoder == text_encoder]
+    if len(fitting) != 1:
+        listing = "; ".join(f"{name}: {space.describe()}" for name, space in encoder.spaces.items())
+        raise InputError(
+            f"the words of {text_encoder} are those of {len(fitting)} of the encoder's teachers ({listing}); expected "
+            "those of one: give its words (teacher.words= or text=), or name it with space="
+        )
+    return fitting[0]
 
 
 def load_scenes(

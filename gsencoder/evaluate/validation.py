@@ -19,7 +19,7 @@ from gsencoder.infer.draw.pictures import contact_sheet, fit_pca_colors, pca_pic
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpaces
 from gsencoder.render import blend
 from gsencoder.render.images import render_image
 from gsencoder.train.class_balance import nearest_codes
@@ -72,7 +72,8 @@ def nearest_classes(
 def validate_encoder(
     scenes: Sequence[PreparedScene],
     encoder: GaussianEncoder,
-    outputs: OutputSpace,
+    outputs: OutputSpaces,
+    teacher: str,
     codebook: Float32[np.ndarray, "C channels"],
     config: EncodeConfig = EncodeConfig(),
     *,
@@ -84,12 +85,14 @@ def validate_encoder(
     Args:
         scenes: prepared scenes.
         encoder: the encoder to validate.
-        outputs: its output space.
+        outputs: its output spaces.
+        teacher: whose targets the scenes hold, and whose features are scored.
         codebook: the target classes, in standard units.
         config: settings of encoding.
         pictured: number of scenes of which a view is drawn.
         track: wraps the loop over scenes to show progress.
     """
+    space = outputs[teacher]
     pictures: list[np.ndarray] = []
     titles: list[str] = []
     correct, total = np.zeros(len(codebook)), np.zeros(len(codebook))
@@ -98,8 +101,9 @@ def validate_encoder(
         seen = np.flatnonzero(scene.weights)
         gaussians = scene.gaussians(np.arange(len(scene)))
         with about(f"scene {scene.name}"):
-            encoded = encode(gaussians, encoder, outputs, config, metres_per_unit=scene.metres_per_unit or 1.0)
-        predicted = outputs.standardize(encoded.features[seen])
+            unit = scene.metres_per_unit or 1.0
+            encoded = encode(gaussians, encoder, outputs, config, space=teacher, metres_per_unit=unit)
+        predicted = space.standardize(encoded.features[seen])
         targets = scene.targets(seen)
         if len(pictures) < 3 * pictured:
             pictures += draw_middle_view(scene, seen, targets, predicted)
@@ -109,9 +113,9 @@ def validate_encoder(
         predicted_codes = nearest_classes(predicted, codebook, choices)
         correct += np.bincount(true_codes, weights=predicted_codes == true_codes, minlength=len(codebook))
         total += np.bincount(true_codes, minlength=len(codebook))
-        targets, predicted = outputs.standard_units(targets), outputs.standard_units(predicted)
+        targets, predicted = space.standard_units(targets), space.standard_units(predicted)
         lengths = np.sqrt(np.square(targets).sum(axis=1))
-        named = lengths >= 0.5 * outputs.channels**0.5
+        named = lengths >= 0.5 * space.channels**0.5
         dots = (targets[named] * predicted[named]).sum(axis=1)
         norms = lengths[named] * np.sqrt(np.square(predicted[named]).sum(axis=1) + 1e-12)
         cosines += float((dots / norms).sum())
@@ -124,7 +128,8 @@ def validate_encoder(
 def validate_names(
     scenes: Sequence[PreparedScene],
     encoder: GaussianEncoder,
-    outputs: OutputSpace,
+    outputs: OutputSpaces,
+    teacher: str,
     codebook: Float32[np.ndarray, "C channels"],
     config: EncodeConfig = EncodeConfig(),
 ) -> ValidationResult:
@@ -133,7 +138,7 @@ def validate_names(
     Its scores are "names", the accuracy averaged over classes, and "cosine_named", the mean cosine over named
     Gaussians; its picture "features" is the sheet of the first scenes.
     """
-    accuracy = validate_encoder(scenes, encoder, outputs, codebook, config, pictured=PICTURED_SCENES)
+    accuracy = validate_encoder(scenes, encoder, outputs, teacher, codebook, config, pictured=PICTURED_SCENES)
     pictures = {} if accuracy.sheet is None else {"features": accuracy.sheet}
     return ValidationResult({"names": accuracy.score, "cosine_named": accuracy.cosine_named}, pictures)
 

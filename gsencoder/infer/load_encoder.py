@@ -9,7 +9,7 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.onnx.runtime import SUFFIX, OnnxEncoder
 from gsencoder.text.table import TextTable
-from gsencoder.types import GaussianFeatures, Gaussians
+from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians
 
 
 @runtime_checkable
@@ -21,8 +21,16 @@ class Encoder(Protocol):
         """Edge of the finest grid in metres."""
 
     @property
+    def spaces(self) -> Mapping[str, FeatureSpace]:
+        """The feature spaces that the encoder gives features of, by the names of their teachers."""
+
+    @property
+    def tables(self) -> Mapping[str, TextTable]:
+        """The text tables that lie beside the encoder, by the teacher in whose space they are."""
+
+    @property
     def words(self) -> TextTable | None:
-        """Text table of the features' space; None where none lies beside the encoder."""
+        """The first of the text tables; None where there is none."""
 
     @property
     def made_by(self) -> Mapping[str, Any]:
@@ -33,10 +41,21 @@ class Encoder(Protocol):
         gaussians: Gaussians,
         config: EncodeConfig = EncodeConfig(),
         *,
+        space: str | None = None,
         metres_per_unit: float = 1.0,
         track: Track = untracked,
     ) -> GaussianFeatures:
         """Features of every Gaussian, all with weight 1; see `gsencoder.infer.encode.encode.encode`."""
+
+    def encode_spaces(
+        self,
+        gaussians: Gaussians,
+        config: EncodeConfig = EncodeConfig(),
+        *,
+        metres_per_unit: float = 1.0,
+        track: Track = untracked,
+    ) -> dict[str, GaussianFeatures]:
+        """Such features in all spaces; see `gsencoder.infer.encode.encode.encode_spaces`."""
 
 
 def load_encoder(weights: str, device: Device = "auto") -> Encoder:

@@ -8,6 +8,7 @@ teacher's vectors themselves.
 """
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -108,3 +109,131 @@ def read_output_space(file: Archive) -> OutputSpace:
     space, mean, basis = read_space(file)
     switches = {name: bool(file.value(name, bool)) for name in ("centered", "scaled") if name in file}
     return OutputSpace(space=space, mean=mean, scale=file.value("scale", float, int), basis=basis, **switches)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OutputSpaces:
+    """The output spaces of an encoder, one for each of its teachers. The columns of the encoder's outputs are those of
+    the first space, then those of the second, and so on.
+
+    Attributes:
+        by_teacher: the spaces by the names of the teachers, in the order of their columns.
+    """
+
+    by_teacher: Mapping[str, OutputSpace]
+
+    def __post_init__(self) -> None:
+        if not self.by_teacher:
+            raise InputError("OutputSpaces: expected one output space or more, got none")
+        names = [outputs.space.name for outputs in self.by_teacher.values()]
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise InputError(
+                f"teachers: two of them have features called {repeated[0]!r}; expected feature spaces with distinct "
+                "names (teacher.NAME.space= gives one to a teacher=onnx)"
+            )
+
+    @property
+    def channels(self) -> int:
+        """Columns of the outputs, of all spaces together."""
+        return sum(outputs.channels for outputs in self.by_teacher.values())
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """The columns of each space, by the name of its teacher."""
+        ends = np.cumsum([outputs.channels for outputs in self.by_teacher.values()]).tolist()
+        return {name: slice(end - self.by_teacher[name].channels, end) for name, end in zip(self, ends, strict=True)}
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.by_teacher)
+
+    def __len__(self) -> int:
+        return len(self.by_teacher)
+
+    def __getitem__(self, name: str) -> OutputSpace:
+        return self.by_teacher[name]
+
+    @property
+    def unit(self) -> Float32[np.ndarray, " channels"]:
+        """The unit of each column; see `OutputSpace.unit`."""
+        return np.concatenate([np.full(each.channels, each.unit, np.float32) for each in self.by_teacher.values()])
+
+    @property
+    def offset(self) -> Float32[np.ndarray, " channels"]:
+        """The offset of each column; see `OutputSpace.offset`."""
+        return np.concatenate([outputs.offset for outputs in self.by_teacher.values()])
+
+    def restore(self, outputs: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
+        """Converts outputs to coordinates or vectors, each space in its columns."""
+        return np.asarray(outputs * self.unit + self.offset, dtype=np.float32)
+
+    def select(self, name: str | None = None) -> OutputSpace:
+        """One of the spaces; `name` and errors are those of `resolve`."""
+        return self[self.resolve(name)]
+
+    def resolve(self, name: str | None = None) -> str:
+        """The teacher that `name` stands for: the teacher itself, or the name of its feature space.
+
+        Args:
+            name: of a teacher or a feature space; None = the only one.
+
+        Raises:
+            InputError: there is no such space, or there are several and none is named.
+        """
+        known = {each.space.name: teacher for teacher, each in self.by_teacher.items()} | {each: each for each in self}
+        if name is None and len(self) == 1:
+            return next(iter(self))
+        if name not in known:
+            wanted = "name one of them" if name is None else f"got {name!r}"
+            raise InputError(f"space: the encoder gives features of {', '.join(self)}; {wanted}")
+        return known[name]
+
+    def features(self, restored: Float32[np.ndarray, "N channels"], name: str | None = None) -> GaussianFeatures:
+        """Wraps the columns of one space, restored, as features; see `OutputSpace.features`.
+
+        Raises:
+            InputError: see `resolve`.
+        """
+        teacher = self.resolve(name)
+        return self[teacher].features(np.ascontiguousarray(restored[:, self.columns[teacher]]))
+
+
+def output_spaces_parts(outputs: OutputSpaces) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and header values that represent the output spaces of an encoder in a file.
+
+    Those of a single space are what `output_space_parts` gives, and the teacher's name; arrays of several spaces have
+    the number of the space before their names.
+    """
+    if len(outputs) == 1:
+        (name,) = outputs
+        arrays, header = output_space_parts(outputs[name])
+        return arrays, {**header, "teacher": name}
+    arrays, headers = {}, []
+    for number, name in enumerate(outputs):
+        own_arrays, header = output_space_parts(outputs[name])
+        arrays |= {f"{number}.{key}": value for key, value in own_arrays.items()}
+        headers.append({**header, "teacher": name})
+    return arrays, {"outputs": headers}
+
+
+def read_output_spaces(file: Archive) -> OutputSpaces:
+    """Reads the output spaces of an encoder from a file.
+
+    Raises:
+        InputError: the file is damaged, or was not written by gsencoder.
+    """
+    if "outputs" not in file:
+        # Files of earlier versions, which had one teacher, do not name it otherwise.
+        outputs = read_output_space(file)
+        name = file.value("teacher", str) if "teacher" in file else outputs.space.teacher or outputs.space.name
+        return OutputSpaces(by_teacher={name: outputs})
+    by_teacher: dict[str, OutputSpace] = {}
+    for number, header in enumerate(file.value("outputs", list)):
+        if not isinstance(header, dict):
+            raise InputError(f"expected an output space in the header, got {str(header)[:60]!r}")
+        part = file.section(f"{number}.", header)
+        name = part.value("teacher", str)
+        if name in by_teacher:
+            raise InputError(f"expected output spaces of distinct teachers, got two of {name[:60]!r}")
+        by_teacher[name] = read_output_space(part)
+    return OutputSpaces(by_teacher=by_teacher)

@@ -23,7 +23,7 @@ from gsencoder.models.grid.serialize import (
     morton_codes,
     swap_xy,
 )
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpaces
 from gsencoder.models.point_transformer import TransformerConfig
 
 
@@ -47,11 +47,12 @@ class TokenLevel(NamedTuple):
 
 
 class RawEncoder(nn.Module):
-    """`GaussianEncoder` with the computation of its inputs before it and `OutputSpace.restore` after it."""
+    """`GaussianEncoder` with the computation of its inputs before it and `OutputSpaces.restore` after it."""
 
-    def __init__(self, encoder: GaussianEncoder, outputs: OutputSpace) -> None:
+    def __init__(self, encoder: GaussianEncoder, outputs: OutputSpaces) -> None:
         super().__init__()
-        self.encoder, self.unit = encoder, outputs.unit
+        self.encoder = encoder
+        self.register_buffer("unit", torch.from_numpy(outputs.unit), persistent=False)
         self.register_buffer("offset", torch.from_numpy(outputs.offset), persistent=False)
 
     def forward(
@@ -65,7 +66,7 @@ class RawEncoder(nn.Module):
         corner: Float32[Tensor, "3"],
         starts: Int64[Tensor, "rows P"],
     ) -> Float32[Tensor, "N channels"]:
-        """Predicts features of a cloud of one or more Gaussians: coordinates in the basis, or vectors of the space.
+        """Predicts features of a cloud of one or more Gaussians: coordinates in the basis, or vectors, of each space.
 
         Args:
             means: centers, world units.
@@ -83,7 +84,7 @@ class RawEncoder(nn.Module):
         attributes = embed(means, quats, scales, opacities, sh_dc, voxel=voxel, attributes=config.inputs)
         plan = _plan_cloud(means, voxel, corner, starts, config.transformer, config.stem)
         standard: Tensor = self.encoder(attributes, opacities, plan)
-        return standard * self.unit + self.get_buffer("offset")
+        return standard * self.get_buffer("unit") + self.get_buffer("offset")
 
 
 def _plan_cloud(

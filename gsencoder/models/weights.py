@@ -1,4 +1,4 @@
-"""Encoder weights on disk: one safetensors file with parameters, configuration of the network and output space."""
+"""Encoder weights on disk: one safetensors file with parameters, configuration of the network and output spaces."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -12,7 +12,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.model_files import find_file
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
-from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
+from gsencoder.models.output_space import OutputSpaces, output_spaces_parts, read_output_spaces
 
 WEIGHTS_FILE = "encoder.safetensors"
 SHIPPED_WEIGHTS = Path(__file__).resolve().parent.parent / "weights"
@@ -47,17 +47,17 @@ def find_weights(source: str) -> Path:
 def save_weights(
     path: Path,
     encoder: GaussianEncoder,
-    outputs: OutputSpace,
+    outputs: OutputSpaces,
     made_by: Mapping[str, Any],
     *,
     dtype: Literal["float32", "float16"] = "float32",
 ) -> None:
-    """Writes parameters, configuration and output space; an existing file is replaced only by a complete new one.
+    """Writes parameters, configuration and output spaces; an existing file is replaced only by a complete new one.
 
     Args:
         path: the file.
         encoder: the encoder to save.
-        outputs: its output space.
+        outputs: its output spaces.
         made_by: settings and results of the training, as JSON values.
         dtype: type of the stored parameters. float16 halves the file and keeps 3 decimal digits of the parameters,
             which are small numbers.
@@ -65,7 +65,7 @@ def save_weights(
     Raises:
         InputError: a parameter is not finite, or the disk is full.
     """
-    arrays, header = output_space_parts(outputs)
+    arrays, header = output_spaces_parts(outputs)
     for name, value in encoder.state_dict().items():
         with np.errstate(over="ignore"):
             stored = value.detach().cpu().numpy().astype(dtype)
@@ -77,7 +77,7 @@ def save_weights(
     write_archive(path, arrays, header)
 
 
-def load_weights(source: str | Path) -> tuple[GaussianEncoder, OutputSpace, dict[str, Any]]:
+def load_weights(source: str | Path) -> tuple[GaussianEncoder, OutputSpaces, dict[str, Any]]:
     """Loads an encoder.
 
     Args:
@@ -85,14 +85,14 @@ def load_weights(source: str | Path) -> tuple[GaussianEncoder, OutputSpace, dict
             `find_weights`.
 
     Returns:
-        The encoder in evaluation mode, its output space, and settings and results of its training.
+        The encoder in evaluation mode, its output spaces, and settings and results of its training.
 
     Raises:
         InputError: the file is missing, damaged or of another version, or its parameters do not fit its configuration.
     """
     with open_archive(find_weights(str(source))) as file:
         config = _read_config(file.value("encoder", dict))
-        outputs = read_output_space(file)
+        outputs = read_output_spaces(file)
         dtype = file.value("dtype", str)
         if dtype not in ("float32", "float16"):
             raise InputError(f"expected parameters of float32 or float16, got {dtype[:20]!r}")

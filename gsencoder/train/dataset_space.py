@@ -1,7 +1,7 @@
 """The output space of a dataset: mean, scale and basis that all its scenes share."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,27 @@ from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import map_rows
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import Scene, Views
 
 MAX_CELLS_PER_MAP = 4096
 """Approximate limit of the cells of one teacher map that enter the moments."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DatasetSpace:
+    """The output space of a dataset, and what else its teacher says of all scenes.
+
+    Attributes:
+        outputs: the output space.
+        codebook: for a coded teacher its vectors in standard units, else None.
+        kinds: names of the things that the teacher tells apart, of all scenes, if it has names.
+    """
+
+    outputs: OutputSpace
+    codebook: Float32[np.ndarray, "C channels"] | None = None
+    kinds: tuple[str, ...] = ()
 
 
 def dataset_space(
@@ -28,7 +43,8 @@ def dataset_space(
     views: int,
     center: bool = True,
     scale: bool = True,
-) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
+    optional: bool = False,
+) -> DatasetSpace:
     """Computes the output space of a dataset.
 
     For a coded teacher the moments are those of the distinct vectors of all its tables. For a dense teacher they are
@@ -42,42 +58,56 @@ def dataset_space(
         views: number of maps of a dense teacher to use.
         center: subtract the mean from targets.
         scale: divide targets by the root mean square distance from the mean.
-
-    Returns:
-        The space, and for a coded teacher its vectors in standard units, else None.
+        optional: leave out scenes that lack what the teacher needs, since they have other teachers.
 
     Raises:
+        MissingInput: a scene lacks what the teacher needs, or with `optional` all do; then the message is that of the
+            first.
         InputError: there are no scenes, or their teachers have different spaces.
     """
     if not scenes:
         raise InputError("training: no scenes to train on")
     tables: list[np.ndarray] = []
+    kinds: dict[str, None] = {}
+    missing: MissingInput | None = None
     moments: Moments | None = None
     teacher: Teacher | None = None
     view_bounds = np.linspace(0, views, len(scenes) + 1).round().astype(int)
     for number, path in enumerate(scenes):
         if teacher is not None and teacher.table is None and view_bounds[number] == view_bounds[number + 1]:
             continue
-        scene, scene_teacher = open_scene(path)
-        if teacher is not None and scene_teacher.space != teacher.space:
-            raise InputError(
-                f"training: expected one feature space for all scenes, got several feature spaces: "
-                f"({teacher.space.describe()}), and in {path} ({scene_teacher.space.describe()})"
-            )
+        try:
+            scene, scene_teacher = open_scene(path)
+            if teacher is not None and scene_teacher.space != teacher.space:
+                raise InputError(
+                    f"training: expected one feature space for all scenes, got several feature spaces: "
+                    f"({teacher.space.describe()}), and in {path} ({scene_teacher.space.describe()})"
+                )
+            if scene_teacher.table is None:
+                assert scene.views is not None
+                moments = moments or Moments(scene_teacher.space.channels)
+                count = max(1, int(view_bounds[number + 1] - view_bounds[number]))
+                _add_maps(moments, scene_teacher, scene.views, count)
+        except MissingInput as error:
+            if not optional:
+                raise
+            missing = missing or error
+            continue
         teacher = scene_teacher
+        kinds |= dict.fromkeys(getattr(teacher, "kinds", ()))
         if teacher.table is not None:
             tables.append(teacher.table)
-            continue
-        moments = moments or Moments(teacher.space.channels)
-        assert scene.views is not None
-        _add_maps(moments, teacher, scene.views, max(1, int(view_bounds[number + 1] - view_bounds[number])))
-    assert teacher is not None
+    if teacher is None:
+        assert missing is not None
+        raise missing
     if tables:
         table = np.unique(np.concatenate(tables), axis=0)
         space = replace(_coded_space(table, teacher, config), centered=center, scaled=scale)
-        return space, space.standardize(to_coordinates(space.basis, table) if space.basis is not None else table)
+        coordinates = to_coordinates(space.basis, table) if space.basis is not None else table
+        return DatasetSpace(outputs=space, codebook=space.standardize(coordinates), kinds=tuple(kinds))
     assert moments is not None
-    return replace(_dense_space(moments, teacher, config), centered=center, scaled=scale), None
+    outputs = replace(_dense_space(moments, teacher, config), centered=center, scaled=scale)
+    return DatasetSpace(outputs=outputs, kinds=tuple(kinds))
 
 
 def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:

@@ -1,69 +1,104 @@
-"""Distillation: the terms of an encoder's loss on a batch of samples (SplatDistill Eq. 5)."""
+"""Distillation: the terms of an encoder's loss on a batch (SplatDistill Eq. 5), for one teacher or several."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.train.losses import AdapterHead, LossConfig, contrast_loss, field_loss, render_loss
-from gsencoder.train.samples import Batch
+from gsencoder.train.samples import Batch, TeacherRecipe, TeacherTargets
+
+Heads = Sequence[tuple[AdapterHead, nn.Module]]
+"""Adapter heads of a teacher, each with a decoder from standard units to its input."""
 
 
 class Distillation:
-    """The loss L = λ_3D · L_3D + λ_render · L_render (+ λ_contrast · L_contrast), as totals before division.
+    """The loss L = Σ_teachers w · (λ_3D · L_3D + λ_render · L_render + λ_contrast · L_contrast), as totals before
+    division.
 
     In a step each term is Σ total / Σ weight over all micro-batches of all processes. The weights are known before
     anything is computed, so each micro-batch divides its totals by the sum of the step's weights, and gradients are
-    simply added.
+    simply added. A term of one of several teachers is called TEACHER/TERM, such as "labels/field".
     """
 
     def __init__(
         self,
         encoder: nn.Module,
         config: LossConfig,
-        codebook: Float[Tensor, "K C"],
+        teachers: Sequence[TeacherRecipe],
         *,
-        heads: Sequence[tuple[AdapterHead, nn.Module]] = (),
+        heads: Mapping[str, Heads] = {},
+        device: torch.device = torch.device("cpu"),
     ) -> None:
         """Args:
         encoder: a `GaussianEncoder`, possibly compiled or wrapped for several processes.
         config: weights and parameters of the terms.
-        codebook: target classes in standard units, which the codes of a batch index.
-        heads: adapter heads of the teacher, each with a decoder from standard units to its input.
+        teachers: the teachers, in the order of the encoder's output columns.
+        heads: adapter heads of teachers, by name.
+        device: the device of the losses.
         """
-        self.encoder, self.config, self.codebook, self.heads = encoder, config, codebook, heads
+        self.encoder, self.config = encoder, config
+        self._teachers = list(teachers)
+        self._codebooks = [torch.from_numpy(each.class_balance.codebook).to(device) for each in teachers]
+        self._heads = {
+            name: [(head.to(device), decode.to(device)) for head, decode in of_teacher]
+            for name, of_teacher in heads.items()
+        }
 
     @property
     def lambdas(self) -> dict[str, float]:
-        """The weights λ of the terms that are not 0, by name."""
+        """The weights of the terms that are not 0, by name."""
         config = self.config
         terms = {"field": config.field_weight, "render": config.render_weight, "contrast": config.contrast_weight}
-        return {name: weight for name, weight in terms.items() if weight}
+        return {
+            self._term(teacher, name): weight * teacher.weight
+            for teacher in self._teachers
+            for name, weight in terms.items()
+            if weight * teacher.weight
+        }
+
+    def _term(self, teacher: TeacherRecipe, name: str) -> str:
+        return name if len(self._teachers) == 1 else f"{teacher.name}/{name}"
 
     def divisors(self, batch: Batch) -> dict[str, float]:
         """The sum of the weights of a batch's Gaussians or rows, for each term."""
-        gaussians = float(batch.loss_weights.double().sum())
-        return {
-            "field": gaussians,
-            "render": float(batch.rows.row_weights.double().sum()),
-            "contrast": gaussians,
-        }
+        divisors = {}
+        for teacher, targets in zip(self._teachers, batch.teachers, strict=True):
+            gaussians = float(targets.loss_weights.double().sum())
+            divisors[self._term(teacher, "field")] = gaussians
+            divisors[self._term(teacher, "render")] = float(targets.rows.row_weights.double().sum())
+            divisors[self._term(teacher, "contrast")] = gaussians
+        return divisors
 
     def __call__(self, batch: Batch) -> dict[str, Tensor]:
-        """Totals of the terms whose λ is not 0, for the encoder's predictions."""
+        """Totals of the terms whose weight is not 0, for the encoder's predictions."""
         return self.terms(self.encoder(batch.attributes, batch.opacities, batch.plan), batch)
 
     def terms(self, predicted: Float[Tensor, "N C"], batch: Batch) -> dict[str, Tensor]:
-        """Totals of the terms whose λ is not 0; the render loss of a batch without rows is 0."""
-        config, terms = self.config, {}
+        """Totals of the terms whose weight is not 0; the terms of a teacher that the batch's scenes lack are 0."""
+        widths = [teacher.channels for teacher in self._teachers]
+        terms: dict[str, Tensor] = {}
         with torch.autocast(predicted.device.type, enabled=False):
-            if config.field_weight:
-                terms["field"] = field_loss(predicted, batch.targets, batch.loss_weights, config)
-            if config.render_weight:
-                rows = batch.rows
-                b = rows.blend(len(predicted))
-                terms["render"] = render_loss(predicted, b, rows.targets, rows.row_weights, config, self.heads)
-            if config.contrast_weight:
-                terms["contrast"] = contrast_loss(predicted, batch.codes, batch.loss_weights, self.codebook, config)
+            columns = predicted.split(widths, dim=1)
+            for number, (teacher, targets) in enumerate(zip(self._teachers, batch.teachers, strict=True)):
+                if teacher.weight:
+                    totals = self._teacher_terms(columns[number], targets, number)
+                    terms |= {self._term(teacher, name): total for name, total in totals.items()}
+        return terms
+
+    def _teacher_terms(
+        self, predicted: Float[Tensor, "N C"], targets: TeacherTargets, number: int
+    ) -> dict[str, Tensor]:
+        """The terms of one teacher; the render loss without rows is 0."""
+        config, terms = self.config, dict[str, Tensor]()
+        if config.field_weight:
+            terms["field"] = field_loss(predicted, targets.targets, targets.loss_weights, config)
+        if config.render_weight:
+            rows, heads = targets.rows, self._heads.get(self._teachers[number].name, ())
+            b = rows.blend(len(predicted))
+            terms["render"] = render_loss(predicted, b, rows.targets, rows.row_weights, config, heads)
+        if config.contrast_weight:
+            codebook = self._codebooks[number]
+            terms["contrast"] = contrast_loss(predicted, targets.codes, targets.loss_weights, codebook, config)
         return terms

@@ -56,6 +56,10 @@ class LossConfig:
         default=0.95,
         metadata={"help": "smallest share of a cell's weight that must be in the crop for the cell to enter L_render"},
     )
+    teacher_weights: tuple[float, ...] = field(
+        default=(),
+        metadata={"help": "weights of the losses of several teachers, in their order; empty = all equal 1"},
+    )
 
     def __post_init__(self) -> None:
         for name in ("cosine", "smooth_l1", "field_weight", "render_weight", "contrast_weight", "rarity"):
@@ -70,6 +74,12 @@ class LossConfig:
         for name in ("min_alpha", "min_kept"):
             if not 0 < getattr(self, name) <= 1:
                 raise InputError(f"{name}: expected a number in (0, 1], got {getattr(self, name)}")
+        if not all(0 <= weight < float("inf") for weight in self.teacher_weights) or (
+            self.teacher_weights and not sum(self.teacher_weights) > 0
+        ):
+            raise InputError(
+                f"teacher_weights: expected numbers of 0 or more, not all 0, got {list(self.teacher_weights)}"
+            )
         if not (self.cosine + self.smooth_l1 > 0 or self.contrast_weight > 0):
             raise InputError(
                 "cosine and smooth_l1: expected one above 0 unless contrast_weight is; there would be no loss"

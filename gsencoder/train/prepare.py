@@ -121,9 +121,16 @@ class PreparedDataset:
                 stream.write(json.dumps(expected, indent=1).encode())
 
     def fit_space(
-        self, scenes: Sequence[Path], open_scene: Callable[[Path], tuple[Scene, Teacher]], config: PrepareConfig
+        self,
+        scenes: Sequence[Path],
+        open_scene: Callable[[Path], tuple[Scene, Teacher]],
+        config: PrepareConfig,
+        *,
+        optional: bool = False,
     ) -> None:
         """Computes and stores the output space of the training scenes, unless it is stored already.
+
+        With `optional`, scenes that lack what the teacher needs are left out.
 
         Raises:
             InputError: the folder holds scenes without their space, or see `dataset_space`.
@@ -135,17 +142,36 @@ class PreparedDataset:
                 f"{self.folder}: holds scenes, but not the space that they were prepared for ({SPACE_FILE}); give "
                 "another folder as prepared="
             )
-        outputs, codebook = dataset_space(
-            scenes, open_scene, config.fusion, views=config.basis_views, center=config.center, scale=config.scale
+        space = dataset_space(
+            scenes,
+            open_scene,
+            config.fusion,
+            views=config.basis_views,
+            center=config.center,
+            scale=config.scale,
+            optional=optional,
         )
-        arrays, header = output_space_parts(outputs)
-        if codebook is not None:
-            arrays["codebook"] = codebook
-        write_archive(self.folder / SPACE_FILE, arrays, header)
+        arrays, header = output_space_parts(space.outputs)
+        if space.codebook is not None:
+            arrays["codebook"] = space.codebook
+        write_archive(self.folder / SPACE_FILE, arrays, {**header, "kinds": list(space.kinds)})
 
     def fingerprint(self) -> str:
         """A hash of the output space, by which a resumed training checks that its targets are the same."""
         return hashlib.sha256((self.folder / SPACE_FILE).read_bytes()).hexdigest()[:16]
+
+    def load_kinds(self) -> tuple[str, ...]:
+        """Loads the names of the things that the teacher tells apart; none for a teacher without names, and of datasets
+        of earlier versions.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
+        with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
+            kinds = file.value("kinds", list) if "kinds" in file else []
+            if not all(isinstance(kind, str) for kind in kinds):
+                raise InputError("expected names as the kinds in the header")
+        return tuple(kinds)
 
     def load_space(self) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
         """Loads the output space, and for a coded teacher the vectors of its codes in standard units, else None.
@@ -205,7 +231,8 @@ class PreparedDataset:
                 shutil.rmtree(path, ignore_errors=True)
 
     def count_classes(self, names: Sequence[str], track: Track) -> None:
-        """Counts the target classes of the training scenes and stores the counts, unless they are stored already."""
+        """Counts the target classes of the training scenes and stores the counts, unless they are stored already;
+        scenes that are not prepared are left out."""
         if (self.folder / CLASS_BALANCE_FILE).is_file():
             return
         _, codebook = self.load_space()
@@ -238,9 +265,14 @@ class PreparedDataset:
                 raise InputError("expected one or more target classes with counts of 0 or more")
             return ClassBalance(codebook=codebook, counts=counts)
 
+    def find_scene(self, name: str) -> PreparedScene | None:
+        """Opens a prepared scene by name; None if it is not prepared, for lack of what the teacher needs."""
+        path = self.scene_path(name)
+        return PreparedScene(path) if path.is_file() else None
+
     def scenes(self, names: Sequence[str]) -> list[PreparedScene]:
-        """Opens prepared scenes by name."""
-        return [PreparedScene(self.scene_path(name)) for name in names]
+        """Opens prepared scenes by name; those that are not prepared are left out."""
+        return [scene for name in names if (scene := self.find_scene(name)) is not None]
 
 
 def prepare_scene(

@@ -1,13 +1,17 @@
 """Preparation of all scenes of a training from disk: reading, seeding and fusing, shared among processes."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+import re
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
@@ -15,12 +19,13 @@ from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_views
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.store.folder import TEACHER_NAME
+from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.text.table import TextTable
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.distributed import ProcessRank, fail_together
-from gsencoder.train.prepare import PrepareConfig, PreparedDataset
+from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PrepareConfig, PreparedDataset
 from gsencoder.types import Scene
 
 
@@ -39,10 +44,27 @@ class SourceConfig:
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    teachers: Mapping[str, TeacherConfig] = field(
+        default_factory=dict,
+        metadata={
+            "help": "several teachers instead of one, by the names that teacher= takes, or NAME:TEACHER; options of "
+            "one of them are teachers.NAME.OPTION",
+            "several": "teacher",
+        },
+    )
+    text: TextConfig = field(default_factory=TableTextConfig)
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
 
     def __post_init__(self) -> None:
         check_orbits(self.orbits)
+        wrong = [name for name in self.teachers if not re.fullmatch(TEACHER_NAME, name)]
+        if wrong:
+            raise InputError(f"teachers: expected names of letters, digits, _ and -, got {wrong[0]!r}")
+
+    @property
+    def teachers_by_name(self) -> dict[str, TeacherConfig]:
+        """The teachers of the training, one or several."""
+        return dict(self.teachers) or {self.teacher.name: self.teacher}
 
 
 def split_scenes(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[Path], list[Path]]:
@@ -72,92 +94,185 @@ def split_scenes(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[P
 def prepare_scenes(
     training: Sequence[Path],
     held_out: Sequence[Path],
-    words: TextTable | None,
+    words: Mapping[str, Words],
     config: SourceConfig,
     folder: Path,
     *,
     voxel: float,
     process: ProcessRank = ProcessRank(),
     track: Track = untracked,
-) -> PreparedDataset:
+) -> dict[str, PreparedDataset]:
     """Prepares the scenes that are not in `folder` yet; the processes of a training share the work.
 
+    A scene that lacks what one of several teachers needs, such as labels, is prepared for the others.
+
     Args:
-        training: scenes whose targets define the output space and the class balance.
+        training: scenes whose targets define the output spaces and the class balances.
         held_out: scenes for validation.
-        words: text table of the teacher; None if it has none.
-        config: settings of reading, seeding, the teacher and preparation.
-        folder: folder of the prepared dataset; created if it does not exist.
+        words: the words of teachers that have any, by teacher.
+        config: settings of reading, seeding, the teachers and preparation.
+        folder: folder of the prepared dataset, or of one for each of several teachers; created if it does not exist.
         voxel: edge length of the encoder's grid cells in metres, from which the unit of a splat is estimated if it is
             unknown.
         process: rank of this process.
         track: wraps loops to show progress.
 
+    Returns:
+        The prepared dataset of each teacher, by its name.
+
     Raises:
-        InputError: in any process, a scene cannot be used, or the folder cannot.
+        InputError: in any process, a scene cannot be used, a teacher has no scene or a scene no teacher, or the folder
+            cannot be used.
+
+    Warns:
+        SceneWarning: scenes that lack one of several teachers.
     """
-    sections = {name: plain(getattr(config, name)) for name in ("data", "seeds", "teacher", "prepare")}
-    made_with: dict[str, Any] = {
-        "scenes": {path.name: str(path.resolve()) for path in training},
-        "words": _text_table_digest(words),
-        **sections,
-        **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras, "voxel": voxel},
+    teachers = config.teachers_by_name
+    folders = teacher_folders(folder, list(teachers))
+    made_with = {
+        name: _made_with(training, words.get(name), teacher, config, voxel) for name, teacher in teachers.items()
     }
-    read_views, read_scene = _scene_readers(config, words, voxel)
+    reader = _SceneReader(config, words, voxel)
+    several = len(teachers) > 1
     with fail_together():
         if process.is_first:
-            dataset = PreparedDataset(folder, made_with)
-            dataset.remove_stale_maps()
-            dataset.fit_space(training, read_views, config.prepare)
-    dataset = PreparedDataset(folder, made_with)
-    missing = [path for path in [*training, *held_out] if not dataset.has_scene(path)]
+            for name, path in folders.items():
+                dataset = PreparedDataset(path, made_with[name])
+                dataset.remove_stale_maps()
+                with about(f"teacher {name}") if several else nullcontext():
+                    dataset.fit_space(training, partial(reader.with_views, name), config.prepare, optional=several)
+    datasets = {name: PreparedDataset(path, made_with[name]) for name, path in folders.items()}
+    missing = {
+        path: [name for name, dataset in datasets.items() if not dataset.has_scene(path)]
+        for path in [*training, *held_out]
+    }
     with fail_together():
         pass  # No process may start to prepare before all have listed the missing scenes.
     with fail_together():
-        assigned: Iterable[Path] = track(missing[process.rank :: process.world_size], "preparing scenes")
+        unprepared = [path for path, names in missing.items() if names]
+        assigned: Iterable[Path] = track(unprepared[process.rank :: process.world_size], "preparing scenes")
         for path in assigned:
-            scene, teacher = read_scene(path)
-            with about(path):
-                dataset.prepare(scene, teacher, config.prepare, source=path)
+            _prepare_scene(path, missing[path], datasets, reader, config.prepare, optional=several)
     with fail_together():
         if process.is_first:
-            dataset.count_classes([path.name for path in training], track)
-    return dataset
+            _check_teachers(datasets, training, held_out)
+            for dataset in datasets.values():
+                dataset.count_classes([path.name for path in training], track)
+    return datasets
 
 
-ReadScene = Callable[[Path], tuple[Scene, Teacher]]
+def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """The folder of the prepared scenes of each teacher: the given one, or one in it for each of several teachers.
+
+    Raises:
+        InputError: there are several teachers, and the folder holds scenes that were prepared for one.
+    """
+    if len(names) == 1:
+        return {names[0]: folder}
+    if (folder / DATASET_SETTINGS_FILE).is_file():
+        raise InputError(f"{folder}: was prepared for one teacher, and this run has several; give another prepared=")
+    return {name: folder / name for name in names}
 
 
-def _scene_readers(config: SourceConfig, words: TextTable | None, voxel: float) -> tuple[ReadScene, ReadScene]:
-    """Two functions from a path to a scene and its teacher. The first ensures only that the scene has views, which is
-    enough for teacher maps; the second also makes Gaussians, estimates the unit, and names the scene by its path."""
-    shared: list[Teacher] = []
+def _made_with(
+    training: Sequence[Path], words: Words | None, teacher: TeacherConfig, config: SourceConfig, voxel: float
+) -> dict[str, Any]:
+    """Everything that the preparation for a teacher depends on, as JSON values."""
+    return {
+        "scenes": {path.name: str(path.resolve()) for path in training},
+        "words": _words_digest(words),
+        **{name: plain(getattr(config, name)) for name in ("data", "seeds")},
+        "teacher": plain(teacher),
+        "prepare": plain(config.prepare),
+        **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras, "voxel": voxel},
+    }
 
-    def teacher_of(scene: Scene) -> Teacher:
-        # The labels teacher depends on the objects of the scene; any other teacher is built once for all scenes.
-        if isinstance(config.teacher, LabelsConfig):
-            return build_teacher(config.teacher, scene, words)
-        if not shared:
-            shared.append(build_teacher(config.teacher, scene, words))
-        return shared[0]
 
-    def read_views(path: Path) -> tuple[Scene, Teacher]:
+def _prepare_scene(
+    path: Path,
+    names: Sequence[str],
+    datasets: Mapping[str, PreparedDataset],
+    reader: "_SceneReader",
+    config: PrepareConfig,
+    *,
+    optional: bool,
+) -> None:
+    """Prepares a scene for some teachers; with `optional` those are left out for which it lacks something."""
+    scene = reader.with_gaussians(path)
+    for name in names:
         with about(path):
-            scene = load_scene(path, splat=config.splat or None, options=config.data)
-            if scene.views is None:
-                scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)
-            return scene, teacher_of(scene)
+            try:
+                datasets[name].prepare(scene, reader.teacher(name, scene), config, source=path)
+            except MissingInput:
+                if not optional:
+                    raise
 
-    def read_scene(path: Path) -> tuple[Scene, Teacher]:
-        scene, teacher = read_views(path)
+
+def _check_teachers(
+    datasets: Mapping[str, PreparedDataset], training: Sequence[Path], held_out: Sequence[Path]
+) -> None:
+    """Checks that each scene has a teacher and each teacher a scene, and warns of scenes that lack teachers."""
+    every = [path.name for path in [*training, *held_out]]
+    present = {name: {scene.name for scene in dataset.scenes(every)} for name, dataset in datasets.items()}
+    without = [name for name in every if not any(name in scenes for scenes in present.values())]
+    if without:
+        raise InputError(f"teachers: {len(without)} scenes have none of them, such as {without[0]!r}; leave these out")
+    for name, scenes in present.items():
+        lacking = [each for each in every if each not in scenes]
+        if not any(path.name in scenes for path in training):
+            raise InputError(f"teacher {name}: no scene to train on has it; leave it out")
+        if lacking:
+            warnings.warn(
+                f"teacher {name}: {len(lacking)} of {len(every)} scenes lack what it needs ({listed(lacking, 3)}); "
+                "there the other teachers are used alone",
+                SceneWarning,
+                stacklevel=3,
+            )
+
+
+class _SceneReader:
+    """Reads scenes and builds teachers for them."""
+
+    def __init__(self, config: SourceConfig, words: Mapping[str, Words], voxel: float) -> None:
+        """Args:
+        config: settings of reading, seeding and the teachers.
+        words: the words of teachers that have any, by teacher.
+        voxel: see `prepare_scenes`.
+        """
+        self.config, self.words, self.voxel = config, words, voxel
+        self._shared: dict[str, Teacher] = {}
+
+    def teacher(self, name: str, scene: Scene) -> Teacher:
+        """The teacher of a scene. The labels teacher depends on the scene; any other is built once for all."""
+        config = self.config.teachers_by_name[name]
+        if isinstance(config, LabelsConfig):
+            return build_teacher(config, scene, self.words.get(name))
+        if name not in self._shared:
+            self._shared[name] = build_teacher(config, scene, self.words.get(name))
+        return self._shared[name]
+
+    def with_views(self, name: str, path: Path) -> tuple[Scene, Teacher]:
+        """A scene with views, which is enough for maps, and the teacher of this name."""
         with about(path):
-            scene = with_gaussians(scene, config.seeds)
-            return replace(scene, name=path.name, metres_per_unit=unit_of(scene, voxel)), teacher
+            scene = self._load(path)
+            return scene, self.teacher(name, scene)
 
-    return read_views, read_scene
+    def with_gaussians(self, path: Path) -> Scene:
+        """A scene with views and Gaussians, of known unit, named by its path."""
+        with about(path):
+            scene = with_gaussians(self._load(path), self.config.seeds)
+            return replace(scene, name=path.name, metres_per_unit=unit_of(scene, self.voxel))
+
+    def _load(self, path: Path) -> Scene:
+        config = self.config
+        scene = load_scene(path, splat=config.splat or None, options=config.data)
+        if scene.views is None:
+            scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)
+        return scene
 
 
-def _text_table_digest(words: TextTable | None) -> str:
+def _words_digest(words: Words | None) -> str:
     if words is None:
         return ""
-    return hashlib.sha256(repr(words.names).encode() + words.embeddings.tobytes()).hexdigest()[:16]
+    table = closed_table(words)
+    return hashlib.sha256(repr(table.names).encode() + table.embeddings.tobytes()).hexdigest()[:16]

@@ -1,6 +1,6 @@
 """Training of an encoder from scenes on disk (SplatDistill sec. 3.3): preparation, distillation, validation."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -15,26 +15,31 @@ from gsencoder.core.files.json_values import plain
 from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.fusion.teachers.build import text_table_of
+from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpaces
+from gsencoder.text.build import Words, closed_table
+from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable
 from gsencoder.train.adapter_heads import load_heads
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.crops import SamplingConfig
+from gsencoder.train.distill import Heads
 from gsencoder.train.distributed import ProcessRank, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
 from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.samples import SampleDataset, SampleRecipe
-from gsencoder.train.trainer import Trainer, TrainerConfig, ValidationResult
+from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
+from gsencoder.train.trainer import EncoderValidator, Trainer, TrainerConfig, ValidationResult
+from gsencoder.train.training_scene import TrainingScene
 
 SceneValidator = Callable[
-    [Sequence[PreparedScene], GaussianEncoder, OutputSpace, Float32[np.ndarray, "C channels"]], ValidationResult
+    [Sequence[PreparedScene], GaussianEncoder, OutputSpaces, str, Float32[np.ndarray, "C channels"]], ValidationResult
 ]
-"""Scores an encoder on held-out scenes, given these, the encoder, its output space and the target classes' codebook."""
+"""Scores an encoder on held-out scenes, given these, the encoder, its output spaces, a teacher's name, and the codebook
+of its target classes."""
 CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
 """Settings of the trainer that a resumed run may change, since they do not change the result of a step."""
 
@@ -73,15 +78,15 @@ class Training:
 
     Attributes:
         encoder: the trained network.
-        outputs: its output space.
-        words: text table of the teacher; None if it has none.
+        outputs: its output spaces.
+        tables: text tables of the teachers that have one, by name.
         state: steps and seconds of the training.
         scores: scores of the last validation; empty without held-out scenes.
     """
 
     encoder: GaussianEncoder
-    outputs: OutputSpace
-    words: TextTable | None
+    outputs: OutputSpaces
+    tables: Mapping[str, TextTable]
     state: TrainingState
     scores: dict[str, float]
 
@@ -117,16 +122,16 @@ def train(
     """
     folder = Path(work)
     training, validation = [Path(path) for path in scenes], [Path(path) for path in held_out]
-    words = text_table_of(config.teacher)
+    words = words_by_teacher(config.teachers_by_name, config.text)
     with join_processes(device) as (process, chosen_device):
         folder.mkdir(parents=True, exist_ok=True)
         prepared_folder = Path(prepared) if prepared is not None else folder / "prepared"
         voxel = config.model.voxel
-        dataset = prepare_scenes(
+        datasets = prepare_scenes(
             training, validation, words, config, prepared_folder, voxel=voxel, process=process, track=track
         )
         return fit(
-            dataset,
+            datasets,
             [path.name for path in training],
             [path.name for path in validation],
             words,
@@ -140,10 +145,10 @@ def train(
 
 
 def fit(
-    dataset: PreparedDataset,
+    datasets: Mapping[str, PreparedDataset],
     training: Sequence[str],
     held_out: Sequence[str],
-    words: TextTable | None,
+    words: Mapping[str, Words],
     config: TrainConfig,
     *,
     work: Path,
@@ -157,29 +162,41 @@ def fit(
     Raises:
         InputError: see `train`.
     """
-    outputs, _ = dataset.load_space()
-    class_balance = dataset.load_class_balance()
+    outputs = OutputSpaces(by_teacher={name: dataset.load_space()[0] for name, dataset in datasets.items()})
+    weights = config.loss.teacher_weights or (1.0,) * len(datasets)
+    if len(weights) != len(datasets):
+        raise InputError(
+            f"loss.teacher_weights: expected {len(datasets)} numbers, one for each of {', '.join(datasets)}, got "
+            f"{list(weights)}"
+        )
     recipe = SampleRecipe(
         encoder=config.model,
         sampling=config.sampling,
         augmentation=config.augment,
         losses=config.loss,
-        class_balance=class_balance,
+        teachers=tuple(
+            TeacherRecipe(name=name, class_balance=dataset.load_class_balance(), weight=weight)
+            for (name, dataset), weight in zip(datasets.items(), weights, strict=True)
+        ),
         seed=config.train.seed,
         step_samples=config.train.samples_per_step(process.world_size),
     )
-    score_encoder: Callable[[GaussianEncoder], ValidationResult] = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
+    score_encoder: EncoderValidator = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
     if validate is not None and held_out:
-        score_encoder = partial(_validate, validate, dataset.scenes(held_out), outputs, class_balance.codebook)
+        scenes = {name: dataset.scenes(held_out) for name, dataset in datasets.items()}
+        score_encoder = partial(_validate, validate, scenes, outputs, recipe.teachers)
+    scenes_to_train_on = [
+        TrainingScene([dataset.find_scene(name) for dataset in datasets.values()]) for name in training
+    ]
     torch.manual_seed(config.train.seed)
     trainer = Trainer(
         GaussianEncoder(config.model, outputs.channels),
-        SampleDataset(dataset.scenes(training), recipe),
+        SampleDataset(scenes_to_train_on, recipe),
         config.loss,
         config.train,
         folder=work,
-        settings=resume_settings(config, process, dataset),
-        heads=load_heads(find_file(config.heads, "heads"), outputs) if config.heads else (),
+        settings=resume_settings(config, process, datasets),
+        heads=_heads(config, outputs),
         process=process,
         device=device,
         tensorboard=config.tensorboard,
@@ -190,10 +207,28 @@ def fit(
     if trainer.last_validation is None and process.is_first:
         trainer.last_validation = score_encoder(trainer.encoder)
     scores = dict(trainer.last_validation.scores) if trainer.last_validation is not None else {}
-    return Training(encoder=trainer.encoder, outputs=outputs, words=words, state=state, scores=scores)
+    tables = {name: _table_of(each, datasets[name]) for name, each in words.items()}
+    return Training(encoder=trainer.encoder, outputs=outputs, tables=tables, state=state, scores=scores)
 
 
-def resume_settings(config: TrainConfig, process: ProcessRank, dataset: PreparedDataset) -> dict[str, Any]:
+def _table_of(words: Words, dataset: PreparedDataset) -> TextTable:
+    """The names that are known without a tower: those of a table, or of a tower's vocabulary and the dataset."""
+    return closed_table(words.including(dataset.load_kinds()) if isinstance(words, OpenVocabulary) else words)
+
+
+def _heads(config: TrainConfig, outputs: OutputSpaces) -> dict[str, Heads]:
+    """The adapter heads of the file `heads`, for the only teacher."""
+    if not config.heads:
+        return {}
+    if len(outputs) > 1:
+        raise InputError("heads: adapter heads belong to the features of one teacher; expected no others in teachers=")
+    (name,) = outputs
+    return {name: load_heads(find_file(config.heads, "heads"), outputs[name])}
+
+
+def resume_settings(
+    config: TrainConfig, process: ProcessRank, datasets: Mapping[str, PreparedDataset]
+) -> dict[str, Any]:
     """The settings that a run must share with the one that it resumes, as JSON values.
 
     The distribution of a step's micro-batches over processes may change.
@@ -202,19 +237,37 @@ def resume_settings(config: TrainConfig, process: ProcessRank, dataset: Prepared
     for name in CHANGEABLE_ON_RESUME:
         del shared["train"][name]
     heads = digest_files(find_file(config.heads, "heads")) if config.heads else ""
+    spaces = {name: dataset.fingerprint() for name, dataset in datasets.items()}
+    prepared = {name: dataset.settings for name, dataset in datasets.items()}
+    if len(datasets) == 1:
+        # The form of runs of earlier versions, which had one teacher and can be resumed.
+        (space,), (made_with,) = spaces.values(), prepared.values()
+        of_teachers: dict[str, Any] = {"space": space, "prepared": made_with}
+    else:
+        of_teachers = {"spaces": spaces, "prepared": prepared}
     return {
         **shared,
-        **{"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": heads},
+        **of_teachers,
+        "heads": heads,
         "samples_per_step": config.train.samples_per_step(process.world_size),
     }
 
 
 def _validate(
     validate: SceneValidator,
-    scenes: Sequence[PreparedScene],
-    outputs: OutputSpace,
-    codebook: Float32[np.ndarray, "C channels"],
+    scenes: Mapping[str, Sequence[PreparedScene]],
+    outputs: OutputSpaces,
+    teachers: Sequence[TeacherRecipe],
     encoder: GaussianEncoder,
 ) -> ValidationResult:
-    """`validate` with the encoder as the last argument, for `partial`."""
-    return validate(scenes, encoder, outputs, codebook)
+    """`validate` for each teacher; names of scores and pictures begin with the teacher's where there are several."""
+    scores: dict[str, float] = {}
+    pictures: dict[str, np.ndarray] = {}
+    for teacher in teachers:
+        if not scenes[teacher.name]:
+            continue
+        result = validate(scenes[teacher.name], encoder, outputs, teacher.name, teacher.class_balance.codebook)
+        prefix = f"{teacher.name}/" if len(teachers) > 1 else ""
+        scores |= {prefix + name: value for name, value in result.scores.items()}
+        pictures |= {prefix.replace("/", "_") + name: pixels for name, pixels in result.pictures.items()}
+    return ValidationResult(scores, pictures)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Float32, Int32, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
@@ -25,9 +25,26 @@ from gsencoder.train.crops import SamplingConfig, choose_crop, crop_size, drop_r
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.render_rows import RenderRows, empty_rows, join_rows, make_render_rows, restrict_rows
+from gsencoder.train.training_scene import TrainingScene
 
 MAX_OPEN_SCENES = 256
 """Largest number of scenes that a process keeps open; the least recently used is closed first."""
+
+
+class TeacherTargets(NamedTuple):
+    """What one teacher says of the Gaussians and views of a sample or a batch.
+
+    Attributes:
+        targets: targets of the Gaussians, standard units.
+        codes: class of each Gaussian's target, a row of the teacher's codebook; −1 without a target.
+        loss_weights: weight of each Gaussian in the loss; 0 without a target.
+        rows: rows of the render loss.
+    """
+
+    targets: Float[Tensor, "N C"]
+    codes: Int64[Tensor, " N"]
+    loss_weights: Float[Tensor, " N"]
+    rows: RenderRows
 
 
 class Sample(NamedTuple):
@@ -37,10 +54,7 @@ class Sample(NamedTuple):
     attributes: Float[Tensor, "N A"]
     opacities: Float[Tensor, " N"]
     plan: CloudPlan
-    targets: Float[Tensor, "N C"]
-    codes: Int64[Tensor, " N"]
-    loss_weights: Float[Tensor, " N"]
-    rows: RenderRows
+    teachers: tuple[TeacherTargets, ...]
 
 
 class Batch(NamedTuple):
@@ -49,20 +63,14 @@ class Batch(NamedTuple):
     Attributes:
         names: scene and views of each sample, for messages.
         attributes, opacities, plan: inputs of the encoder.
-        targets: targets of the Gaussians, standard units.
-        codes: class of each Gaussian's target, a row of the codebook; −1 without a target.
-        loss_weights: weight of each Gaussian in the loss; 0 without a target.
-        rows: rows of the render loss.
+        teachers: targets of each teacher, in the order of the recipe; without weights in scenes that lack the teacher.
     """
 
     names: tuple[str, ...]
     attributes: Float[Tensor, "N A"]
     opacities: Float[Tensor, " N"]
     plan: Plan
-    targets: Float[Tensor, "N C"]
-    codes: Int64[Tensor, " N"]
-    loss_weights: Float[Tensor, " N"]
-    rows: RenderRows
+    teachers: tuple[TeacherTargets, ...]
 
     def to(self, device: torch.device) -> "Batch":
         """The batch with all its tensors on a device."""
@@ -77,11 +85,37 @@ class Batch(NamedTuple):
             attributes=move(self.attributes),
             opacities=move(self.opacities),
             plan=self.plan.to(device),
-            targets=move(self.targets),
-            codes=move(self.codes),
-            loss_weights=move(self.loss_weights),
-            rows=RenderRows(*map(move, self.rows)),
+            teachers=tuple(
+                TeacherTargets(
+                    targets=move(each.targets),
+                    codes=move(each.codes),
+                    loss_weights=move(each.loss_weights),
+                    rows=RenderRows(*map(move, each.rows)),
+                )
+                for each in self.teachers
+            ),
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TeacherRecipe:
+    """A teacher of a training.
+
+    Attributes:
+        name: for messages and logs.
+        class_balance: classes of its targets in the dataset and their frequencies; the columns of the codebook are the
+            teacher's columns of the encoder's outputs.
+        weight: of its losses.
+    """
+
+    name: str
+    class_balance: ClassBalance
+    weight: float = 1.0
+
+    @property
+    def channels(self) -> int:
+        """Columns of its targets."""
+        return self.class_balance.codebook.shape[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +127,8 @@ class SampleRecipe:
         sampling: selection of views and Gaussians.
         augmentation: random changes; None = none.
         losses: thresholds of the rows of the render loss, and the power of class weights.
-        class_balance: target classes of the dataset and their frequencies.
+        teachers: the teachers, in the order of the encoder's output columns. Centers of crops are drawn by the classes
+            of the first one that a scene has.
         seed: seed of all random numbers.
         step_samples: samples of one step over all processes; their crops have one size, so that no process waits for
             another.
@@ -103,15 +138,19 @@ class SampleRecipe:
     sampling: SamplingConfig
     augmentation: AugmentConfig | None
     losses: LossConfig
-    class_balance: ClassBalance
+    teachers: tuple[TeacherRecipe, ...]
     seed: int
     step_samples: int = 1
+
+
+Codes = tuple[Int32[np.ndarray, " N"] | None, ...]
+"""For each teacher the class of each Gaussian's target, −1 without a target; None in a scene that lacks the teacher."""
 
 
 class SampleDataset(Dataset[Sample]):
     """The samples of a run by number; each epoch goes through the scenes in a new random order."""
 
-    def __init__(self, scenes: Sequence[PreparedScene], recipe: SampleRecipe) -> None:
+    def __init__(self, scenes: Sequence[TrainingScene], recipe: SampleRecipe) -> None:
         """Args:
         scenes: the scenes to train on.
         recipe: settings of the samples.
@@ -122,7 +161,7 @@ class SampleDataset(Dataset[Sample]):
         if not scenes:
             raise InputError("training: no scenes to train on")
         self.scenes, self.recipe = list(scenes), recipe
-        self._codes: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._codes: OrderedDict[int, Codes] = OrderedDict()
 
     def __getitem__(self, number: int) -> Sample | InputError:  # type: ignore[override]
         """Sample `number`, or its error as a value: raised in a data worker it would arrive as a long traceback."""
@@ -147,13 +186,13 @@ class SampleDataset(Dataset[Sample]):
         with about(f"scene {scene.name}"):
             return make_sample(scene, self._target_codes(scene_index), self.recipe, size, rng)
 
-    def _target_codes(self, scene_index: int) -> Int32[np.ndarray, " N"]:
-        """Target classes of a scene's Gaussians, cached together with the open scene.
+    def _target_codes(self, scene_index: int) -> Codes:
+        """Target classes of a scene's Gaussians for each teacher, cached together with the open scene.
 
         The number of open scenes is limited, since each holds a file descriptor.
         """
         if scene_index not in self._codes:
-            self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe.class_balance)
+            self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe.teachers)
         self._codes.move_to_end(scene_index)
         if len(self._codes) > MAX_OPEN_SCENES:
             oldest, _ = self._codes.popitem(last=False)
@@ -190,17 +229,28 @@ class StepSampler(Sampler[list[int]]):
                 yield list(range(start, start + self.batch))
 
 
-def target_codes(scene: PreparedScene, class_balance: ClassBalance) -> Int32[np.ndarray, " N"]:
-    """The class of each Gaussian's target, a row of the codebook; −1 without a target."""
-    codes = np.full(len(scene), -1, np.int32)
-    seen = np.flatnonzero(scene.weights)
-    codes[seen] = nearest_codes(class_balance.codebook, scene.targets(seen))
-    return codes
+def target_codes(scene: TrainingScene, teachers: Sequence[TeacherRecipe]) -> Codes:
+    """The class of each Gaussian's target, a row of each teacher's codebook.
+
+    Raises:
+        InputError: the scene was not prepared for the same Gaussians and views by all teachers.
+    """
+    scene.check_consistent()
+    result: list[np.ndarray | None] = []
+    for part, teacher in zip(scene.parts, teachers, strict=True):
+        if part is None:
+            result.append(None)
+            continue
+        codes = np.full(len(part), -1, np.int32)
+        seen = np.flatnonzero(part.weights)
+        codes[seen] = nearest_codes(teacher.class_balance.codebook, part.targets(seen))
+        result.append(codes)
+    return tuple(result)
 
 
 def make_sample(
-    scene: PreparedScene,
-    codes: Int32[np.ndarray, " N"],
+    scene: TrainingScene,
+    codes: Codes,
     recipe: SampleRecipe,
     size: int,
     rng: np.random.Generator,
@@ -209,7 +259,7 @@ def make_sample(
 
     Args:
         scene: the scene.
-        codes: target classes of its Gaussians (`target_codes`).
+        codes: target classes of its Gaussians for each teacher (`target_codes`).
         recipe: settings of the sample.
         size: largest number of Gaussians; 0 = all that the views see.
         rng: source of all random numbers.
@@ -217,10 +267,9 @@ def make_sample(
     Raises:
         InputError: no view sees any of the scene's Gaussians.
     """
-    # Code −1 indexes the last row of these tables: Gaussians without a target get weight 0. With the power 1 every
-    # class is equally often the center of a crop.
-    center_weights = np.append(recipe.class_balance.class_weights(1.0), np.float32(0))[codes]
-    loss_weights = np.append(recipe.class_balance.class_weights(recipe.losses.rarity), np.float32(0))[codes]
+    # With the power 1 every class is equally often the center of a crop.
+    first, first_codes = next((number, each) for number, each in enumerate(codes) if each is not None)
+    center_weights = _weights_of(first_codes, recipe.teachers[first].class_balance, 1.0)
     views, selected = choose_crop(scene.means, scene.cameras, center_weights, recipe.sampling, size, rng)
     augmentation = recipe.augmentation
     remaining = drop_random(selected, augmentation.drop, rng) if augmentation is not None else selected
@@ -229,20 +278,55 @@ def make_sample(
     if augmentation is not None:
         gaussians = augment(gaussians, rng, augmentation, voxel=voxel, up=scene.up)
     attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
-    losses = recipe.losses
-    rows = [empty_rows(scene.channels)]
-    for view in views if losses.render_weight else ():
-        view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
-        rows.append(make_render_rows(view_rows, recipe.class_balance, losses.rarity))
     return Sample(
         name=f"{scene.name} ({', '.join(scene.view_names[view] for view in views)})",
         attributes=attributes,
         opacities=opacities,
         plan=plan,
+        teachers=tuple(
+            _no_targets(len(remaining), teacher.channels)
+            if part is None or part_codes is None
+            else _targets_of(part, part_codes, teacher, recipe.losses, views, selected, remaining)
+            for part, part_codes, teacher in zip(scene.parts, codes, recipe.teachers, strict=True)
+        ),
+    )
+
+
+def _weights_of(codes: Int32[np.ndarray, " N"], balance: ClassBalance, power: float) -> Float32[np.ndarray, " N"]:
+    """The weight n^−power of each Gaussian's class; 0 without a target, whose code −1 indexes the last row."""
+    return np.append(balance.class_weights(power), np.float32(0))[codes]
+
+
+def _targets_of(
+    scene: PreparedScene,
+    codes: Int32[np.ndarray, " N"],
+    teacher: TeacherRecipe,
+    losses: LossConfig,
+    views: Sequence[int],
+    selected: Int64[np.ndarray, " s"],
+    remaining: Int64[np.ndarray, " n"],
+) -> TeacherTargets:
+    """The targets of one teacher for the remaining Gaussians, and its rows in the views."""
+    balance = teacher.class_balance
+    rows = [empty_rows(scene.channels)]
+    for view in views if losses.render_weight and teacher.weight else ():
+        view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
+        rows.append(make_render_rows(view_rows, balance, losses.rarity))
+    return TeacherTargets(
         targets=torch.from_numpy(scene.targets(remaining)),
         codes=torch.from_numpy(codes[remaining].astype(np.int64)),
-        loss_weights=torch.from_numpy(loss_weights[remaining]),
+        loss_weights=torch.from_numpy(_weights_of(codes, balance, losses.rarity)[remaining]),
         rows=join_rows(rows, [0] * len(rows)),
+    )
+
+
+def _no_targets(gaussians: int, channels: int) -> TeacherTargets:
+    """The targets of a teacher that a scene lacks: nothing that has a weight."""
+    return TeacherTargets(
+        targets=torch.zeros(gaussians, channels),
+        codes=torch.full((gaussians,), -1),
+        loss_weights=torch.zeros(gaussians),
+        rows=empty_rows(channels),
     )
 
 
@@ -265,8 +349,13 @@ def join_samples(results: Sequence[Sample | InputError], patch: int) -> Batch | 
         attributes=torch.cat([sample.attributes for sample in samples]),
         opacities=torch.cat([sample.opacities for sample in samples]),
         plan=join_plans([sample.plan for sample in samples], patch),
-        targets=torch.cat([sample.targets for sample in samples]),
-        codes=torch.cat([sample.codes for sample in samples]),
-        loss_weights=torch.cat([sample.loss_weights for sample in samples]),
-        rows=join_rows([sample.rows for sample in samples], starts),
+        teachers=tuple(
+            TeacherTargets(
+                targets=torch.cat([each.targets for each in of_teacher]),
+                codes=torch.cat([each.codes for each in of_teacher]),
+                loss_weights=torch.cat([each.loss_weights for each in of_teacher]),
+                rows=join_rows([each.rows for each in of_teacher], starts),
+            )
+            for of_teacher in zip(*(sample.teachers for sample in samples), strict=True)
+        ),
     )

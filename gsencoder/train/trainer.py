@@ -4,7 +4,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,10 +26,13 @@ from gsencoder.core.runtime.signals import defer_signals, stop_of
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.distill import Distillation
+from gsencoder.train.distill import Distillation, Heads
 from gsencoder.train.distributed import STOPPED_ELSEWHERE, ProcessRank, fail_together, sum_over_processes
-from gsencoder.train.losses import AdapterHead, LossConfig
+from gsencoder.train.losses import LossConfig
 from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
+
+NO_WEIGHT = 1e-12
+"""Divisor of a term that nothing in a step has a weight for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,7 +108,7 @@ class Trainer:
         *,
         folder: Path,
         settings: Mapping[str, Any],
-        heads: Sequence[tuple[AdapterHead, nn.Module]] = (),
+        heads: Mapping[str, Heads] = {},
         process: ProcessRank = ProcessRank(),
         device: torch.device = torch.device("cpu"),
         tensorboard: bool = False,
@@ -120,7 +123,7 @@ class Trainer:
             config: settings of the loop.
             folder: existing folder for checkpoint and log.
             settings: the settings that a run must share with the one that it resumes, as JSON values.
-            heads: adapter heads of the teacher, each with a decoder from standard units to its input.
+            heads: adapter heads of teachers, by name.
             process: rank of this process.
             device: device of this process.
             tensorboard: whether to write TensorBoard events.
@@ -153,9 +156,7 @@ class Trainer:
         if process.world_size > 1:
             device_ids = [device.index] if device.type == "cuda" else None
             network = self._parallel = nn.parallel.DistributedDataParallel(network, device_ids=device_ids)
-        codebook = torch.from_numpy(dataset.recipe.class_balance.codebook).to(device)
-        heads = [(head.to(device), decode.to(device)) for head, decode in heads]
-        self.distillation = Distillation(network, losses, codebook, heads=heads)
+        self.distillation = Distillation(network, losses, dataset.recipe.teachers, heads=heads, device=device)
         self._autocast = autocast_dtype(config.precision, device)
 
     def run(self, track: Track = untracked) -> TrainingState:
@@ -211,7 +212,9 @@ class Trainer:
         is_last = step == config.steps
         row: dict[str, float] = {}
         if log_due := is_last or step % config.log_every == 0:
-            row = {name: float(np.mean([losses[name] for losses in recent])) for name in recent[-1]}
+            # A term of a teacher that no scene of a step has is not among the losses of that step.
+            names = dict.fromkeys(name for losses in recent for name in losses)
+            row = {name: float(np.mean([losses[name] for losses in recent if name in losses])) for name in names}
         if is_last or (config.validate_every and step % config.validate_every == 0):
             with fail_together():
                 row |= self._run_validation(step)
@@ -277,6 +280,7 @@ class Trainer:
         totals = self._finite_totals(step, batches, torch.stack(micro_losses), norm)
         losses = dict(zip(lambdas, totals, strict=True))
         total = sum(lambdas[name] * loss for name, loss in losses.items())
+        losses = {name: loss for name, loss in losses.items() if divisors[name] > NO_WEIGHT}
         return {"loss": total, **losses, "gradient": norm, "learning_rate": rate}
 
     def _sum_divisors(self, items: list[Batch | InputError]) -> tuple[list[Batch], dict[str, float]]:
@@ -303,7 +307,7 @@ class Trainer:
                 "cell of the teacher passes the thresholds; check loss.min_alpha, loss.min_kept and loss.rarity, and "
                 "these scenes"
             )
-        return batches, {name: max(total, 1e-12) for name, total in zip(lambdas, totals, strict=False)}
+        return batches, {name: max(total, NO_WEIGHT) for name, total in zip(lambdas, totals, strict=False)}
 
     def _seed(self, number: int) -> None:
         """Seeds the network's random numbers by the number of the micro-batch in the run, so that a resumed run repeats

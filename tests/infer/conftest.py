@@ -12,7 +12,7 @@ from gsencoder.app import cli
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.export import lower
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.point_transformer import TransformerConfig
 from gsencoder.models.weights import save_weights
 from gsencoder.text.table import make_text_table, save_text_table
@@ -45,7 +45,8 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     encoder = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), 4)
     outputs = OutputSpace(space=space, mean=mean, scale=2.0, basis=basis)
-    save_weights(folder / "encoder.safetensors", encoder, outputs, {"steps": 3})
+    spaces = OutputSpaces(by_teacher={"labels": outputs})
+    save_weights(folder / "encoder.safetensors", encoder, spaces, {"steps": 3})
     save_text_table(folder / "words.safetensors", table)
     return folder
 

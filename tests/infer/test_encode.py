@@ -14,11 +14,12 @@ from gsencoder.core.errors import InputError
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.point_transformer import TransformerConfig
 from gsencoder.types import FeatureSpace
 
-OUTPUTS = OutputSpace(space=FeatureSpace(name="s", channels=5), mean=np.arange(5, dtype=np.float32), scale=2.0)
+SPACE = OutputSpace(space=FeatureSpace(name="s", channels=5), mean=np.arange(5, dtype=np.float32), scale=2.0)
+OUTPUTS = OutputSpaces(by_teacher={"s": SPACE})
 WHOLE = EncodeConfig(chunk=0, precision="float32")
 
 

@@ -7,7 +7,14 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
+from gsencoder.models.output_space import (
+    OutputSpace,
+    OutputSpaces,
+    output_space_parts,
+    output_spaces_parts,
+    read_output_space,
+    read_output_spaces,
+)
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=6)
@@ -69,3 +76,77 @@ def test_coordinates_of_a_basis_are_always_about_the_mean() -> None:
     )
     with pytest.raises(InputError, match="centered: expected true with a basis"):
         OutputSpace(space=SPACE, mean=basis.mean, scale=1.0, basis=basis, centered=False)
+
+
+def two_spaces() -> OutputSpaces:
+    other = FeatureSpace(name="t", channels=5)
+    components = np.linalg.qr(np.random.default_rng(1).normal(size=(5, 2)))[0].T.astype(np.float32)
+    basis = FeatureBasis(mean=np.arange(5, dtype=np.float32), components=components, energy_kept=0.9, space=other)
+    second = OutputSpace(space=other, mean=basis.mean, scale=3.0, basis=basis)
+    return OutputSpaces(by_teacher={"first": space(), "second": second})
+
+
+def test_several_spaces_lie_side_by_side_and_are_restored_each_by_itself() -> None:
+    spaces = two_spaces()
+    assert spaces.channels == 8
+    assert spaces.columns == {"first": slice(0, 6), "second": slice(6, 8)}
+    values = np.random.default_rng(2).normal(size=(10, 8)).astype(np.float32)
+    restored = spaces.restore(values)
+    for name, columns in spaces.columns.items():
+        np.testing.assert_allclose(restored[:, columns], spaces[name].restore(values[:, columns]), rtol=1e-6)
+        found = spaces.features(restored, name)
+        assert found.space == spaces[name].space
+        np.testing.assert_array_equal(found.features, restored[:, columns])
+
+
+def test_a_space_is_named_by_its_teacher_or_by_itself() -> None:
+    spaces = two_spaces()
+    assert spaces.resolve("second") == spaces.resolve("t") == "second"
+    assert spaces.select("s") is spaces["first"]
+    assert OutputSpaces(by_teacher={"only": space()}).resolve(None) == "only"
+    with pytest.raises(InputError, match=r"gives features of first, second; name one of them"):
+        spaces.resolve(None)
+    with pytest.raises(InputError, match=r"gives features of first, second; got 'third'"):
+        spaces.resolve("third")
+    with pytest.raises(InputError, match="one output space or more"):
+        OutputSpaces(by_teacher={})
+
+
+def test_a_file_restores_several_spaces_in_their_order(tmp_path: Path) -> None:
+    spaces = two_spaces()
+    arrays, header = output_spaces_parts(spaces)
+    write_archive(tmp_path / "spaces.safetensors", arrays, header)
+    with open_archive(tmp_path / "spaces.safetensors") as file:
+        again = read_output_spaces(file)
+    assert list(again) == ["first", "second"]
+    values = np.random.default_rng(3).normal(size=(4, 8)).astype(np.float32)
+    np.testing.assert_array_equal(again.restore(values), spaces.restore(values))
+    assert again["second"].basis is not None
+    assert (again["first"].space, again["second"].space) == (spaces["first"].space, spaces["second"].space)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "message"),
+    [
+        (["no space"], "expected an output space in the header"),
+        ([], "one output space or more"),
+        ([{}], "expected teacher"),
+    ],
+)
+def test_a_header_without_spaces_is_refused(tmp_path: Path, outputs: list[object], message: str) -> None:
+    write_archive(tmp_path / "spaces.safetensors", {}, {"outputs": outputs})
+    with open_archive(tmp_path / "spaces.safetensors") as file, pytest.raises(InputError, match=message):
+        read_output_spaces(file)
+
+
+def test_a_file_of_one_space_is_what_earlier_versions_read(tmp_path: Path) -> None:
+    spaces = OutputSpaces(by_teacher={"palette": space()})
+    arrays, header = output_spaces_parts(spaces)
+    write_archive(tmp_path / "spaces.safetensors", arrays, header)
+    with open_archive(tmp_path / "spaces.safetensors") as file:
+        assert read_output_space(file).space == SPACE
+        assert list(read_output_spaces(file)) == ["palette"]
+    del header["teacher"]
+    write_archive(tmp_path / "old.safetensors", arrays, header)
+    with open_archive(tmp_path / "old.safetensors") as file:
+        assert list(read_output_spaces(file)) == ["s"]

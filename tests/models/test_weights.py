@@ -10,22 +10,22 @@ from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=6, teacher="labels", text_encoder="t")
 
 
-def outputs(basis: bool) -> OutputSpace:
+def outputs(basis: bool) -> OutputSpaces:
     rng = np.random.default_rng(0)
     mean = rng.normal(size=6).astype(np.float32)
     components = np.linalg.qr(rng.normal(size=(6, 6)))[0][:4].astype(np.float32)
     own = FeatureBasis(mean=mean, components=components, energy_kept=0.9, space=SPACE) if basis else None
-    return OutputSpace(space=SPACE, mean=mean, scale=0.7, basis=own)
+    return OutputSpaces(by_teacher={"labels": OutputSpace(space=SPACE, mean=mean, scale=0.7, basis=own)})
 
 
-def encoder(space: OutputSpace) -> GaussianEncoder:
+def encoder(space: OutputSpaces) -> GaussianEncoder:
     torch.manual_seed(1)
     return GaussianEncoder(SMALL, space.channels)
 
@@ -40,10 +40,11 @@ def test_what_is_read_is_what_was_written(basis: bool, dtype: str, tmp_path: Pat
     assert made_by == {"steps": 3}
     assert read.config == SMALL
     assert not read.training
-    assert found.space == SPACE
-    assert found.scale == space.scale
-    np.testing.assert_array_equal(found.mean, space.mean)
-    assert (found.basis is None) == (not basis)
+    assert list(found) == ["labels"]
+    assert found["labels"].space == SPACE
+    assert found["labels"].scale == space["labels"].scale
+    np.testing.assert_array_equal(found["labels"].mean, space["labels"].mean)
+    assert (found["labels"].basis is None) == (not basis)
     tolerance = 0.0 if dtype == "float32" else 1e-3
     for name, value in written.state_dict().items():
         torch.testing.assert_close(read.state_dict()[name], value, rtol=tolerance, atol=tolerance)

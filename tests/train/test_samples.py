@@ -23,6 +23,7 @@ from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene, ViewRows
 from gsencoder.train.render_rows import restrict_rows
 from gsencoder.train.samples import SampleDataset, StepSampler, join_samples, make_sample, target_codes
+from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import Cameras
 
 
@@ -88,8 +89,10 @@ def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[Prepar
     assert source is not None
     assert len(found.attributes) == len(source)
     everything = np.arange(len(source))
-    np.testing.assert_array_equal(found.targets.numpy(), source.targets(everything))
-    assert ((found.loss_weights > 0).numpy() == (source.weights > 0)).all()
+    (targets,), (part,) = found.teachers, source.parts
+    assert part is not None
+    np.testing.assert_array_equal(targets.targets.numpy(), part.targets(everything))
+    assert ((targets.loss_weights > 0).numpy() == (part.weights > 0)).all()
 
 
 def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tuple[PreparedDataset, list[str]]) -> None:
@@ -102,12 +105,13 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     view = scene.view_names.index(found.name.split("(")[1].rstrip(")"))
     config = BlendConfig(rays_per_patch=16)  # One a pixel.
     b = blend(scene.gaussians(np.arange(len(scene))), scene.cameras, view, patch=4, config=config)
-    ours = found.rows.blend(len(scene))
+    (targets,) = found.teachers
+    ours = targets.rows.blend(len(scene))
     opaque = b.alpha >= 0.5
     assert ours.rows == int(opaque.sum())
     torch.testing.assert_close(ours.alpha, b.alpha[opaque], rtol=2e-3, atol=2e-3)
-    rendered = ours.render(found.targets) / ours.alpha[:, None]
-    assert torch.cosine_similarity(rendered, found.rows.targets, dim=1).mean() > 0.9
+    rendered = ours.render(targets.targets) / ours.alpha[:, None]
+    assert torch.cosine_similarity(rendered, targets.rows.targets, dim=1).mean() > 0.9
 
 
 @pytest.mark.parametrize("most", [1, 2])
@@ -118,7 +122,7 @@ def test_of_many_scenes_the_latest_used_are_kept_open(
     data, used = samples(*dataset), list[str]()
     for number in range(9):
         used.append(data.make(number).name.split(" ")[0])
-        opened = {scene.name for scene in data.scenes if "_arrays" in vars(scene)}
+        opened = {scene.name for scene in data.scenes for part in scene.parts if "_arrays" in vars(part)}
         assert opened == set(list(dict.fromkeys(reversed(used)))[:most])
 
 
@@ -146,8 +150,9 @@ def test_the_grid_has_the_encoders_voxel_in_metres(
     assert SMALL.voxel == 0.1
     recipe = samples(*dataset, augmentation=None).recipe
     scene = dataset[0].scenes(dataset[1])[0]
-    found = SampleDataset([in_units(scene, metres)], recipe)[0]
-    expected = SampleDataset([in_units(scene, 1.0)], replace(recipe, encoder=replace(SMALL, voxel=voxel)))[0]
+    found = SampleDataset([TrainingScene([in_units(scene, metres)])], recipe)[0]
+    alike = [TrainingScene([in_units(scene, 1.0)])]
+    expected = SampleDataset(alike, replace(recipe, encoder=replace(SMALL, voxel=voxel)))[0]
     assert same(found, expected)
 
 
@@ -159,11 +164,12 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
     rewrite(path, {**arrays, "weights": np.where(np.arange(len(arrays["means"])) % 5 == 0, 0, arrays["weights"])})
     scene = PreparedScene(path)
     recipe = samples(*dataset, augmentation=None, sampling=SamplingConfig(scope="scene", gaussians=0)).recipe
-    balance, power = recipe.class_balance, recipe.losses.rarity
+    balance, power = recipe.teachers[0].class_balance, recipe.losses.rarity
     squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - balance.codebook).sum(axis=2)
     expected = np.where(scene.weights > 0, squares.argmin(axis=1), -1)
-    np.testing.assert_array_equal(target_codes(scene, balance), expected)
-    found = SampleDataset([scene], recipe)[0]
+    (codes,) = target_codes(TrainingScene([scene]), recipe.teachers)
+    np.testing.assert_array_equal(codes, expected)
+    (found,) = SampleDataset([TrainingScene([scene])], recipe)[0].teachers
     np.testing.assert_array_equal(found.codes.numpy(), expected)
     np.testing.assert_array_equal(
         found.loss_weights.numpy(), np.where(expected < 0, 0, balance.class_weights(power)[expected])
@@ -180,11 +186,13 @@ def test_all_kinds_are_equally_often_the_center_of_a_sample(
         return choose_crop(means, cameras, center_weights, *rest)
 
     monkeypatch.setattr("gsencoder.train.samples.choose_crop", record)
-    counts = recipe.class_balance.counts
+    counts = recipe.teachers[0].class_balance.counts
     sums = np.zeros(len(counts))
-    for scene in dataset[0].scenes(dataset[1]):
-        codes = target_codes(scene, recipe.class_balance)
-        make_sample(scene, codes, recipe, 200, np.random.default_rng(0))
+    for part in dataset[0].scenes(dataset[1]):
+        scene = TrainingScene([part])
+        (codes,) = target_codes(scene, recipe.teachers)
+        assert codes is not None
+        make_sample(scene, (codes,), recipe, 200, np.random.default_rng(0))
         assert (drawn[-1][codes < 0] == 0).all()
         np.add.at(sums, codes[codes >= 0], drawn[-1][codes >= 0])
     occurring = counts > 0
@@ -239,10 +247,10 @@ def test_samples_side_by_side_are_the_samples_alone(dataset: tuple[PreparedDatas
     parts = [data[0], data[1]]
     batch = join_samples(parts, SMALL.transformer.patch)
     n = len(parts[0].attributes)
-    b = batch.rows.blend(len(batch.attributes))
+    b = batch.teachers[0].rows.blend(len(batch.attributes))
     field = torch.randn(len(batch.attributes), 3)
     expected = [
-        part.rows.blend(len(part.attributes)).render(values)
+        part.teachers[0].rows.blend(len(part.attributes)).render(values)
         for part, values in zip(parts, (field[:n], field[n:]), strict=True)
     ]
     torch.testing.assert_close(b.render(field), torch.cat(expected))
@@ -259,7 +267,7 @@ def test_a_dense_teacher_has_clusters_in_the_place_of_names(tmp_path: Path) -> N
     balance = dataset.load_class_balance()
     assert dataset.load_space()[1] is None
     assert balance.counts.sum() == sum(int((scene.weights > 0).sum()) for scene in dataset.scenes(names))
-    assert np.isfinite(samples(dataset, names)[0].targets.numpy()).all()
+    assert np.isfinite(samples(dataset, names)[0].teachers[0].targets.numpy()).all()
 
 
 def test_no_scenes_are_refused(dataset: tuple[PreparedDataset, list[str]]) -> None:

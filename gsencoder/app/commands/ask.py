@@ -16,13 +16,13 @@ from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question
 from gsencoder.infer.ask.batch import ANSWER, ANSWERS, PROMPT, REQUEST, ask_question, ask_questions, write_answers
 from gsencoder.infer.ask.prompts import Task, check_question
 from gsencoder.infer.ask.questions import BatchQuestion, read_questions
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize.localize import LocalizeConfig, select_features
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.text.build import TableTextConfig, TextConfig
 
@@ -92,7 +92,9 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         scene = shown_scene(folder, config.photos, config.data)
         # A box can be asked about without words.
         stated = config.words or not isinstance(config.text, TableTextConfig)
-        words = load_words(folder, config.words, config.text) if stated or (folder / WORDS_FILE).is_file() else None
+        space = select_features(scene, config.space or None)[1].space
+        has_words = bool(stated) or table_path(folder, space.text_encoder) is not None
+        words = load_words(folder, space, config.words, config.text) if has_words else None
     asker = Asker(
         scene,
         words,

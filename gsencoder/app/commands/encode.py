@@ -16,10 +16,10 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
-from gsencoder.fusion.store.folder import WORDS_FILE, save_features
+from gsencoder.fusion.store.folder import FEATURES_FILE, file_of_teacher, save_features
+from gsencoder.fusion.store.words import save_tables
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder, load_encoder
-from gsencoder.text.table import save_text_table
 from gsencoder.types import GaussianFeatures, Scene
 
 
@@ -34,6 +34,10 @@ class EncodeCommandConfig(CommonConfig):
     weights: str = field(
         default="house_cpu",
         metadata={"help": "folder or file written by `train` or `export`, or the name of shipped weights"},
+    )
+    spaces: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "teachers whose features are written, of an encoder with several; empty = all of them"},
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
     basis_views: int = field(
@@ -74,11 +78,11 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
             scene = with_reported_up(scene, one, quiet=config.quiet)
             with about(scene.name):
                 _encode_into(folder, scene, encoder, config, one)
-            if encoder.words is not None:
-                save_text_table(folder / WORDS_FILE, encoder.words)
         screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
         where = "this scene" if config.basis_views else "the scenes held out of the training"
-        screen.print(f"{out}: basis of the encoder: {describe_basis(one.results['basis'], where)}")
+        for name, figures in one.results.get("teachers", {"": one.results}).items():
+            of = f" for {name}" if name else ""
+            screen.print(f"{out}: basis of the encoder{of}: {describe_basis(figures['basis'], where)}")
 
     run_scenes(
         paths,
@@ -102,31 +106,63 @@ def _encode_into(
     assert scene.gaussians is not None
     unit = unit_of(scene, encoder.voxel)
     with summary.step("encode"):
-        features = encoder.encode(
+        by_teacher = encoder.encode_spaces(
             scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
         )
-    basis = basis_figures(features.basis, features.features.shape[1])
-    if config.basis_views:
-        with summary.step("basis"):
-            basis |= _figures_of_scene(scene, features, encoder, config.basis_views)
-    else:
-        basis |= {name: value for name, value in encoder.made_by.get("basis", {}).items() if name.startswith("other_")}
+    by_teacher = _requested(by_teacher, config.spaces)
+    single = len(by_teacher) == 1
+    figures = {}
+    for name, features in by_teacher.items():
+        file = file_of_teacher(FEATURES_FILE, None if single else name)
+        figures[name] = {
+            "channels": features.space.channels,
+            "rank": features.features.shape[1],
+            "basis": _basis_figures(scene, name, features, encoder, config, summary),
+            "space": features.space.describe(),
+            "features": file,
+        }
     with summary.step("write"):
-        save_features(folder, scene, features, {"encode": settings(config.encode), "weights": config.weights})
+        save_features(folder, scene, by_teacher, {"encode": settings(config.encode), "weights": config.weights})
+        save_tables(folder, {name: encoder.tables[name] for name in by_teacher if name in encoder.tables}, by_teacher)
+    first = next(iter(by_teacher.values()))
     summary.results.update(
-        gaussians=len(features),
-        seen=int(features.seen.sum()),
+        gaussians=len(first),
+        seen=int(first.seen.sum()),
         views=len(scene.views) if scene.views is not None else 0,
-        channels=features.space.channels,
-        rank=features.features.shape[1],
-        basis=basis,
         metres_per_unit=unit,
-        space=features.space.describe(),
-        features="features.safetensors",
+        **(next(iter(figures.values())) if single else {"teachers": figures}),
     )
 
 
-def _figures_of_scene(scene: Scene, features: GaussianFeatures, encoder: Encoder, count: int) -> dict[str, float]:
+def _requested(by_teacher: dict[str, GaussianFeatures], names: tuple[str, ...]) -> dict[str, GaussianFeatures]:
+    """The features of the teachers that are named, or of all.
+
+    Raises:
+        InputError: the encoder has no such teacher.
+    """
+    known = {features.space.name: name for name, features in by_teacher.items()} | {name: name for name in by_teacher}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(f"spaces: the encoder gives features of {', '.join(by_teacher)}; got {unknown[0]!r}")
+    return {known[name]: by_teacher[known[name]] for name in names} if names else by_teacher
+
+
+def _basis_figures(
+    scene: Scene, name: str, features: GaussianFeatures, encoder: Encoder, config: EncodeCommandConfig, summary: Summary
+) -> dict[str, int | float]:
+    """The figures of a basis, of this scene with `basis_views`, else of the scenes held out of the training."""
+    figures = basis_figures(features.basis, features.features.shape[1])
+    if config.basis_views:
+        with summary.step("basis"):
+            return figures | _figures_of_scene(scene, name, features, encoder, config.basis_views)
+    stored = encoder.made_by.get("basis", {})
+    stored = stored.get(name, stored)
+    return figures | {key: value for key, value in stored.items() if key.startswith("other_")}
+
+
+def _figures_of_scene(
+    scene: Scene, name: str, features: GaussianFeatures, encoder: Encoder, count: int
+) -> dict[str, float]:
     """How well the encoder's basis represents its teacher's maps of some of a scene's views.
 
     Raises:
@@ -141,7 +177,8 @@ def _figures_of_scene(scene: Scene, features: GaussianFeatures, encoder: Encoder
         raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
     if scene.views is None:
         raise InputError("basis_views: the scene has no views in which the teacher could be run; leave it out")
-    stored = encoder.made_by.get("settings", {}).get("teacher")
+    made_with = encoder.made_by.get("settings", {})
+    stored = (made_with.get("teachers") or {}).get(name) or made_with.get("teacher")
     if stored is None:
         raise InputError("basis_views: the weights do not say which teacher they were made with; leave it out")
     config = typed(SourceConfig, {"teacher": stored}).teacher

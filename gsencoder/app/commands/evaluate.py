@@ -32,7 +32,7 @@ from gsencoder.evaluate.protocols.localization import (
     scores_by_name,
 )
 from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming, naming_scores
-from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, load_scenes
+from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, load_scenes, space_of_words
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers.build import TeacherConfig, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -76,6 +76,10 @@ class EvaluateConfig(CommonConfig):
             "help": "encoder whose features are evaluated (see encode); empty = the fused features of the teacher"
         },
     )
+    space: str = field(
+        default="",
+        metadata={"help": "of an encoder with several teachers, the one that is evaluated; empty = that of the words"},
+    )
     protocol: LocalizationProtocol | NamingProtocol | AbsentProtocol = field(default_factory=LocalizationProtocol)
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -96,7 +100,8 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
         )
     if config.weights:
         retain_freed_memory()
-        source = encoder_source(load_encoder(config.weights, config.encode.device), config.encode)
+        encoder = load_encoder(config.weights, config.encode.device)
+        source = encoder_source(encoder, config.encode, config.space or space_of_words(encoder, words))
     else:
         source = fusion_source(config.teacher, words, config.fusion)
     out = config.out or Path("outputs") / "evaluate" / config.protocol.name

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from gsencoder.app.runs.output_folder import refuse_existing
 from gsencoder.app.runs.progress import Progress, console
@@ -130,16 +131,27 @@ def run(config: ExportConfig, summary: Summary) -> None:
         parity=parity,
         cosines=cosines,
         gaussians=sizes,
-        channels=encoder.outputs.space.channels,
-        rank=encoder.outputs.channels,
-        words=0 if encoder.words is None else len(encoder.words),
-        space=encoder.outputs.space.describe(),
+        **space_figures(encoder),
     )
     write_json(f"{config.out}.summary.json", summary.to_dict())
     screen.print(
         f"{config.out}: {len(model) / 1e6:.1f} MB; {agreement} on {len(compared)} clouds of {min(compared):,} to "
         f"{max(compared):,} Gaussians"
     )
+
+
+def space_figures(encoder: TorchEncoder) -> dict[str, Any]:
+    """Channels, rank, words and space of an encoder; of each teacher by its name where there are several."""
+    figures = {
+        name: {
+            "channels": outputs.space.channels,
+            "rank": outputs.channels,
+            "words": len(encoder.tables.get(name, ())),
+            "space": outputs.space.describe(),
+        }
+        for name, outputs in encoder.outputs.by_teacher.items()
+    }
+    return next(iter(figures.values())) if len(figures) == 1 else {"teachers": figures}
 
 
 def _scenes(config: ExportConfig, voxel: float) -> list[Cloud]:

@@ -24,9 +24,10 @@ from gsencoder.fusion.store.folder import WORDS_FILE, save_features
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.models.output_space import OutputSpaces
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import TextTable, save_text_table
-from gsencoder.types import FeatureBasis, Scene
+from gsencoder.types import FeatureBasis, FeatureSpace, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +69,7 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     paths = find_scenes(config.paths)
     with summary.step("teacher"):
         words = words_of(config.teacher, config.text)
-    basis = basis_of(config.basis) if config.basis else None
+    outputs = load_weights_spaces(config.basis) if config.basis else None
     screen = console(config.quiet)
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
@@ -76,6 +77,7 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             scene = load_fusable(path, config, one)
             with one.step("teacher"):
                 teacher = build_teacher(config.teacher, scene, words)
+            basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             fusion = fuse_scene(scene, teacher, config, one, out, basis=basis)
             write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
@@ -98,15 +100,27 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     )
 
 
-def basis_of(weights: str) -> FeatureBasis:
-    """The basis of an encoder's weights.
-
-    Raises:
-        InputError: no such weights, or they have none.
-    """
+def load_weights_spaces(weights: str) -> OutputSpaces:
+    """The output spaces of an encoder's weights; torch is imported only for them."""
     from gsencoder.models.weights import load_weights
 
-    basis = load_weights(weights)[1].basis
+    return load_weights(weights)[1]
+
+
+def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> FeatureBasis:
+    """The basis in which an encoder gives features of a space.
+
+    Raises:
+        InputError: it gives none of them, or all their channels.
+    """
+    fitting = [each for each in outputs.by_teacher.values() if each.space == space]
+    if not fitting:
+        theirs = "; ".join(each.space.describe() for each in outputs.by_teacher.values())
+        raise InputError(
+            f"basis: the encoder of {weights} gives features of ({theirs}), and the teacher's are of "
+            f"({space.describe()}); give weights that were trained with this teacher"
+        )
+    basis = fitting[0].basis
     if basis is None:
         raise InputError(f"basis: the encoder of {weights} gives all channels; leave basis= out, or give other weights")
     return basis

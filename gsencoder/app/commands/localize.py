@@ -18,7 +18,7 @@ from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
+from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.types import Localization
 
@@ -56,7 +56,8 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         scene = load_features(folder)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
         scene, _ = with_up(scene)
-        table = load_words(folder, config.words, config.text)
+        space = select_features(scene, config.space or None)[1].space
+        table = load_words(folder, space, config.words, config.text)
     with summary.step("localize"):
         localization = localize(scene, words, table, config.localize, space=config.space or None)
     out = config.out or Path("outputs") / scene.name / "boxes"

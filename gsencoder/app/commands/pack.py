@@ -11,6 +11,8 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, Form, save_arrays, save_package, save_ply
+from gsencoder.fusion.store.words import table_path
+from gsencoder.infer.localize.localize import select_features
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -23,6 +25,7 @@ class PackConfig(CommonConfig):
         default=(),
         metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
     )
+    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
     form: Form = field(
         default="compact",
         metadata={
@@ -59,16 +62,16 @@ def run(config: PackConfig, summary: Summary) -> None:
     source = Path(config.paths[0])
     with summary.step("load"):
         scene = load_features(source)
-    features = next(iter(scene.features.values()))
+        _, features = select_features(scene, config.space or None)
     out = config.out or Path("outputs") / scene.name / "package"
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         with summary.step("pack"):
             message = _write(folder, scene, features, config, summary)
-        if (source / WORDS_FILE).is_file():
-            if config.form == "compact":
-                save_text_table(folder / WORDS_FILE, load_text_table(source / WORDS_FILE), dtype="float16")
-            else:
-                copyfile(source / WORDS_FILE, folder / WORDS_FILE)
+        words = table_path(source, features.space.text_encoder)
+        if words is not None and config.form == "compact":
+            save_text_table(folder / WORDS_FILE, load_text_table(words), dtype="float16")
+        elif words is not None:
+            copyfile(words, folder / WORDS_FILE)
     console(config.quiet).print(f"{out}: {message}")
 
 

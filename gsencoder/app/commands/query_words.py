@@ -5,8 +5,10 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.fusion.store.words import table_path
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, vocabulary_of, words_of_table
 from gsencoder.text.table import load_text_table
+from gsencoder.types import FeatureSpace
 
 MAX_QUERIES_BYTES = 1 << 20
 """Largest size of a file of queries, bytes."""
@@ -41,11 +43,12 @@ def _lines_of(file: Path) -> list[str]:
         raise InputError(f"queries: {file} cannot be read as text: {error}") from error
 
 
-def load_words(folder: Path, given: str, text: TextConfig = TableTextConfig()) -> Words:
+def load_words(folder: Path, space: FeatureSpace, given: str, text: TextConfig = TableTextConfig()) -> Words:
     """The text table that was given, or the one in the folder of the features, with the tower that made it.
 
     Args:
         folder: of the features.
+        space: of the features that are asked; folders with several may hold words for each.
         given: a file of words; empty = the one in the folder.
         text: a tower that is given; otherwise it is searched for when a phrase needs it.
 
@@ -54,10 +57,10 @@ def load_words(folder: Path, given: str, text: TextConfig = TableTextConfig()) -
     """
     if given:
         return words_of_table(load_text_table(given), text)
-    path = folder / WORDS_FILE
-    if not path.is_file() and not isinstance(text, TableTextConfig):
+    path = table_path(folder, space.text_encoder)
+    if path is None and not isinstance(text, TableTextConfig):
         return vocabulary_of(text)
-    if not path.is_file():
+    if path is None:
         raise InputError(
             f"{folder}: there is no {WORDS_FILE} beside these features: no words lead into them, or the file was lost; "
             "fuse with a teacher that has words, or give words= or text="

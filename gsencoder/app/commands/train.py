@@ -23,12 +23,11 @@ from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit
-from gsencoder.fusion.store.folder import WORDS_FILE
-from gsencoder.fusion.teachers.build import text_table_of
+from gsencoder.fusion.store.words import save_tables
+from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
-from gsencoder.text.table import save_text_table
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
 from gsencoder.train.prepared_scene import PreparedScene
@@ -69,7 +68,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
         if lies_in(prepared, taken):
             raise InputError(f"prepared={prepared}: is in the folder of {name}, {taken}; give another folder")
     training, held_out = split_scenes(find_scenes(config.paths), config.holdout)
-    words = text_table_of(config.teacher)
+    words = words_by_teacher(config.teachers_by_name, config.text)
     with WorkFolder(work) as state, join_processes(config.device) as (process, device), ExitStack() as results:
         track = Progress(quiet=config.quiet or not process.is_first)
         folder = None
@@ -78,12 +77,12 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 # Opened now, so that an out= that cannot be written is an error before hours of work.
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
         with summary.step("prepare"):
-            dataset = prepare_scenes(
+            datasets = prepare_scenes(
                 training, held_out, words, config, prepared, voxel=config.model.voxel, process=process, track=track
             )
         if config.prepare_only:
             counts = f"{len(training)} scenes to train on, {len(held_out)} for validation"
-            console(config.quiet or not process.is_first).print(f"{dataset.folder}: {counts}")
+            console(config.quiet or not process.is_first).print(f"{prepared}: {counts}")
             return
         with fail_together():
             if process.is_first:
@@ -92,7 +91,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
         encoding = EncodeConfig(precision=config.train.precision, device=config.device)
         with summary.step("train"):
             done = fit(
-                dataset,
+                datasets,
                 names(training),
                 names(held_out),
                 words,
@@ -105,13 +104,18 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
             )
         if folder is None:
             return
-        figures = encoder_basis_figures(done.outputs, dataset.scenes(names(held_out)))
+        figures = {
+            name: encoder_basis_figures(done.outputs[name], dataset.scenes(names(held_out)))
+            for name, dataset in datasets.items()
+        }
         write_results(folder, state.path, done, figures, config, summary)
     scores = ", ".join(f"{name} {value:.3f}" for name, value in done.scores.items()) or "not validated"
     minutes = done.state.seconds / 60
     screen = console(config.quiet)
     screen.print(f"{out}: {done.state.step} steps in {minutes:.1f} minutes; {scores}")
-    screen.print(f"{out}: basis: {describe_basis(figures, 'held-out scenes')}")
+    for name, of_teacher in figures.items():
+        of = f" for {name}" if len(figures) > 1 else ""
+        screen.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
 
 
 def names(paths: Sequence[Path]) -> list[str]:
@@ -131,17 +135,17 @@ def write_results(
     folder: Path,
     work: Path,
     done: Training,
-    figures: dict[str, int | float],
+    figures: dict[str, dict[str, int | float]],
     config: TrainCommandConfig,
     summary: Summary,
 ) -> None:
-    """Writes weights, words, log and pictures; scores and the figures of the basis go into weights and summary."""
+    """Writes weights, words, log and pictures; scores and the figures of each teacher's basis go into weights and
+    summary."""
     steps, seconds = done.state.step, done.state.seconds
     made_by = {"settings": settings(config), "steps": steps, "seconds": seconds, "validation": done.scores}
-    made_by["basis"] = figures
+    made_by["basis"] = figures if len(figures) > 1 else next(iter(figures.values()))
     save_weights(folder / WEIGHTS_FILE, done.encoder, done.outputs, made_by, dtype=config.store)
-    if done.words is not None:
-        save_text_table(folder / WORDS_FILE, done.words, dtype=config.store)
+    save_tables(folder, done.tables, done.outputs, dtype=config.store)
     shutil.copy(work / LOG_FILE, folder / LOG_FILE)
     for name in (EVENTS_FOLDER, "validation"):
         if (work / name).is_dir():
@@ -151,7 +155,7 @@ def write_results(
         seconds=seconds,
         parameters=sum(value.numel() for value in done.encoder.parameters()),
         validation=done.scores,
-        basis=figures,
+        basis=made_by["basis"],
         weights=WEIGHTS_FILE,
         log=LOG_FILE,
     )

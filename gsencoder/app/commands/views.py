@@ -81,9 +81,9 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     if config.query or config.queries or config.choose.method == "greedy":
         with summary.step("localize"):
             words = query_words(config.query, config.queries)
-            localization = localize(
-                scene, words, load_words(folder, config.words, config.text), config.localize, space=config.space or None
-            )
+            space = select_features(scene, config.space or None)[1].space
+            table = load_words(folder, space, config.words, config.text)
+            localization = localize(scene, words, table, config.localize, space=config.space or None)
             assert scene.gaussians is not None
             targets = targets_of(scene.gaussians, localization, config.boxes)
         absent = {word: describe_absent(value) for word, value in localization.absent.items()}

@@ -107,10 +107,18 @@ def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
     return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=chosen)
 
 
+def _option_of_several(key: str, choices: Choices) -> Option | None:
+    """The option that `teachers.NAME.OPTION` stands for, which is that of the choice `teacher`; None for other keys."""
+    field, _, rest = key.partition(".")
+    name, _, last = rest.partition(".")
+    several = choices.options[field].several if field in choices.options else ""
+    return choices.options.get(f"{several}.{last}") if several and name and last else None
+
+
 def _full_key(key: str, choices: Choices) -> str | None:
     """The option or choice that `key` stands for, or None."""
     known = [*choices.options, *choices.groups]
-    if key in known:
+    if key in known or _option_of_several(key, choices) is not None:
         return key
     ends = [name for name in known if re.split(r"[./]", name)[-1] == key]
     if len(ends) > 1:
@@ -142,6 +150,9 @@ def read_words(
             paths.append(word)
             continue
         full = key if sweep and HYDRA_KEY.match(key) else _full_key(key, choices)
+        if full in choices.groups and re.fullmatch(r"\[.*\]", value):
+            # Several members of a choice, where the command takes several, are an option of their own.
+            full = next((name for name, option in choices.options.items() if option.several == full), full)
         if full is None and os.path.lexists(word):
             paths.append(word)
         elif full is None and (removed := removed_option(key, choices.options)) is not None:
@@ -189,7 +200,10 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
     parser = OverridesParser.create()
     hydra_overrides = []
     for key, value in given.items():
-        option = choices.options.get(key)
+        option = choices.options.get(key) or _option_of_several(key, choices)
+        if option is not None and option.several:
+            hydra_overrides += _members_of(key, value, option.several, choices.groups[option.several])
+            continue
         written = value
         if key in choices.groups:
             names = choices.groups[key]
@@ -221,6 +235,25 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
     return hydra_overrides
 
 
+def _members_of(key: str, value: str, group: str, members: Sequence[str]) -> list[str]:
+    """Overrides that add several members of a choice, each below a name of its own.
+
+    Raises:
+        InputError: an unknown member, or a name that is given twice.
+    """
+    words = [word.strip() for word in value.removeprefix("[").removesuffix("]").split(",") if word.strip()]
+    pairs = [(word.partition(":")[0], word.partition(":")[2] or word) for word in words]
+    names = [name for name, _ in pairs]
+    for name, member in pairs:
+        if member not in members:
+            raise InputError(f"{key}: expected some of {', '.join(members)}, got {member!r}{near(member, members)}")
+        if names.count(name) > 1:
+            raise InputError(f"{key}: {name} is given twice; give other names, such as {name}_2:{member}")
+        if not re.fullmatch(r"\w+", name):
+            raise InputError(f"{key}: expected names of letters, digits and _, got {name!r}")
+    return [f"+{group}@{key}.{name}={member}" for name, member in pairs]
+
+
 def _is_list(option: Option) -> bool:
     return getattr(option.annotation, "__origin__", None) is tuple
 
@@ -239,6 +272,9 @@ def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) ->
         key = match[1]
         if HYDRA_KEY.match(key):
             return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
+        if key not in choices.options:
+            section, _, name = key.rpartition(".")[0].partition(".")
+            return f"{key}: there is no {name} among the {section} of this run; {section}= names them"
         section = key.rpartition(".")[0]
         group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
         now = given.get(group, choices.chosen.get(group))

@@ -6,18 +6,20 @@ it), `metavar` (the word that stands for the value in the help) and `secret=True
 written). A field whose type is a dataclass is a section, and its options are written `section.name=value`. A field
 whose type is a union of dataclasses is a choice, written `section=member`: every member has a field
 `name: Literal["…"]`. `preset="NAME"` in the metadata of a section makes it a choice too, between its default, which has
-that name, and the presets in `conf/SECTION/*.yaml`.
+that name, and the presets in `conf/SECTION/*.yaml`. A mapping from names to such a union, with `several="SECTION"`,
+takes several members of that choice: `sections=member,NAME:member`, whose options are `sections.NAME.option=value`.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_origin
+from typing import Any, ClassVar, TypeVar, get_args, get_origin
 
 from gsencoder.app.settings.options import (
     allows_none,
     field_types,
     kind_of,
+    mapped_classes,
     member_name,
     near,
     options_by_key,
@@ -73,6 +75,10 @@ def _prepare(value: Any, annotation: Any) -> Any:
 
 
 def _section(annotation: Any, value: Any, key: str) -> Any:
+    if mapped_classes(annotation):
+        if not isinstance(value, Mapping):
+            raise InputError(f"{key}: expected settings by name ({key}.NAME.OPTION=…), got {value!r}")
+        return {str(name): _section(get_args(annotation)[1], each, f"{key}.{name}") for name, each in value.items()}
     classes = section_classes(annotation)
     if not classes or (value is None and allows_none(annotation)):
         return value

@@ -3,7 +3,7 @@
 import difflib
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
@@ -27,6 +27,7 @@ class Option:
         member: the member of a choice that it belongs to, such as "teacher=onnx"; empty if it always applies.
         kind: "text" and "list" (of text) are taken literally; "value" is parsed.
         secret: its value is never shown or written.
+        several: the choice of which it takes several members, by name; empty for other options.
     """
 
     key: str
@@ -38,6 +39,7 @@ class Option:
     member: str
     kind: Kind
     secret: bool = False
+    several: str = ""
 
 
 MAX_WORD = 200
@@ -86,6 +88,8 @@ def kind_of(annotation: Any) -> Kind:
     members = union_members(annotation)
     if all(_is_text(member) for member in members):
         return "text"
+    if get_origin(annotation) is Mapping:
+        return "list"
     if len(members) == 1 and get_origin(members[0]) is tuple:
         items = get_args(members[0])
         if len(items) == 2 and items[1] is Ellipsis:
@@ -110,6 +114,8 @@ def describe(annotation: Any) -> str:
             words.append(f"{'one of ' if len(items) > 1 else ''}{', '.join(map(str, items))}")
         elif get_origin(member) is tuple and len(items) == 2 and items[1] is Ellipsis:
             words.append(f"a list, each {describe(items[0])}")
+        elif get_origin(member) is Mapping:
+            words.append("a list of names")
         elif get_origin(member) is tuple:
             words.append(f"a list of {len(items)} ({', '.join(describe(item) for item in items)})")
         else:
@@ -167,6 +173,11 @@ def section_classes(annotation: Any) -> tuple[type, ...]:
     return tuple(member for member in union_members(annotation) if is_dataclass(member) and isinstance(member, type))
 
 
+def mapped_classes(annotation: Any) -> tuple[type, ...]:
+    """The dataclasses of the values of a mapping by name; empty for other options."""
+    return section_classes(get_args(annotation)[1]) if get_origin(annotation) is Mapping else ()
+
+
 def member_name(member: type) -> str:
     """The name of a member of a choice: the literal of its field `name`."""
     return str(get_args(field_types(member)["name"])[0])
@@ -201,6 +212,7 @@ def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
                     member=member,
                     kind=kind_of(annotation),
                     secret=item.metadata.get("secret", False),
+                    several=item.metadata.get("several", ""),
                 )
             )
     return options

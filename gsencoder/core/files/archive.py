@@ -159,8 +159,27 @@ class Archive:
         if self.value("sum", str) != _sum_of_version_1(arrays, header):
             raise InputError(f"{self.path}: {DAMAGED}: it does not have the checksum that was written with it")
 
+    def section(self, prefix: str, header: Mapping[str, Any]) -> "ArchiveSection":
+        """A part of the archive: the arrays whose names begin with `prefix`, with a header of its own."""
+        return ArchiveSection(self, prefix, header)
+
     def __contains__(self, key: str) -> bool:
         return key in self._header or key in self._names
+
+
+class ArchiveSection(Archive):
+    """A part of an archive, in which arrays are named without their prefix, and letters in shapes are its own."""
+
+    def __init__(self, archive: Archive, prefix: str, header: Mapping[str, Any]) -> None:
+        self.path, self.sizes = archive.path, dict[str, int]()
+        self._archive, self._prefix, self._header = archive, prefix, dict(header)
+        self._names = frozenset(name.removeprefix(prefix) for name in archive._names if name.startswith(prefix))
+
+    def _read(self, name: str) -> np.ndarray:
+        return self._archive._read(self._prefix + name)
+
+    def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
+        return self._archive._stored(self._prefix + name)
 
 
 def _listed(shape: tuple[int | str, ...]) -> str:

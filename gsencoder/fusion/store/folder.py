@@ -1,9 +1,11 @@
 """Features on disk: a folder that holds the Gaussians, the cameras and their features.
 
+Features of one teacher are in `features.safetensors`, those of several in a file each, `features.TEACHER.safetensors`.
 Arrays are safetensors files, memory-mapped on load; features are float16 for seen rows only. The folder is all that
 localization needs: no photographs, no teacher.
 """
 
+import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -24,10 +26,28 @@ BLOCK = 16_384
 """Rows that are turned into half precision at a time."""
 WORDS_FILE = "words.safetensors"
 """The text table whose words lead into the features, beside them where there is one."""
+TEACHER_NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
+"""Form of the names of teachers, which are parts of names of files."""
+
+
+def file_of_teacher(file: str, teacher: str | None) -> str:
+    """The name of a file for one of several teachers, such as `features.labels.safetensors`; None = the only one."""
+    stem, dot, suffix = file.partition(".")
+    return file if teacher is None else f"{stem}.{teacher}{dot}{suffix}"
+
+
+def teachers_in(folder: Path, file: str) -> list[str]:
+    """The teachers of which a folder has such files."""
+    stem, dot, suffix = file.partition(".")
+    form = re.compile(re.escape(stem) + rf"\.({TEACHER_NAME})" + re.escape(dot + suffix))
+    return sorted(match[1] for path in folder.iterdir() if (match := form.fullmatch(path.name)))
 
 
 def save_features(
-    folder: str | Path, scene: Scene, features: GaussianFeatures, settings: Mapping[str, Any] = {}
+    folder: str | Path,
+    scene: Scene,
+    features: GaussianFeatures | Mapping[str, GaussianFeatures],
+    settings: Mapping[str, Any] = {},
 ) -> None:
     """Writes a scene and its features, as every command that takes features reads them.
 
@@ -37,15 +57,20 @@ def save_features(
         folder: made if it does not exist. Each file appears completely or not at all; that the folder does is up to the
             caller.
         scene: the Gaussians, cameras and names are written; photographs are not.
-        features: of the scene's Gaussians.
+        features: of the scene's Gaussians; by teacher where there are several.
         settings: what made the features, as JSON values.
 
     Raises:
         InputError: features of another number of Gaussians, or not finite, or a folder that cannot be written.
     """
     folder, gaussians = Path(folder), scene.gaussians
-    if gaussians is None or len(gaussians) != len(features):
-        raise InputError(f"save_features: {len(features)} features need as many Gaussians in scene {scene.name}")
+    if isinstance(features, GaussianFeatures):
+        features = {features.space.name: features}
+    single = len(features) == 1
+    by_file = {file_of_teacher(FEATURES_FILE, None if single else name): each for name, each in features.items()}
+    wrong = [len(each) for each in by_file.values() if gaussians is None or len(gaussians) != len(each)]
+    if gaussians is None or wrong:
+        raise InputError(f"save_features: {wrong[0]} features need as many Gaussians in scene {scene.name}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -53,6 +78,12 @@ def save_features(
     around, header = scene_parts(scene)
     arrays = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     write_archive(folder / SCENE_FILE, arrays | around, header)
+    for name, each in by_file.items():
+        _write_rows(folder / name, each, {"settings": dict(settings), "fingerprint": fingerprint(gaussians)})
+
+
+def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any]) -> None:
+    """Writes the features of seen rows, with more entries in the header."""
     rows = np.flatnonzero(features.weights > 0)
     # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
     blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
@@ -74,12 +105,12 @@ def save_features(
         "channel_scale": channel_scale,
         "weights": features.weights[rows],
     }
-    header |= {"settings": dict(settings), "fingerprint": fingerprint(gaussians)}
-    write_archive(folder / FEATURES_FILE, arrays, header)
+    write_archive(path, arrays, header | dict(more))
 
 
 def load_features(folder: str | Path) -> Scene:
-    """The scene and its features from a folder that `save_features` or `save_package` wrote.
+    """The scene and its features from a folder that `save_features` or `save_package` wrote: by the name of their
+    space, or, where there are those of several teachers, by teacher.
 
     Raises:
         InputError: not such a folder, damaged, of another version, or features of another splat.
@@ -100,8 +131,16 @@ def load_features(folder: str | Path) -> Scene:
             sh=file.array("sh", "float32", ("N", "K", 3)),
         )
         scene = read_scene(file, gaussians)
-    features = _load_rows(folder, gaussians)
-    return replace(scene, features={features.space.name: features})
+    teachers = teachers_in(folder, FEATURES_FILE)
+    if not teachers or (folder / FEATURES_FILE).is_file():
+        if teachers:
+            raise InputError(
+                f"{folder}: holds {FEATURES_FILE} and features of {', '.join(teachers)}, of two runs; keep one"
+            )
+        features = _load_rows(folder, FEATURES_FILE, gaussians)
+        return replace(scene, features={features.space.name: features})
+    by_teacher = {name: _load_rows(folder, file_of_teacher(FEATURES_FILE, name), gaussians) for name in teachers}
+    return replace(scene, features=by_teacher)
 
 
 def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
@@ -110,8 +149,8 @@ def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
     return open_archive(folder / name)
 
 
-def _load_rows(folder: Path, gaussians: Gaussians) -> GaussianFeatures:
-    with _open(folder, FEATURES_FILE) as file:
+def _load_rows(folder: Path, name: str, gaussians: Gaussians) -> GaussianFeatures:
+    with _open(folder, name) as file:
         check_splat(file, gaussians, "fuse or encode this splat again")
         rows, n = file.array("rows", "int32", ("n",)), len(gaussians)
         if len(rows) and (rows[0] < 0 or rows[-1] >= n or (np.diff(rows) <= 0).any()):

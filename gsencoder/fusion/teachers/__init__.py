@@ -5,7 +5,13 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.core.errors import InputError
 from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+
+class MissingInput(InputError):
+    """A scene does not have what a teacher needs of every scene, such as labels. A training with several teachers
+    leaves the teacher out in such a scene."""
 
 
 @runtime_checkable

@@ -1,5 +1,7 @@
 """Teachers, and the words that lead into their spaces, from settings."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from gsencoder.core.errors import InputError
@@ -56,6 +58,27 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
     if isinstance(config, (OnnxConfig, SegmenterConfig)) and config.words:
         raise InputError("text= and teacher.words= both say what words are; leave out one of them")
     return vocabulary_of(text)
+
+
+def takes_text(config: TeacherConfig) -> bool:
+    """Whether the words of a teacher may be those of a text tower."""
+    return isinstance(config, (LabelsConfig, SegmenterConfig)) or (isinstance(config, OnnxConfig) and config.joint)
+
+
+def words_by_teacher(teachers: Mapping[str, TeacherConfig], text: TextConfig = TableTextConfig()) -> dict[str, Words]:
+    """The words of each of several teachers that has any; a text tower is for those whose words it can be.
+
+    Raises:
+        InputError: see `words_of`; or a tower is given that is for none of several teachers.
+    """
+    several, given = len(teachers) > 1, not isinstance(text, TableTextConfig)
+    if several and given and not any(map(takes_text, teachers.values())):
+        raise InputError(f"text=: the words of none of the teachers {', '.join(teachers)} can be those of a text tower")
+    words = {
+        name: words_of(config, text if not several or takes_text(config) else TableTextConfig())
+        for name, config in teachers.items()
+    }
+    return {name: each for name, each in words.items() if each is not None}
 
 
 def words_beside(teacher: Teacher, words: Words | None) -> TextTable | None:

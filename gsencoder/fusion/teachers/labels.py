@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
+from gsencoder.fusion.teachers import MissingInput
 from gsencoder.types import FeatureMap, FeatureSpace, SceneObject, Views
 
 
@@ -66,10 +67,11 @@ class LabelsTeacher:
             cell: pixels along the side of a cell of the maps.
 
         Raises:
-            InputError: no objects, or a name that the table lacks.
+            MissingInput: no objects.
+            InputError: a name that the table lacks.
         """
         if not objects:
-            raise InputError("teacher labels: the scene lists no objects; it needs an objects.json beside its views")
+            raise MissingInput("teacher labels: the scene lists no objects; it needs an objects.json beside its views")
         row_of = {name: row for row, name in enumerate(names)}
         used = sorted({o.name for o in objects if o.name is not None})
         missing = [name for name in used if name not in row_of]
@@ -100,10 +102,11 @@ class LabelsTeacher:
         """Codes at image resolution, or vectors on a grid of cells.
 
         Raises:
-            InputError: the scene has no instance maps, or one smaller than a cell.
+            MissingInput: the scene has no instance maps.
+            InputError: an instance map is smaller than a cell.
         """
         if views.instances is None:
-            raise InputError("teacher labels: the scene has no instance maps (instance_file_path in transforms.json)")
+            raise MissingInput("teacher labels: the scene has no instance maps (instance_file_path in transforms.json)")
         instances = views.instances[view]
         values, inverse = np.unique(instances, return_inverse=True)
         codes = np.array([self._code.get(int(value), 0) for value in values], np.int32)[

@@ -11,6 +11,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.files.npz import read_npz
 from gsencoder.core.onnx_session import choose_tensors, open_session, run_on_picture
+from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.resize import fit_to_patches, normalized
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -122,10 +123,11 @@ class OnnxTeacher:
         """The backbone's cells for one picture.
 
         Raises:
-            InputError: no pictures, or an output whose grid does not fit the input.
+            MissingInput: no pictures.
+            InputError: an output whose grid does not fit the input.
         """
         if views.images is None:
-            raise InputError("teacher onnx: the scene has no pictures")
+            raise MissingInput("teacher onnx: the scene has no pictures")
         patch = self.config.patch
         resized, grid_from_image = fit_to_patches(views.images[view], self.config.size, patch)
         rows, columns = resized.shape[0] // patch, resized.shape[1] // patch

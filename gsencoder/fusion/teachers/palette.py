@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from gsencoder.core.errors import InputError
+from gsencoder.fusion.teachers import MissingInput
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 # The eleven basic color terms of English (Berlin & Kay 1969) and typical sRGB values, several where a name is wide.
@@ -84,10 +85,11 @@ class PaletteTeacher:
         """Color-name shares on a grid of cells; pixels over the last whole cell are left out.
 
         Raises:
-            InputError: the scene has no pictures, or one smaller than a cell.
+            MissingInput: the scene has no pictures.
+            InputError: one of them is smaller than a cell.
         """
         if views.images is None:
-            raise InputError("teacher palette: the scene has no pictures")
+            raise MissingInput("teacher palette: the scene has no pictures")
         image, cell = views.images[view], self.cell
         h, w = image.shape[0] // cell, image.shape[1] // cell
         if h == 0 or w == 0:

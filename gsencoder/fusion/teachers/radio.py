@@ -8,6 +8,7 @@ import numpy as np
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.pretrained import load_pretrained, read_config
+from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -75,12 +76,13 @@ class RadioTeacher:
         """The backbone's patch features of one picture.
 
         Raises:
-            InputError: no pictures, or features that are not finite.
+            MissingInput: no pictures.
+            InputError: features that are not finite.
         """
         import torch
 
         if views.images is None:
-            raise InputError("teacher radio: the scene has no pictures")
+            raise MissingInput("teacher radio: the scene has no pictures")
         patch = self._model.config.patch_size
         resized, grid_from_image = fit_to_patches(views.images[view], self.config.size, patch)
         pixels = torch.from_numpy(resized.astype(np.float32) / 255).permute(2, 0, 1)[None].to(self._device)

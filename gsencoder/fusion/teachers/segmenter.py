@@ -15,6 +15,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.model_files import find_file
+from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.segmenter_classes import read_classes, synonyms_of_classes
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenter, OnnxSegmenterOptions
 from gsencoder.fusion.teachers.segmenter_transformers import TransformersSegmenter
@@ -148,7 +149,7 @@ class SegmenterTeacher:
             InputError: no pictures, or outputs that are not finite, or of another number of classes.
         """
         if views.images is None:
-            raise InputError("teacher segmenter: the scene has no pictures")
+            raise MissingInput("teacher segmenter: the scene has no pictures")
         scores, are_probabilities, grid_from_image = self._network.outputs(views.images[view], len(self.names))
         where = f"teacher segmenter: {self._network.name}: view {views.names[view]!r}"
         if scores.shape[-1] != len(self.names):

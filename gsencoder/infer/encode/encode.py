@@ -1,30 +1,41 @@
 """Feed-forward inference: features of a splat in one pass, without photographs or teacher (SplatDistill, sec. 3.4)."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from jaxtyping import Float32
 
 from gsencoder.core.runtime.device import autocast_dtype, choose_device
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.fusion.store.words import load_tables
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.grid.curves import SceneCurves, cut_scene_curves
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpaces
 from gsencoder.models.weights import find_weights, load_weights
-from gsencoder.text.table import load_text_table
-from gsencoder.types import GaussianFeatures, Gaussians, check_unit
+from gsencoder.text.table import TextTable
+from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, check_unit
 
 
 class TorchEncoder:
-    """A trained network with its output space and its words; see `gsencoder.infer.load_encoder.Encoder`."""
+    """A trained network with its output spaces and its words; see `gsencoder.infer.load_encoder.Encoder`."""
 
     def __init__(self, weights: str) -> None:
         """Reads a file, a folder of `train`, or weights that come with the package; see `find_weights`."""
         file = find_weights(weights)
         self.network, self.outputs, self.made_by = load_weights(file)
-        words = file.with_name(WORDS_FILE)
-        self.words = load_text_table(words) if words.is_file() else None
+        self.tables: Mapping[str, TextTable] = load_tables(file.parent, self.outputs)
+
+    @property
+    def spaces(self) -> Mapping[str, FeatureSpace]:
+        """The feature spaces, by the names of their teachers."""
+        return {name: self.outputs[name].space for name in self.outputs}
+
+    @property
+    def words(self) -> TextTable | None:
+        """The first of the text tables; None where there is none."""
+        return next(iter(self.tables.values()), None)
 
     @property
     def voxel(self) -> float:
@@ -36,36 +47,86 @@ class TorchEncoder:
         gaussians: Gaussians,
         config: EncodeConfig = EncodeConfig(),
         *,
+        space: str | None = None,
         metres_per_unit: float = 1.0,
         track: Track = untracked,
     ) -> GaussianFeatures:
         """See `encode`."""
-        return encode(gaussians, self.network, self.outputs, config, metres_per_unit=metres_per_unit, track=track)
+        return encode(
+            gaussians, self.network, self.outputs, config, space=space, metres_per_unit=metres_per_unit, track=track
+        )
+
+    def encode_spaces(
+        self,
+        gaussians: Gaussians,
+        config: EncodeConfig = EncodeConfig(),
+        *,
+        metres_per_unit: float = 1.0,
+        track: Track = untracked,
+    ) -> dict[str, GaussianFeatures]:
+        """See `encode_spaces`."""
+        return encode_spaces(
+            gaussians, self.network, self.outputs, config, metres_per_unit=metres_per_unit, track=track
+        )
 
 
 def encode(
     gaussians: Gaussians,
     encoder: GaussianEncoder,
-    outputs: OutputSpace,
+    outputs: OutputSpaces,
     config: EncodeConfig = EncodeConfig(),
     *,
+    space: str | None = None,
     metres_per_unit: float = 1.0,
     track: Track = untracked,
 ) -> GaussianFeatures:
-    """Features of every Gaussian, all with weight 1.
+    """Features of every Gaussian in one space, all with weight 1.
 
     Args:
         gaussians: the splat.
         encoder: from `load_weights`; put into evaluation mode here.
         outputs: what its output channels mean.
         config: see there.
+        space: name of a teacher or of its feature space; None = the only one.
         metres_per_unit: unit of length of the splat; the encoder's grid is in metres.
         track: wraps the loop over chunks to show progress.
+
+    Raises:
+        InputError: see `encode_spaces`; or there is no such space, or there are several and none is named.
+    """
+    teacher = outputs.resolve(space)
+    values = _restored(gaussians, encoder, outputs, config, metres_per_unit, track)
+    return outputs.features(values, teacher)
+
+
+def encode_spaces(
+    gaussians: Gaussians,
+    encoder: GaussianEncoder,
+    outputs: OutputSpaces,
+    config: EncodeConfig = EncodeConfig(),
+    *,
+    metres_per_unit: float = 1.0,
+    track: Track = untracked,
+) -> dict[str, GaussianFeatures]:
+    """Features of every Gaussian in all spaces, by the names of their teachers; arguments are those of `encode`.
 
     Raises:
         InputError: no Gaussians, or they spread over too many cells, or features that are not finite, or a unit that
             is not positive.
     """
+    values = _restored(gaussians, encoder, outputs, config, metres_per_unit, track)
+    return {teacher: outputs.features(values, teacher) for teacher in outputs}
+
+
+def _restored(
+    gaussians: Gaussians,
+    encoder: GaussianEncoder,
+    outputs: OutputSpaces,
+    config: EncodeConfig,
+    metres_per_unit: float,
+    track: Track,
+) -> Float32[np.ndarray, "N channels"]:
+    """The encoder's outputs for every Gaussian, restored."""
     check_unit(metres_per_unit, "metres_per_unit")
     device = choose_device(config.device)
     dtype = autocast_dtype(config.precision, device)
@@ -79,7 +140,7 @@ def encode(
             )
             return outputs.restore(encoder(attributes, opacities, encoder.join([plan])).cpu().numpy())
 
-    features = encode_by_chunks(
+    return encode_by_chunks(
         gaussians,
         run,
         lambda: cut_scene_curves(gaussians.means, voxel, levels=shape.levels, orders=shape.orders, patch=shape.patch),
@@ -88,4 +149,3 @@ def encode(
         channels=outputs.channels,
         track=track,
     )
-    return outputs.features(features)

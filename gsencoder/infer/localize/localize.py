@@ -248,19 +248,25 @@ def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, Gaussia
 
     Args:
         scene: with both.
-        space: name of the feature set; None where the scene has only one.
+        space: name of the feature set, or of its space; None = the only one, or the only one that words lead into.
 
     Raises:
         InputError: no feature set of that name, or several and no name.
     """
     if scene.gaussians is None or not scene.features:
         missing = "Gaussians" if scene.gaussians is None else "features"
-        raise InputError(f"localize: scene {scene.name} has no {missing}; run `gsencoder fuse` on it first")
-    if space is None and len(scene.features) == 1:
-        return scene.gaussians, next(iter(scene.features.values()))
+        raise InputError(f"scene {scene.name} has no {missing}; run `gsencoder fuse` on it first")
+    if space is None:
+        with_words = [each for each in scene.features.values() if each.space.text_encoder]
+        candidates = list(scene.features.values()) if len(scene.features) == 1 else with_words
+        if len(candidates) == 1:
+            return scene.gaussians, candidates[0]
+    by_space = [each for each in scene.features.values() if each.space.name == space]
+    if space not in scene.features and len(by_space) == 1:
+        return scene.gaussians, by_space[0]
     if space not in scene.features:
         raise InputError(
-            f"localize: scene {scene.name} has features of {', '.join(sorted(scene.features))}; "
+            f"scene {scene.name} has features of {', '.join(sorted(scene.features))}; "
             + ("name one with space=" if space is None else f"none of {space!r}")
         )
     return scene.gaussians, scene.features[space]

@@ -129,7 +129,7 @@ def header_of(encoder: TorchEncoder, precision: Stored = "float32") -> OnnxHeade
         orders=shape.orders,
         patch=shape.patch,
         outputs=encoder.outputs,
-        words=encoder.words,
+        tables=encoder.tables,
         precision=precision,
         made_by=encoder.made_by,
     )

@@ -1,8 +1,8 @@
 """Metadata of an exported encoder: entries of text beside the graph, which any program can read.
 
-`gsencoder` is JSON: the format's version, the grid, the curves, the feature space, and for each array its type and
-shape. `gsencoder.NAME` is the array NAME: little-endian, deflated, in base64. `gsencoder.sum` is the sha256 of the
-whole file, with zeros in the sum's own place.
+`gsencoder` is JSON: the format's version, the grid, the curves, the feature space (or the spaces of several teachers,
+in whose columns the features are), and for each array its type and shape. `gsencoder.NAME` is the array NAME:
+little-endian, deflated, in base64. `gsencoder.sum` is the sha256 of the whole file, with zeros in the sum's own place.
 """
 
 import base64
@@ -21,12 +21,13 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.int8 import round_columns
 from gsencoder.core.runtime.device_names import Stored
 from gsencoder.models.grid.serialize import ALIGN, Order
-from gsencoder.models.output_space import OutputSpace, output_space_parts
+from gsencoder.models.output_space import OutputSpace, OutputSpaces, output_spaces_parts
 from gsencoder.text.table import TextTable, tower_from_json, tower_to_json, unrounded
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 KEY = "gsencoder"
-VERSION = 2
+VERSION, VERSION_OF_SEVERAL = 2, 3
+"""Of files of one output space, and of several; the first is read by earlier versions of gsencoder, too."""
 SUM, NO_SUM = f"{KEY}.sum", "0" * 64
 FIELDS = ("means", "quats", "scales", "opacities", "sh_dc")
 """Inputs of the graph that every cloud has."""
@@ -50,7 +51,7 @@ class OnnxHeader:
         orders: the curves that attention follows.
         patch: most tokens in a patch.
         outputs: what the features mean; the graph has restored them already.
-        words: what turns words into their space, where there is such a table.
+        tables: what turns words into their spaces, by teacher, where there are such tables.
         precision: what the graph computes in; files of earlier versions may say "int8_static".
         made_by: settings and results of training and export, as JSON values.
     """
@@ -59,8 +60,8 @@ class OnnxHeader:
     levels: int
     orders: tuple[Order, ...]
     patch: int
-    outputs: OutputSpace
-    words: TextTable | None = None
+    outputs: OutputSpaces
+    tables: Mapping[str, TextTable] = field(default_factory=dict)
     precision: Stored | Literal["int8_static"] = "float32"
     made_by: Mapping[str, Any] = field(default_factory=dict)
 
@@ -81,10 +82,9 @@ class OnnxHeader:
 
 def to_metadata(header: OnnxHeader) -> dict[str, str]:
     """The entries of text that hold a header."""
-    words = header.words
-    arrays, values = output_space_parts(header.outputs)
+    arrays, values = output_spaces_parts(header.outputs)
     values |= {
-        "version": VERSION,
+        "version": VERSION if len(header.outputs) == 1 else VERSION_OF_SEVERAL,
         "voxel": header.voxel,
         "levels": header.levels,
         "orders": list(header.orders),
@@ -92,21 +92,32 @@ def to_metadata(header: OnnxHeader) -> dict[str, str]:
         "precision": header.precision,
         "made_by": dict(header.made_by),
     }
-    if words is not None:
-        arrays["words_mean"] = words.mean
-        if header.precision.startswith("int8"):
-            arrays["words"], arrays["words_scale"] = round_columns(words.embeddings, WORD_STEPS)
-        else:
-            arrays["words"] = words.embeddings.astype(np.float16)
-        values["words"] = {"names": list(words.names), "space": asdict(words.space)}
-        if words.tower is not None:
-            values["words"]["tower"] = tower_to_json(words.tower)
+    for number, name in enumerate(header.outputs):
+        if name not in header.tables:
+            continue
+        single = len(header.outputs) == 1
+        entry, prefix = (values, "") if single else (values["outputs"][number], f"{number}.")
+        words_arrays, entry["words"] = _words_parts(header.tables[name], in_int8=header.precision.startswith("int8"))
+        arrays |= {prefix + key: value for key, value in words_arrays.items()}
     values["arrays"] = {name: {"dtype": value.dtype.name, "shape": value.shape} for name, value in arrays.items()}
     entries = {KEY: json.dumps(values, ensure_ascii=False)}
     for name, value in arrays.items():
         little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
         entries[f"{KEY}.{name}"] = base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
     return entries
+
+
+def _words_parts(words: TextTable, *, in_int8: bool) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the JSON values that hold a text table."""
+    arrays = {"words_mean": words.mean}
+    if in_int8:
+        arrays["words"], arrays["words_scale"] = round_columns(words.embeddings, WORD_STEPS)
+    else:
+        arrays["words"] = words.embeddings.astype(np.float16)
+    values: dict[str, Any] = {"names": list(words.names), "space": asdict(words.space)}
+    if words.tower is not None:
+        values["tower"] = tower_to_json(words.tower)
+    return arrays, values
 
 
 def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
@@ -122,40 +133,35 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
         version = values["version"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"the entry {KEY!r} is damaged ({type(error).__name__})") from error
-    if version != VERSION:
+    if version not in (VERSION, VERSION_OF_SEVERAL):
         raise InputError(
-            f"is of format version {str(version)[:20]}, and this gsencoder reads {VERSION}; export it again"
+            f"is of format version {str(version)[:20]}, and this gsencoder reads {VERSION} and {VERSION_OF_SEVERAL}; "
+            "export it again"
         )
     try:
-        arrays = {name: _array(entries, name, **values["arrays"][name]) for name in ARRAYS if name in values["arrays"]}
-        space = FeatureSpace(**values["space"])
-        basis = None
-        if "components" in arrays:
-            basis = FeatureBasis(
-                mean=arrays["mean"],
-                components=arrays["components"],
-                energy_kept=values["energy_kept"],
-                space=space,
-            )
-        words = None
-        if "words" in values:
-            words = TextTable(
-                names=tuple(values["words"]["names"]),
-                embeddings=unrounded(arrays["words"].astype(np.float32) * arrays.get("words_scale", np.float32(1))),
-                space=FeatureSpace(**values["words"]["space"]),
-                mean=arrays["words_mean"],
-                tower=tower_from_json(values["words"]["tower"]) if "tower" in values["words"] else None,
-            )
-        switches = {name: values[name] for name in ("centered", "scaled") if name in values}
+        parts = [("", values)]
+        if version == VERSION_OF_SEVERAL:
+            parts = [(f"{number}.", part) for number, part in enumerate(values["outputs"])]
+        by_teacher: dict[str, OutputSpace] = {}
+        tables: dict[str, TextTable] = {}
+        for prefix, part in parts:
+            known = {name: values["arrays"][prefix + name] for name in ARRAYS if prefix + name in values["arrays"]}
+            arrays = {name: _array(entries, prefix + name, **form) for name, form in known.items()}
+            outputs = _output_space(part, arrays)
+            # Files of earlier versions do not name their teacher otherwise.
+            teacher = str(part.get("teacher") or outputs.space.teacher or outputs.space.name)
+            if teacher in by_teacher:
+                raise InputError(f"expected output spaces of distinct teachers, got two of {teacher[:60]!r}")
+            by_teacher[teacher] = outputs
+            if "words" in part:
+                tables[teacher] = _text_table(part["words"], arrays)
         return OnnxHeader(
             voxel=float(values["voxel"]),
             levels=values["levels"],
             orders=tuple(values["orders"]),
             patch=values["patch"],
-            outputs=OutputSpace(
-                space=space, mean=arrays["mean"], scale=float(values["scale"]), basis=basis, **switches
-            ),
-            words=words,
+            outputs=OutputSpaces(by_teacher=by_teacher),
+            tables=tables,
             precision=values["precision"],
             made_by=values["made_by"],
         )
@@ -163,6 +169,28 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
         if isinstance(error, InputError):
             raise
         raise InputError(f"its entries are damaged ({type(error).__name__}: {str(error)[:80]})") from error
+
+
+def _output_space(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> OutputSpace:
+    """The output space that JSON values and arrays hold."""
+    space, mean = FeatureSpace(**values["space"]), arrays["mean"]
+    basis = None
+    if "components" in arrays:
+        components, energy_kept = arrays["components"], values["energy_kept"]
+        basis = FeatureBasis(mean=mean, components=components, energy_kept=energy_kept, space=space)
+    switches = {name: values[name] for name in ("centered", "scaled") if name in values}
+    return OutputSpace(space=space, mean=mean, scale=float(values["scale"]), basis=basis, **switches)
+
+
+def _text_table(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TextTable:
+    """The text table that JSON values and arrays hold."""
+    return TextTable(
+        names=tuple(values["names"]),
+        embeddings=unrounded(arrays["words"].astype(np.float32) * arrays.get("words_scale", np.float32(1))),
+        space=FeatureSpace(**values["space"]),
+        mean=arrays["words_mean"],
+        tower=tower_from_json(values["tower"]) if "tower" in values else None,
+    )
 
 
 def with_sum(model: bytes) -> bytes:

@@ -17,7 +17,7 @@ from gsencoder.infer.onnx.header import FIELDS, OUTPUT, SETTINGS, SUM, OnnxHeade
 from gsencoder.models.grid.curves import SceneCurves, cut_scene_curves
 from gsencoder.models.grid.serialize import INVALID_CODE, check_extent
 from gsencoder.text.table import TextTable
-from gsencoder.types import GaussianFeatures, Gaussians, check_unit
+from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, check_unit
 
 SUFFIX = ".onnx"
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
@@ -82,15 +82,26 @@ class OnnxEncoder:
         return self.header.made_by
 
     @property
+    def spaces(self) -> Mapping[str, FeatureSpace]:
+        """The feature spaces, by the names of their teachers."""
+        return {name: self.header.outputs[name].space for name in self.header.outputs}
+
+    @property
+    def tables(self) -> Mapping[str, TextTable]:
+        """What turns words into the features' spaces, by teacher, where the file has it."""
+        return self.header.tables
+
+    @property
     def words(self) -> TextTable | None:
-        """What turns words into the features' space, where the file has it."""
-        return self.header.words
+        """The first of the text tables; None where there is none."""
+        return next(iter(self.tables.values()), None)
 
     def encode(
         self,
         gaussians: Gaussians,
         config: EncodeConfig = EncodeConfig(),
         *,
+        space: str | None = None,
         metres_per_unit: float = 1.0,
         track: Track = untracked,
     ) -> GaussianFeatures:
@@ -100,13 +111,33 @@ class OnnxEncoder:
         Args:
             gaussians: the splat.
             config: of its parts; the precision is the file's.
+            space: name of a teacher or of its feature space; None = the only one.
             metres_per_unit: of the splat's world; the encoder's grid is in metres.
             track: wraps the loop over chunks to show progress.
 
         Raises:
             InputError: no Gaussians, or they spread over too many cells, or features that are not finite, or a unit
-                that is not positive.
+                that is not positive; or there is no such space, or there are several and none is named.
         """
+        teacher = self.header.outputs.resolve(space)
+        return self.header.outputs.features(self._restored(gaussians, config, metres_per_unit, track), teacher)
+
+    def encode_spaces(
+        self,
+        gaussians: Gaussians,
+        config: EncodeConfig = EncodeConfig(),
+        *,
+        metres_per_unit: float = 1.0,
+        track: Track = untracked,
+    ) -> dict[str, GaussianFeatures]:
+        """Features of every Gaussian in all spaces, by teacher; arguments and errors are those of `encode`."""
+        values = self._restored(gaussians, config, metres_per_unit, track)
+        return {teacher: self.header.outputs.features(values, teacher) for teacher in self.spaces}
+
+    def _restored(
+        self, gaussians: Gaussians, config: EncodeConfig, metres_per_unit: float, track: Track
+    ) -> Float32[np.ndarray, "N channels"]:
+        """The graph's outputs for every Gaussian."""
         check_unit(metres_per_unit, "metres_per_unit")
         header = self.header
         if config.precision not in ("auto", header.precision):
@@ -119,7 +150,7 @@ class OnnxEncoder:
         def run(subset: Gaussians, scene_curves: SceneCurves | None) -> Float32[np.ndarray, "n channels"]:
             return self._run(subset, scene_curves, voxel)
 
-        features = encode_by_chunks(
+        return encode_by_chunks(
             gaussians,
             run,
             lambda: cut_scene_curves(
@@ -130,7 +161,6 @@ class OnnxEncoder:
             channels=header.outputs.channels,
             track=track,
         )
-        return header.outputs.features(features)
 
     def _run(
         self, subset: Gaussians, scene_curves: SceneCurves | None, voxel: float

@@ -54,7 +54,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_training_states_what_the_basis_keeps_of_its_scenes_and_of_held_out_ones(folder: Path) -> None:
-    _, outputs, made_by = load_weights(folder / "encoder")
+    _, spaces, made_by = load_weights(folder / "encoder")
+    outputs = spaces.select()
     figures = results_of(folder / "encoder")["basis"]
     assert made_by["basis"] == figures
     assert outputs.basis is not None
@@ -87,7 +88,7 @@ def test_fusing_in_the_basis_of_weights_gives_features_that_compare_with_encoded
 ) -> None:
     words = [str(folder / "room_0"), "teacher=palette", f"basis={folder / 'encoder'}", f"out={tmp_path / 'fused'}"]
     assert cli.main(["fuse", *words, "quiet=true"]) == 0
-    basis = load_weights(folder / "encoder")[1].basis
+    basis = load_weights(folder / "encoder")[1].select().basis
     (features,) = load_features(tmp_path / "fused").features.values()
     fused = features.basis
     assert basis is not None

@@ -1,0 +1,187 @@
+"""`train teacher=[…]` and what follows it: encode, localize, pack, export and evaluate by the name of a teacher."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsencoder.app import cli
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+from gsencoder.fusion.store.folder import load_features
+from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.onnx.export import header_of
+from gsencoder.infer.onnx.header import from_metadata, to_metadata
+from gsencoder.models.weights import load_weights
+from gsencoder.text.table import make_text_table, save_text_table
+
+pytestmark = pytest.mark.slow
+
+QUICK = (
+    "quiet=true",
+    "tensorboard=false",
+    "train.steps=4",
+    "train.warmup=2",
+    "train.log_every=2",
+    "sampling.gaussians=2000",
+    "sampling.smallest=500",
+    "model.transformer.encoder_channels=[32,32,32,32,32]",
+    "model.transformer.decoder_channels=[32,32,32,32]",
+)
+
+
+def results_of(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
+    return found
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line that a refused command prints."""
+    capsys.readouterr()
+    assert cli.main([*arguments, "quiet=true"]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three rooms, of which the second has no labels, and the words of all that is in them."""
+    folder = tmp_path_factory.mktemp("rooms")
+    names: set[str] = set()
+    for number in range(3):
+        room = make_room(number, objects=3, views=3, width=100, height=75)
+        write_room(room, folder / f"room_{number}")
+        names |= {thing.name for thing in room.objects if thing.name}
+    (folder / "room_1" / "objects.json").unlink()
+    vectors = np.eye(len(names), dtype=np.float32)
+    save_text_table(folder / "words.safetensors", make_text_table(sorted(names), vectors, "room-words"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(rooms: Path) -> Path:
+    """An encoder of names and colors."""
+    out = rooms.parent / "encoder"
+    scenes = [str(rooms / f"room_{number}") for number in range(3)]
+    words = ["teacher=[labels,palette]", f"teachers.labels.words={rooms / 'words.safetensors'}", "holdout=room_2"]
+    assert cli.main(["train", *scenes, *words, f"out={out}", *QUICK]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def encoded(rooms: Path, trained: Path) -> Path:
+    out = rooms.parent / "features"
+    assert cli.main(["encode", str(rooms / "room_2"), f"weights={trained}", f"out={out}", "quiet=true"]) == 0
+    return out
+
+
+def test_training_leaves_one_encoder_with_the_spaces_words_and_scores_of_both_teachers(
+    rooms: Path, trained: Path
+) -> None:
+    summary = json.loads((trained / "summary.json").read_text())
+    assert any("teacher labels: 1 of 3 scenes lack" in str(warning) for warning in summary["warnings"])
+    results = summary["results"]
+    assert set(results["validation"]) == {
+        f"{teacher}/{score}" for teacher in ("labels", "palette") for score in ("names", "cosine_named")
+    }
+    assert set(results["basis"]) == {"labels", "palette"}
+    encoder, outputs, made_by = load_weights(trained)
+    assert list(outputs) == ["labels", "palette"]
+    assert encoder.channels == outputs["labels"].channels + outputs["palette"].channels
+    assert list(made_by["settings"]["teachers"]) == ["labels", "palette"]
+    assert {path.name for path in trained.glob("words*")} == {"words.labels.safetensors", "words.palette.safetensors"}
+    assert {path.name for path in (trained / "validation").iterdir()} >= {"labels_features_000004.png"} or list(
+        (trained / "validation").glob("labels_features*")
+    )
+    columns = (trained / "log.csv").read_text().splitlines()[0].split(",")
+    assert {"labels/field", "labels/render", "palette/field", "palette/render"} <= set(columns)
+    prepared = trained.with_name("encoder.prepared")
+    assert sorted(path.name for path in prepared.iterdir()) == ["labels", "palette"]
+    assert len(list((prepared / "labels" / "scenes").iterdir())) == 2
+    assert len(list((prepared / "palette" / "scenes").iterdir())) == 3
+
+
+def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named(
+    rooms: Path, trained: Path, encoded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = load_features(encoded)
+    assert set(scene.features) == {"labels", "palette"}
+    assert set(results_of(encoded)["teachers"]) == {"labels", "palette"}
+    assert scene.gaussians is not None
+    direct = TorchEncoder(str(trained)).encode_spaces(scene.gaussians, metres_per_unit=1.0)
+    for name, features in direct.items():
+        np.testing.assert_allclose(scene.features[name].features, features.features, atol=5e-3)
+    words = ["encode", str(rooms / "room_2"), f"weights={trained}", "quiet=true"]
+    assert cli.main([*words, "spaces=palette", f"out={tmp_path / 'one'}"]) == 0
+    (only,) = load_features(tmp_path / "one").features.values()
+    np.testing.assert_array_equal(only.features, scene.features["palette"].features)
+    assert {path.name for path in (tmp_path / "one").iterdir()} >= {"features.safetensors", "words.safetensors"}
+    assert "got 'depth'" in refusal(capsys, *words[:3], "spaces=depth", f"out={tmp_path / 'none'}")
+
+
+def test_words_are_asked_of_the_space_that_is_named(
+    encoded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    colors = ["localize", str(encoded), "query=red", "pictures=0", "localize.min_probability=0"]
+    assert cli.main([*colors, "space=palette", f"out={tmp_path / 'red'}", "quiet=true"]) == 0
+    line = refusal(capsys, *colors, f"out={tmp_path / 'any'}")
+    assert "has features of labels, palette; name one with space=" in line
+    assert "not among" in refusal(capsys, *colors, "space=labels", f"out={tmp_path / 'wrong'}")
+    assert "none of 'depth'" in refusal(capsys, *colors, "space=depth", f"out={tmp_path / 'wrong'}")
+    packed = ["pack", str(encoded), "quiet=true", f"out={tmp_path / 'packed'}"]
+    assert cli.main([*packed, "space=palette"]) == 0
+    (features,) = load_features(tmp_path / "packed").features.values()
+    assert features.space.teacher == "palette"
+    assert cli.main([colors[0], str(tmp_path / "packed"), *colors[2:], f"out={tmp_path / 'again'}", "quiet=true"]) == 0
+
+
+def test_evaluation_takes_the_space_of_the_words(rooms: Path, trained: Path, tmp_path: Path) -> None:
+    words = f"teacher.words={rooms / 'words.safetensors'}"
+    command = ["evaluate", str(rooms / "room_2"), f"weights={trained}", words, "protocol=naming", "quiet=true"]
+    assert cli.main([*command, f"out={tmp_path / 'scores'}"]) == 0
+    assert results_of(tmp_path / "scores")["names"]
+
+
+def test_fusing_in_the_basis_of_one_of_several_teachers_needs_a_teacher_of_its_space(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal(
+        capsys,
+        *["fuse", str(rooms / "room_2"), "teacher=palette", f"basis={trained}", f"out={tmp_path / 'fused'}"],
+        "teacher.cell=8",
+    )
+    assert "gives features of" in line or "gives all channels" in line
+
+
+def test_an_exported_header_carries_all_spaces_and_their_words(trained: Path) -> None:
+    encoder = TorchEncoder(str(trained))
+    header = header_of(encoder)
+    entries = to_metadata(header)
+    assert json.loads(entries["gsencoder"])["version"] == 3
+    again = from_metadata(entries)
+    assert list(again.outputs) == ["labels", "palette"]
+    for name in again.outputs:
+        assert again.outputs[name].space == encoder.outputs[name].space
+        np.testing.assert_array_equal(again.outputs[name].mean, encoder.outputs[name].mean)
+        assert again.tables[name].names == encoder.tables[name].names
+    np.testing.assert_array_equal(again.outputs.unit, encoder.outputs.unit)
+
+
+def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train = ["train", str(rooms / "room_0"), *QUICK[2:], f"out={tmp_path / 'out'}", f"prepared={tmp_path / 'prepared'}"]
+    words = f"teachers.labels.words={rooms / 'words.safetensors'}"
+    for more, message in (
+        (["teacher=[labels,colors]"], "teachers: expected some of"),
+        (["teacher=[palette,palette]"], "palette is given twice; give other names, such as palette_2:palette"),
+        (["teacher=[palette,p/2:palette]"], "expected names of letters, digits and _, got 'p/2'"),
+        (["teacher=[palette,labels]", "teachers.radio.size=3"], "teachers.radio.size: there is no radio among"),
+        (["teacher=[palette,labels]", words, "loss.teacher_weights=[1.0]"], "loss.teacher_weights: expected 2 numbers"),
+        (["teacher=[palette,other:palette]"], "two of them have features called"),
+        (["teacher=[palette,x:onnx]"], "teacher.model= is missing"),
+    ):
+        assert message in refusal(capsys, *train, *more), more
+    line = refusal(capsys, "train", str(rooms / "room_1"), *QUICK[2:], "teacher=[labels,palette]", words, *train[-2:])
+    assert "the scene lists no objects" in line

@@ -1,0 +1,272 @@
+"""An encoder with several teachers: what each of them contributes is what it contributes alone."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from training_scenes import (
+    LOSSES,
+    PREPARE,
+    SHORT,
+    SMALL,
+    DenseSideTeacher,
+    SideTeacher,
+    prepared,
+    samples,
+    scene,
+    small_encoder,
+)
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.step_log import LOG_FILE, read_log
+from gsencoder.fusion.teachers import MissingInput
+from gsencoder.models.output_space import OutputSpaces
+from gsencoder.train.dataset_space import dataset_space
+from gsencoder.train.distill import Distillation
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
+from gsencoder.train.samples import Batch, SampleDataset, SampleRecipe, TeacherRecipe, join_samples
+from gsencoder.train.trainer import Trainer
+from gsencoder.train.training_scene import TrainingScene
+from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+TALL = FeatureSpace(name="heights", channels=4)
+
+
+class HeightTeacher(DenseSideTeacher):
+    """Says of cells of two pixels how high in the picture they are."""
+
+    space = TALL
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        seen = super().feature_map(views, view)
+        assert seen.features is not None
+        rows = np.linspace(-1, 1, len(seen.features), dtype=np.float32)[:, None]
+        features = np.stack(np.broadcast_arrays(rows, rows**2, np.sin(3 * rows), np.float32(0)), axis=-1)
+        features = np.broadcast_to(features, seen.features.shape).astype(np.float32)
+        return FeatureMap(features=features.copy(), grid_from_image=seen.grid_from_image, space=TALL)
+
+
+Datasets = Mapping[str, tuple[PreparedDataset, list[str]]]
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> Datasets:
+    """The same walls, prepared for two teachers; the second one lacks the last wall."""
+    folder = tmp_path_factory.mktemp("prepared")
+    sides, names = prepared(folder / "sides", teacher=SideTeacher())
+    heights, _ = prepared(folder / "heights", count=2, teacher=HeightTeacher())
+    return {"sides": (sides, names), "heights": (heights, names)}
+
+
+def joint(datasets: Datasets, weights: Mapping[str, float] = {}, **changes: object) -> SampleDataset:
+    """Samples of all walls with the targets of both teachers."""
+    recipe: SampleRecipe = samples(*datasets["sides"], **changes).recipe
+    teachers = tuple(
+        TeacherRecipe(name=name, class_balance=dataset.load_class_balance(), weight=weights.get(name, 1.0))
+        for name, (dataset, _) in datasets.items()
+    )
+    names = datasets["sides"][1]
+    scenes = [TrainingScene([dataset.find_scene(name) for dataset, _ in datasets.values()]) for name in names]
+    return SampleDataset(scenes, replace(recipe, teachers=teachers))
+
+
+def batch_of(data: SampleDataset, numbers: range) -> Batch:
+    batch = join_samples([data[number] for number in numbers], SMALL.transformer.patch)
+    assert isinstance(batch, Batch)
+    return batch
+
+
+def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alone(datasets: Datasets) -> None:
+    data = joint(datasets)
+    batch = batch_of(data, range(6))
+    widths = [teacher.channels for teacher in data.recipe.teachers]
+    predicted = torch.randn(len(batch.attributes), sum(widths), requires_grad=True)
+    both = Distillation(small_encoder(), LOSSES, data.recipe.teachers)
+    terms, divisors = both.terms(predicted, batch), both.divisors(batch)
+    sum(terms[name] for name in terms).backward()
+    assert predicted.grad is not None
+    for number, (name, (dataset, names)) in enumerate(datasets.items()):
+        alone = Distillation(small_encoder(), LOSSES, data.recipe.teachers[number : number + 1])
+        own = batch._replace(teachers=batch.teachers[number : number + 1])
+        part = predicted.detach().split(widths, dim=1)[number].clone().requires_grad_()
+        expected = alone.terms(part, own)
+        sum(expected.values()).backward()
+        assert set(expected) == {"field", "render", "contrast"}
+        for term, value in expected.items():
+            torch.testing.assert_close(terms[f"{name}/{term}"], value)
+            assert divisors[f"{name}/{term}"] == alone.divisors(own)[term]
+        torch.testing.assert_close(predicted.grad.split(widths, dim=1)[number], part.grad)
+        del dataset, names
+
+
+def test_samples_have_the_targets_of_each_teacher_for_the_same_gaussians(datasets: Datasets) -> None:
+    data = joint(datasets)
+    for number, (name, (dataset, names)) in enumerate(datasets.items()):
+        # A teacher alone draws other centers, by its own classes, unless all Gaussians are in each sample.
+        everything = {"sampling": replace(data.recipe.sampling, scope="scene", gaussians=0)}
+        together = SampleDataset(data.scenes[:2], replace(data.recipe, **everything))
+        alone = samples(dataset, names[:2], **everything)
+        assert together[0].name == alone[0].name
+        theirs, (ours,) = together[0].teachers[number], alone[0].teachers
+        torch.testing.assert_close(theirs.targets, ours.targets)
+        torch.testing.assert_close(theirs.loss_weights, ours.loss_weights)
+        torch.testing.assert_close(theirs.codes, ours.codes)
+        for one, other in zip(theirs.rows, ours.rows, strict=True):
+            torch.testing.assert_close(one, other)
+        assert name in datasets
+
+
+def test_a_scene_that_lacks_a_teacher_has_no_weight_in_its_terms(datasets: Datasets) -> None:
+    data = joint(datasets)
+    lacking = SampleDataset(data.scenes[2:], data.recipe)
+    batch = batch_of(lacking, range(2))
+    distillation = Distillation(small_encoder(), LOSSES, data.recipe.teachers)
+    divisors = distillation.divisors(batch)
+    assert divisors["heights/field"] == divisors["heights/render"] == divisors["heights/contrast"] == 0
+    predicted = torch.randn(len(batch.attributes), 8, requires_grad=True)
+    terms = distillation.terms(predicted, batch)
+    sum(terms.values()).backward()
+    assert predicted.grad is not None
+    assert terms["heights/field"].item() == terms["heights/render"].item() == terms["heights/contrast"].item() == 0
+    assert (predicted.grad[:, 4:] == 0).all()
+    assert (predicted.grad[:, :4] != 0).any()
+
+
+def test_the_log_averages_a_teachers_losses_over_the_steps_that_have_it(datasets: Datasets, tmp_path: Path) -> None:
+    config = replace(SHORT, steps=6, log_every=3)
+    data = joint(datasets)
+    each = Trainer(
+        small_encoder(8), data, LOSSES, replace(config, log_every=1), folder=_made(tmp_path / "1"), settings={}
+    )
+    each.run()
+    single = read_log(tmp_path / "1" / LOG_FILE)
+    lacking = [row for row in single if not row.get("heights/field")]
+    assert len(lacking) == 2  # One wall of three.
+    Trainer(small_encoder(8), data, LOSSES, config, folder=_made(tmp_path / "3"), settings={}).run()
+    rows = read_log(tmp_path / "3" / LOG_FILE)
+    assert len(rows) == 2
+    for row, group in zip(rows, (single[:3], single[3:]), strict=True):
+        for name in ("heights/field", "sides/render", "loss"):
+            values = [float(one[name]) for one in group if one.get(name)]
+            assert float(row[name]) == pytest.approx(np.mean(values), rel=1e-5)
+
+
+def test_a_resumed_run_has_the_same_bits(datasets: Datasets, tmp_path: Path) -> None:
+    def run(folder: Path, steps: range | None = None) -> torch.Tensor:
+        encoder = small_encoder(8)
+        trainer = Trainer(encoder, joint(datasets), LOSSES, SHORT, folder=folder, settings={"run": 1})
+        if steps is None:
+            trainer.run()
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                trainer.run(_stop_at(4))
+        return encoder.head.weight.detach().clone()
+
+    straight = run(_made(tmp_path / "straight"))
+    run(_made(tmp_path / "killed"), range(4))
+    assert torch.equal(run(tmp_path / "killed"), straight)
+
+
+def test_training_lowers_the_losses_of_both_teachers(datasets: Datasets, tmp_path: Path) -> None:
+    data, encoder = joint(datasets), small_encoder(8)
+    batch = batch_of(data, range(6))
+
+    def field_losses() -> dict[str, float]:
+        distillation = Distillation(encoder.eval(), LOSSES, data.recipe.teachers)
+        with torch.no_grad():
+            terms, divisors = distillation(batch), distillation.divisors(batch)
+        return {name: terms[name].item() / divisors[name] for name in ("sides/field", "heights/field")}
+
+    before = field_losses()
+    Trainer(encoder, data, LOSSES, replace(SHORT, steps=25), folder=tmp_path, settings={}).run()
+    after = field_losses()
+    for name, loss in before.items():
+        assert after[name] < 0.8 * loss, name
+
+
+def test_a_teacher_of_weight_zero_changes_nothing_but_its_own_columns(datasets: Datasets, tmp_path: Path) -> None:
+    weightless = joint(datasets, {"heights": 0.0})
+    names = Distillation(small_encoder(8), LOSSES, weightless.recipe.teachers).lambdas
+    assert all(name.startswith("sides/") for name in names)
+    before = small_encoder(8).head.weight[4:].detach().clone()
+    encoder = small_encoder(8)
+    config = replace(SHORT, steps=2, weight_decay=0.0)
+    Trainer(encoder, weightless, LOSSES, config, folder=tmp_path, settings={}).run()
+    assert torch.equal(encoder.head.weight[4:], before)
+
+
+def test_files_of_other_gaussians_are_refused(datasets: Datasets, tmp_path: Path) -> None:
+    other, _ = prepared(tmp_path / "other", count=1, teacher=HeightTeacher())
+    moved = scene(0)
+    assert moved.gaussians is not None
+    other.scene_path("wall_0").unlink()
+    shifted = replace(moved, gaussians=replace(moved.gaussians, means=moved.gaussians.means + np.float32(1e-3)))
+    other.prepare(shifted, HeightTeacher(), PREPARE, source=Path("wall_0"))
+    first = datasets["sides"][0].find_scene("wall_0")
+    with pytest.raises(InputError, match="has other Gaussians or views than"):
+        TrainingScene([first, other.find_scene("wall_0")]).check_consistent()
+    with pytest.raises(InputError, match="a scene has no teacher"):
+        TrainingScene([None, None])
+
+
+def test_scenes_without_a_teacher_and_teachers_without_a_scene_are_reported(datasets: Datasets) -> None:
+    opened = {name: dataset for name, (dataset, _) in datasets.items()}
+    walls = [Path(f"wall_{number}") for number in range(3)]
+    with pytest.warns(SceneWarning, match=r"teacher heights: 1 of 3 scenes lack what it needs \(wall_2\)"):
+        _check_teachers(opened, walls, [])
+    with pytest.raises(InputError, match="1 scenes have none of them, such as 'wall_3'"):
+        _check_teachers(opened, [*walls, Path("wall_3")], [])
+    with pytest.raises(InputError, match="teacher heights: no scene to train on has it"):
+        _check_teachers(opened, walls[2:], walls[:2])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _check_teachers(opened, walls[:1], walls[1:2])
+
+
+def test_the_space_is_that_of_the_scenes_that_have_the_teacher() -> None:
+    def open_scene(path: Path) -> tuple[object, object]:
+        if path.name == "bare":
+            raise MissingInput("the scene has no labels")
+        return scene(0), HeightTeacher()
+
+    arguments = {"config": PREPARE.fusion, "views": 2}
+    found = dataset_space([Path("bare"), Path("a")], open_scene, optional=True, **arguments)  # type: ignore[arg-type]
+    expected = dataset_space([Path("a")], open_scene, **arguments)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.outputs.mean, expected.outputs.mean, atol=1e-6)
+    with pytest.raises(MissingInput, match="no labels"):
+        dataset_space([Path("bare")], open_scene, optional=True, **arguments)  # type: ignore[arg-type]
+    with pytest.raises(MissingInput, match="no labels"):
+        dataset_space([Path("bare"), Path("a")], open_scene, **arguments)  # type: ignore[arg-type]
+
+
+def test_scenes_prepared_for_one_teacher_are_not_taken_for_those_of_several(datasets: Datasets) -> None:
+    folder = datasets["sides"][0].folder
+    assert teacher_folders(folder, ["sides"]) == {"sides": folder}
+    with pytest.raises(InputError, match="was prepared for one teacher, and this run has several"):
+        teacher_folders(folder, ["sides", "heights"])
+
+
+def test_two_teachers_of_one_feature_space_are_refused(datasets: Datasets) -> None:
+    outputs, _ = datasets["sides"][0].load_space()
+    with pytest.raises(InputError, match=r"two of them have features called 'sides'"):
+        OutputSpaces(by_teacher={"a": outputs, "b": outputs})
+
+
+def _stop_at(step: int) -> object:
+    def track(steps: range, label: str) -> object:
+        for number in steps:
+            if number == step:
+                raise KeyboardInterrupt
+            yield number
+
+    return track
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    return folder
