@@ -61,7 +61,7 @@ class Preprocessing:
         resized = torch.nn.functional.interpolate(
             values, (rows * patch, columns * patch), mode=FLOAT_FILTERS[self.resample], antialias=True
         )
-        pixels = normalized(resized[0].permute(1, 2, 0).numpy(), 1, self.mean, self.std)
+        pixels = normalized(resized[0].permute(1, 2, 0).numpy(), 1.0, self.mean, self.std)
         return pixels.transpose(2, 0, 1)[None], np.array([[columns / width, 0, 0], [0, rows / height, 0]])
 
     def describe(self) -> str:
