@@ -1,4 +1,4 @@
-"""Small random vision towers of the true architectures with their preprocessing, saved as `from_pretrained` reads them."""
+"""Small random vision towers of the true architectures, saved with their preprocessing as transformers reads it."""
 
 import json
 from collections.abc import Callable, Mapping

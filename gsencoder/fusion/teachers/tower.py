@@ -48,8 +48,8 @@ class TransformersConfig:
     large: Literal["interpolate", "windows"] = field(
         default="interpolate",
         metadata={
-            "help": "pictures of another size than the model's: its position embeddings are interpolated, or windows of "
-            "its size are averaged"
+            "help": "pictures of another size than the model's: its position embeddings are interpolated, or windows "
+            "of its size are averaged"
         },
     )
     overlap: float = field(

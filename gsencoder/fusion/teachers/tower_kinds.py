@@ -67,11 +67,13 @@ class TowerInFolder:
     Attributes:
         kind: of the tower.
         config: of the tower, as transformers reads it.
-        cut_out: whether the tower is a part of a larger model, such as a vision-language model.
+        alone: whether the folder holds the tower alone.
+        cut_out: whether it is a part of a larger model, such as a vision-language model, of which nothing else is read.
     """
 
     kind: TowerKind
     config: Any
+    alone: bool
     cut_out: bool
 
 
@@ -91,8 +93,9 @@ def tower_in(folder: Path) -> TowerInFolder:
     if stated.model_type == "clip":
         # The width of the joint space stands in both configurations, and in old files only in this one.
         config.projection_dim = stated.projection_dim
-    whole = config is stated or stated.model_type in WITH_OTHER_PARTS
-    return TowerInFolder(kind=kind, config=config, cut_out=not whole)
+    alone = config is stated
+    cut_out = not alone and stated.model_type not in WITH_OTHER_PARTS
+    return TowerInFolder(kind=kind, config=config, alone=alone, cut_out=cut_out)
 
 
 def supported() -> str:

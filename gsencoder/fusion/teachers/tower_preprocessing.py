@@ -89,7 +89,7 @@ def read_preprocessing(folder: Path, what: str, *, floats: bool = False) -> Prep
     missing = [name for name in ("resample", "image_mean", "image_std") if name not in stated]
     if missing:
         raise InputError(f"{where} does not state {', '.join(missing)}; take the file that belongs to the model")
-    if type(stated["resample"]) is not int or stated["resample"] not in list(Image.Resampling):
+    if type(stated["resample"]) is not int or not 0 <= stated["resample"] <= 5:
         raise InputError(f"{where}: resample: expected a number from 0 to 5, got {stated['resample']!r}")
     resample = Image.Resampling(stated["resample"])
     if floats and resample not in FLOAT_FILTERS:
