@@ -11,6 +11,8 @@ from splats import front_camera
 from vision_towers import LAYERS, MAKERS, PATCH, SIDE, picture, processor_of, save_vision_tower, tower_of
 
 from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
+from gsencoder.fusion.teachers.tower_kinds import tower_in
+from gsencoder.fusion.teachers.tower_network import VisionTower
 from gsencoder.types import FeatureMap, Views
 
 transformers = pytest.importorskip("transformers")
@@ -218,6 +220,21 @@ def test_the_layout_of_published_llava_weights_is_read(saved: Save, tmp_path: Pa
     old = {name.replace("vision_tower.", "vision_tower.vision_model."): value for name, value in weights.items()}
     save_file(old, tmp_path / "model.safetensors", {"format": "pt"})
     np.testing.assert_array_equal(features_of(tmp_path, SQUARE[0]), features_of(folder, SQUARE[0]))
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+@pytest.mark.parametrize("dense", ["auto", "tokens"])
+def test_a_tower_in_bfloat16_stays_near_the_one_in_float32(saved: Save, kind: str, dense: Any) -> None:
+    """As on a GPU, where it runs under autocast."""
+    folder, _ = saved(kind)
+    network = VisionTower(folder, tower_in(folder), dense, None)
+    pixels = torch.randn(1, 3, SIDE, SIDE - PATCH, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        exact = network(pixels)
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded = network(pixels)
+    assert exact.dtype == rounded.dtype == torch.float32
+    assert 0 < (rounded - exact).norm() / exact.norm() < 0.05
 
 
 def test_no_part_of_a_picture_is_cut_off(saved: Save) -> None:

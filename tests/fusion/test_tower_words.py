@@ -13,6 +13,8 @@ from text_towers import save_tokenizer
 from vision_towers import save_vision_tower
 
 from gsencoder.app import cli
+from gsencoder.app.commands.fuse import FuseCommandConfig
+from gsencoder.app.settings.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
@@ -170,6 +172,36 @@ def test_a_scene_is_fused_and_words_are_localized_in_it(
     assert cli.main([*phrase, "text=transformers", f"text.model={model}", "quiet=true"]) == 0
     assert cli.main([*fuse, "teacher.dense=tokens", "teacher.size=48", f"out={tmp_path / 'tokens'}"]) == 0
     assert features_of(tmp_path / "tokens").space.channels == vision_towers.SHAPE["hidden_size"]
+
+
+@pytest.mark.parametrize(
+    ("preset", "kind", "dense", "grid"),
+    [
+        ("clip", "clip", "values", (37, 56)),
+        ("siglip2", "siglip2", "summary", (43, 64)),
+        ("dinov2", "dinov2_with_registers", "tokens", (43, 65)),
+        ("dinov3", "dinov3", "tokens", (64, 96)),
+    ],
+)
+def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str, dense: str, grid: Any) -> None:
+    from splats import front_camera
+
+    from gsencoder.types import Views
+
+    save_vision_tower(kind, tmp_path / kind)
+    config = compose("fuse", FuseCommandConfig, ("s", f"teacher={preset}", f"teacher.model={tmp_path / kind}")).teacher
+    assert isinstance(config, TransformersConfig)
+    assert config.dense == dense
+    views = Views(cameras=front_camera(30, 20), names=("a",), images=[vision_towers.picture(20, 30)])
+    features = build_teacher(config, Scene(name="s"), None).feature_map(views, 0).features
+    assert features is not None
+    assert features.shape[:2] == grid
+
+
+def test_the_preset_of_sam_is_of_its_published_size(tmp_path: Path) -> None:
+    config = compose("fuse", FuseCommandConfig, ("s", "teacher=sam")).teacher
+    assert isinstance(config, TransformersConfig)
+    assert config.size == transformers.SamVisionConfig().image_size
 
 
 @pytest.mark.slow
