@@ -93,6 +93,15 @@ def paligemma() -> Any:
     )
 
 
+def gemma3() -> Any:
+    vision = {"model_type": "siglip_vision_model", "vision_use_head": False, **VISION}
+    text = {"model_type": "gemma3_text", **SMALL, "vocab_size": 40, "num_key_value_heads": 1, "head_dim": 8}
+    tokens = {"mm_tokens_per_image": 4, "image_token_index": 3, "boi_token_index": 4, "eoi_token_index": 5}
+    return transformers.Gemma3ForConditionalGeneration(
+        transformers.Gemma3Config(vision_config=vision, text_config=text, **tokens)
+    )
+
+
 def idefics3() -> Any:
     return transformers.Idefics3ForConditionalGeneration(
         transformers.Idefics3Config(vision_config=VISION, text_config=LLAMA, image_token_id=3, pad_token_id=0)
@@ -117,6 +126,7 @@ MAKERS: Mapping[str, Callable[[], Any]] = {
         sam,
         llava,
         paligemma,
+        gemma3,
         idefics3,
         smolvlm,
     )

@@ -74,7 +74,7 @@ def inputs_of(kind: str, image: np.ndarray, grid: tuple[int, int]) -> dict[str, 
 
 
 def options_of(kind: str) -> dict[str, Any]:
-    return {"interpolate_pos_encoding": True} if kind in ("clip", "siglip", "llava", "paligemma") else {}
+    return {"interpolate_pos_encoding": True} if kind in ("clip", "siglip", "llava", "paligemma", "gemma3") else {}
 
 
 def direct(kind: str, model: Any, image: np.ndarray, grid: tuple[int, int], layer: int | None = None) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -175,15 +176,16 @@ def test_a_scene_is_fused_and_words_are_localized_in_it(
 
 
 @pytest.mark.parametrize(
-    ("preset", "kind", "dense", "grid"),
+    ("preset", "kind", "dense", "size"),
     [
-        ("clip", "clip", "values", (37, 56)),
-        ("siglip2", "siglip2", "summary", (43, 64)),
-        ("dinov2", "dinov2_with_registers", "tokens", (43, 65)),
-        ("dinov3", "dinov3", "tokens", (64, 96)),
+        ("clip", "clip", "values", 448),
+        ("siglip2", "siglip2", "summary", 512),
+        ("dinov2", "dinov2_with_registers", "tokens", 518),
+        ("dinov3", "dinov3", "tokens", 768),
+        ("sam", "sam", "tokens", 1024),
     ],
 )
-def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str, dense: str, grid: Any) -> None:
+def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str, dense: str, size: int) -> None:
     from splats import front_camera
 
     from gsencoder.types import Views
@@ -191,17 +193,12 @@ def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str,
     save_vision_tower(kind, tmp_path / kind)
     config = compose("fuse", FuseCommandConfig, ("s", f"teacher={preset}", f"teacher.model={tmp_path / kind}")).teacher
     assert isinstance(config, TransformersConfig)
-    assert config.dense == dense
+    assert (config.dense, config.size) == (dense, size)
+    config = replace(config, size=vision_towers.SIDE)
     views = Views(cameras=front_camera(30, 20), names=("a",), images=[vision_towers.picture(20, 30)])
     features = build_teacher(config, Scene(name="s"), None).feature_map(views, 0).features
     assert features is not None
-    assert features.shape[:2] == grid
-
-
-def test_the_preset_of_sam_is_of_its_published_size(tmp_path: Path) -> None:
-    config = compose("fuse", FuseCommandConfig, ("s", "teacher=sam")).teacher
-    assert isinstance(config, TransformersConfig)
-    assert config.size == transformers.SamVisionConfig().image_size
+    assert features.shape[:2] == (3, 4)
 
 
 @pytest.mark.slow
