@@ -299,6 +299,17 @@ def test_a_folder_without_weights_or_with_damaged_ones_is_refused(copied: Any, k
         teacher(path.parent)
 
 
+def test_a_clip_without_its_projection_is_damaged_and_a_vision_tower_alone_is_not(copied: Any) -> None:
+    folder = copied("clip")
+    change_weights(folder, lambda weights: {n: v for n, v in weights.items() if n != "visual_projection.weight"})
+    with pytest.raises(InputError, match=r"1 are missing \(visual_projection\.weight\)"):
+        teacher(folder)
+    stated = json.loads((folder / "config.json").read_text())["vision_config"]
+    (folder / "config.json").write_text(json.dumps({**stated, "model_type": "clip_vision_model"}))
+    change_weights(folder, lambda weights: {n: v for n, v in weights.items() if n.startswith("vision_model.")})
+    assert teacher(folder).space.layer == "tokens after the final norm"
+
+
 def test_a_vision_language_model_without_its_tower_is_refused(copied: Any) -> None:
     folder = copied("llava")
     change_weights(folder, lambda weights: {n: v for n, v in weights.items() if "vision_tower" not in n})

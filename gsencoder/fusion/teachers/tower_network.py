@@ -45,8 +45,8 @@ class VisionTower(nn.Module):
             folder: of the model.
             tower: what its configuration says.
             dense: what the vectors are; auto = in the joint space if there is one: values of CLIP, summary of SigLIP.
-            layer: hidden states of a layer, as transformers counts them: 0 = what goes into the first layer, −1 = what
-                comes from the last one, without the final norm. None = after the final norm.
+            layer: tokens are hidden states of a layer, as transformers counts them: 0 = what goes into the first layer,
+                −1 = what comes from the last one, without the final norm. None = after the final norm.
 
         Raises:
             InputError: weights that cannot be read or do not fit, or vectors or a layer that the model does not have.
@@ -85,19 +85,18 @@ class VisionTower(nn.Module):
         return self.dense != "tokens"
 
     def _joint_head(self, folder: Path, tower: TowerInFolder) -> str:
-        """The kind's head if this folder has it: towers are also published without."""
+        """The kind's head if this folder has it: towers that are published alone may be without."""
         if tower.cut_out:
             return ""
         if self._kind.joint == "head":
             return "head" if tower.config.vision_use_head else ""
         if self._kind.joint == "projection":
-            return "projection" if "visual_projection.weight" in _names_of_weights(folder) else ""
+            has = not tower.alone or "visual_projection.weight" in _names_of_weights(folder)
+            return "projection" if has else ""
         return ""
 
     def _decide(self, dense: str, layer: int | None) -> Dense:
-        if layer is not None and dense in ("values", "summary"):
-            raise InputError(f"{WHAT}: layer: hidden states of a layer are dense=tokens; leave out one of the two")
-        if dense == "tokens" or (dense == "auto" and (layer is not None or not self._head)):
+        if dense == "tokens" or layer is not None or (dense == "auto" and not self._head):
             return "tokens"
         if not self._head:
             raise InputError(
