@@ -39,7 +39,7 @@ class TransformersConfig:
         default=None,
         metadata={
             "help": "hidden states of this layer: -2 = before the last layer, -1 = after it, 1 = after the first; "
-            "none = after the final norm"
+            "null = after the final norm"
         },
     )
     size: int = field(
