@@ -13,7 +13,7 @@ EXTRA = "pip install 'gsencoder[teachers]'"
 VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
 
 
-def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = "warn") -> Any:
+def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = "warn", **options: Any) -> Any:
     """A model with exactly the weights of a folder, in evaluation mode.
 
     Args:
@@ -22,6 +22,7 @@ def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = 
         what: who loads it, for messages.
         other_parts: what is done about weights of modules that the class does not have, such as the other tower of a
             joint model: "warn" or "ignore".
+        options: further arguments of `from_pretrained`.
 
     Raises:
         InputError: the folder holds no model of that class, or weights that do not fit its configuration.
@@ -29,29 +30,98 @@ def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = 
     Warns:
         SceneWarning: weights of other modules are not used, with `other_parts="warn"`.
     """
+    weight_files(folder, what)
+    with _readable(folder, what):
+        model, report = _from_pretrained(loader, str(folder), use_safetensors=True, **options)
+    _check_keys(folder, model, report, what, other_parts)
+    return model.eval()
+
+
+def load_part(loader: Any, config: Any, folder: Path, weight: str, what: str) -> tuple[Any, list[Path]]:
+    """A part of the model of a folder, such as the vision tower of a vision-language model, with exactly its weights.
+
+    No other weights are read. The part is in evaluation mode and in float32.
+
+    Args:
+        loader: a class of transformers with `from_pretrained`.
+        config: of the part.
+        folder: with safetensors files.
+        weight: name of one of the part's weights within the part; the rest of its name in the files is the prefix of
+            the part.
+        what: who loads it, for messages.
+
+    Returns:
+        The part, and the files that hold weights of it.
+
+    Raises:
+        InputError: the files hold no such part or several, or weights that do not fit its configuration.
+    """
+    files = weight_files(folder, what)
+    with _readable(folder, what):
+        import torch
+        from safetensors import safe_open
+
+        names: dict[str, Path] = {}
+        for path in files:
+            with safe_open(path, framework="pt") as opened:
+                names |= dict.fromkeys(opened.keys(), path)
+        prefixes = sorted(name.removesuffix(weight) for name in names if name.endswith(f".{weight}") or name == weight)
+        if len(prefixes) != 1:
+            raise InputError(f"{what}: {folder}: {len(prefixes)} of its weights end in {weight}; expected one")
+        weights: dict[str, Any] = {}
+        used = sorted({path for name, path in names.items() if name.startswith(prefixes[0])})
+        for path in used:
+            with safe_open(path, framework="pt") as opened:
+                for name in opened.keys():  # noqa: SIM118 - it is no mapping
+                    if name.startswith(prefixes[0]):
+                        weights[name.removeprefix(prefixes[0])] = opened.get_tensor(name)
+        model, report = _from_pretrained(loader, None, config=config, state_dict=weights, dtype=torch.float32)
+    _check_keys(folder, model, report, what, "warn")
+    return model.eval(), used
+
+
+def weight_files(folder: Path, what: str) -> list[Path]:
+    """The safetensors files of a folder.
+
+    Raises:
+        InputError: there are none.
+    """
+    files = sorted(folder.glob("*.safetensors"))
+    if not files:
+        raise InputError(f"{what}: {folder} has no weights as safetensors, and files of pickles are not opened")
+    return files
+
+
+def _from_pretrained(loader: Any, source: str | None, **options: Any) -> tuple[Any, Mapping[str, Any]]:
+    """A model and the report of which of its weights were there."""
+    with quiet_transformers():
+        # Sizes that do not match are reported with the keys that do not, instead of an error that names none.
+        model, report = loader.from_pretrained(
+            source,
+            local_files_only=True,
+            trust_remote_code=False,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,
+            **options,
+        )
+    return model, report
+
+
+@contextmanager
+def _readable(folder: Path, what: str) -> Iterator[None]:
+    """Turns the errors of libraries that read a model into one that names its folder."""
     try:
         from safetensors import SafetensorError
     except ImportError as error:
         raise InputError(f"{what}: needs the package transformers ({EXTRA})") from error
-    if not list(folder.glob("*.safetensors")):
-        raise InputError(f"{what}: {folder} has no weights as safetensors, and files of pickles are not opened")
     try:
-        with quiet_transformers():
-            # Sizes that do not match are reported with the keys that do not, instead of an error that names none.
-            model, report = loader.from_pretrained(
-                str(folder),
-                local_files_only=True,
-                trust_remote_code=False,
-                use_safetensors=True,
-                output_loading_info=True,
-                ignore_mismatched_sizes=True,
-            )
+        yield
+    except InputError:
+        raise
     except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError, SafetensorError) as error:
         for path in folder.glob("*.safetensors"):
             check_fetched(path)
         raise _unreadable(folder, what, error) from error
-    _check_keys(folder, model, report, what, other_parts)
-    return model.eval()
 
 
 def read_config(folder: Path, what: str) -> Any:

@@ -12,12 +12,13 @@ from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
+from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
 from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable, load_text_table, make_text_table
 from gsencoder.types import Scene
 
-TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig | SegmenterConfig
+TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig | SegmenterConfig | TransformersConfig
 
 
 def text_table_of(config: TeacherConfig) -> TextTable | None:
@@ -55,7 +56,12 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
             "text=: the features of teacher=onnx are taken for those of the text tower if teacher.joint=true says that "
             "both belong to one joint model, such as CLIP; other backbones have no words"
         )
-    if isinstance(config, (OnnxConfig, SegmenterConfig)) and config.words:
+    if isinstance(config, TransformersConfig) and (config.dense == "tokens" or config.layer is not None):
+        raise InputError(
+            "text=: no words lead into hidden states (teacher.dense=tokens, teacher.layer=); give teacher.dense=values "
+            "or summary with a text-aligned model, or leave out text="
+        )
+    if isinstance(config, (OnnxConfig, SegmenterConfig, TransformersConfig)) and config.words:
         raise InputError("text= and teacher.words= both say what words are; leave out one of them")
     return vocabulary_of(text)
 
@@ -103,12 +109,17 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
         return PaletteTeacher(config)
     if isinstance(config, OnnxConfig):
         backbone = OnnxTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
-        if words is not None and words.space.channels != backbone.space.channels:
-            raise InputError(
-                f"teacher onnx: its features have {backbone.space.channels} channels and its words "
-                f"{words.space.channels} ({words.space.text_encoder}); expected both of one joint model"
-            )
+        _check_channels(backbone, words)
         return backbone
+    if isinstance(config, TransformersConfig):
+        tower = TransformersTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
+        if isinstance(words, OpenVocabulary) and not tower.joint:
+            raise InputError(
+                f"text=: no words lead into {tower.space.layer} of {tower.space.name}; leave out text=, or give a "
+                "text-aligned model (CLIP, SigLIP, SigLIP2) with its head"
+            )
+        _check_channels(tower, words)
+        return tower
     if isinstance(config, RadioConfig):
         return RadioTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
     if isinstance(config, SegmenterConfig):
@@ -130,3 +141,11 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
         mean=table.mean,
         cell=config.cell,
     )
+
+
+def _check_channels(teacher: Teacher, words: Words | None) -> None:
+    if words is not None and words.space.channels != teacher.space.channels:
+        raise InputError(
+            f"teacher {teacher.space.teacher}: its features have {teacher.space.channels} channels and its words "
+            f"{words.space.channels} ({words.space.text_encoder}); expected both of one joint model"
+        )
