@@ -89,7 +89,7 @@ def encoder(folder: Path) -> Made:
 
 def heads(folder: Path) -> Made:
     save_heads(folder / "h", {"clip": (torch.nn.Sequential(torch.nn.Linear(4, 3)), np.ones(3), 2.0)})
-    return folder / "h", lambda: [head.state_dict() for head, _ in load_heads(folder / "h", an_output_space())]
+    return folder / "h", lambda: [head.state_dict() for head, _ in load_heads(folder / "h", an_output_space()["s"])]
 
 
 def prepared_file(folder: Path, name: str) -> Made:

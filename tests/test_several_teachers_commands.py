@@ -183,5 +183,6 @@ def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pyt
         (["teacher=[palette,x:onnx]"], "teacher.model= is missing"),
     ):
         assert message in refusal(capsys, *train, *more), more
-    line = refusal(capsys, "train", str(rooms / "room_1"), *QUICK[2:], "teacher=[labels,palette]", words, *train[-2:])
+    fresh = [f"out={tmp_path / 'out'}", f"prepared={tmp_path / 'fresh'}"]
+    line = refusal(capsys, "train", str(rooms / "room_1"), *QUICK[2:], "teacher=[labels,palette]", words, *fresh)
     assert "the scene lists no objects" in line

@@ -74,11 +74,11 @@ def test_chunks_whose_halo_covers_what_a_token_sees_give_what_the_whole_gives() 
 
 def test_chunks_give_nearly_what_the_whole_gives_and_the_halo_is_why() -> None:
     one = random_gaussians(1500)
-    whole = encode(one, encoder(), OUTPUTS, WHOLE).features - OUTPUTS.mean
+    whole = encode(one, encoder(), OUTPUTS, WHOLE).features - SPACE.mean
     cosines = []
     for halo in (0.0, 1.0):
         assert len(cut(one.means, 700, halo)) > 1
-        parts = encode(one, encoder(), OUTPUTS, replace(WHOLE, chunk=700, halo=halo)).features - OUTPUTS.mean
+        parts = encode(one, encoder(), OUTPUTS, replace(WHOLE, chunk=700, halo=halo)).features - SPACE.mean
         norms = np.linalg.norm(whole, axis=1) * np.linalg.norm(parts, axis=1)
         cosines.append(float(((whole * parts).sum(axis=1) / norms).mean()))
     assert cosines[1] > 0.97
@@ -87,7 +87,7 @@ def test_chunks_give_nearly_what_the_whole_gives_and_the_halo_is_why() -> None:
 
 def test_features_come_with_their_space_and_a_weight_for_every_gaussian() -> None:
     found = encode(random_gaussians(50), encoder(), OUTPUTS, WHOLE)
-    assert found.space == OUTPUTS.space
+    assert found.space == SPACE.space
     assert (found.weights == 1).all()
     assert found.basis is None
 

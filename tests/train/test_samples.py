@@ -278,11 +278,13 @@ def test_no_scenes_are_refused(dataset: tuple[PreparedDataset, list[str]]) -> No
 def test_views_that_see_nothing_are_named(dataset: tuple[PreparedDataset, list[str]]) -> None:
     data = samples(*dataset)
     scene = data.scenes[0]
-    scene._header[0].cam_from_world[:, 2, 3] -= 1000  # Both cameras now stand behind the wall and look away.
+    (part,) = scene.parts
+    assert part is not None
+    part._header[0].cam_from_world[:, 2, 3] -= 1000  # Both cameras now stand behind the wall and look away.
     data = SampleDataset([scene], replace(data.recipe, augmentation=AugmentConfig()))
     with pytest.raises(InputError, match=r"scene wall_0: sample: no Gaussian"):
         data.make(0)
     # From a worker it comes back as a value, and through the batch, so that it can be raised in its own words.
     assert isinstance(data[0], InputError)
     assert isinstance(join_samples([data[0]], SMALL.transformer.patch), InputError)
-    scene._header[0].cam_from_world[:, 2, 3] += 1000
+    part._header[0].cam_from_world[:, 2, 3] += 1000
