@@ -68,6 +68,8 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
 
 def takes_text(config: TeacherConfig) -> bool:
     """Whether the words of a teacher may be those of a text tower."""
+    if isinstance(config, TransformersConfig):
+        return config.dense in ("values", "summary")
     return isinstance(config, (LabelsConfig, SegmenterConfig)) or (isinstance(config, OnnxConfig) and config.joint)
 
 

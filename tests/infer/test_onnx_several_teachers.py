@@ -1,0 +1,63 @@
+"""An exported encoder with several teachers: all spaces in one graph, as torch gives them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from symbolic import symbolic_sizes
+
+from gsencoder.core.errors import InputError
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.onnx.export import Cloud, check_cosines, check_parity, export_onnx, lower, random_cloud
+from gsencoder.infer.onnx.runtime import OnnxEncoder
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
+from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.weights import save_weights
+from gsencoder.text.table import load_text_table, save_text_table
+from gsencoder.types import FeatureSpace
+
+SHAPE = TransformerConfig(
+    encoder_depths=(1, 1),
+    encoder_channels=(16, 32),
+    decoder_depths=(1,),
+    decoder_channels=(16,),
+    head_channels=8,
+    patch=24,
+)
+ALONE = EncodeConfig(chunk=0, precision="float32", device="cpu")
+
+
+@pytest.mark.slow
+def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights: Path, tmp_path: Path) -> None:
+    first = TorchEncoder(str(weights)).outputs.select()
+    second = OutputSpace(space=FeatureSpace(name="three", channels=3), mean=np.arange(3, dtype=np.float32), scale=5.0)
+    outputs = OutputSpaces(by_teacher={"labels": first, "colors": second})
+    torch.manual_seed(1)
+    network = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), outputs.channels)
+    save_weights(tmp_path / "encoder.safetensors", network, outputs, {"steps": 1})
+    save_text_table(tmp_path / "words.labels.safetensors", load_text_table(weights / "words.safetensors"))
+    encoder = TorchEncoder(str(tmp_path))
+    clouds = [Cloud(f"{count}", random_cloud(count, encoder.voxel, seed=count)) for count in (1, 300)]
+    with symbolic_sizes():
+        lowered = lower(encoder)
+    model = export_onnx(encoder, lowered)
+    assert max(check_parity(model, encoder, clouds).values()) < 1e-4
+    assert check_cosines(export_onnx(encoder, lowered, "int8_weights"), model, clouds[1:], cosine=0.98)
+    runtime = OnnxEncoder(model, device="cpu")
+    assert set(runtime.spaces) == {"labels", "colors"}
+    assert set(runtime.tables) == {"labels"}
+    cloud = clouds[1].gaussians
+    together = runtime.encode_spaces(cloud, ALONE)
+    for name, features in together.items():
+        np.testing.assert_array_equal(runtime.encode(cloud, ALONE, space=name).features, features.features)
+    with pytest.raises(InputError, match="gives features of labels, colors; name one of them"):
+        runtime.encode(cloud, ALONE)
+    # A wrong block of columns in the graph is not hidden by the larger numbers of another space.
+    swapped = OutputSpaces(by_teacher={"labels": first, "colors": replace(second, scale=5.001)})
+    encoder.outputs = swapped
+    with pytest.raises(InputError, match="onnxruntime and torch differ"):
+        check_parity(model, encoder, clouds[1:])
