@@ -1,7 +1,7 @@
 """Models of transformers in folders on disk: loaded without a network, without pickles, and without a folder's code."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,9 @@ EXTRA = "pip install 'gsencoder[teachers]'"
 VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
 
 
-def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = "warn") -> Any:
+def load_pretrained(
+    loader: Any, folder: Path, what: str, *, other_parts: str = "warn", known_parts: Sequence[str] = ()
+) -> Any:
     """A model with exactly the weights of a folder, in evaluation mode.
 
     Args:
@@ -22,6 +24,8 @@ def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = 
         what: who loads it, for messages.
         other_parts: what is done about weights of modules that the class does not have, such as the other tower of a
             joint model: "warn" or "ignore".
+        known_parts: what keys of weights begin with that are read from the same files by other means, and need no
+            warning.
 
     Raises:
         InputError: the folder holds no model of that class, or weights that do not fit its configuration.
@@ -50,6 +54,7 @@ def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = 
         for path in folder.glob("*.safetensors"):
             check_fetched(path)
         raise _unreadable(folder, what, error) from error
+    report["unexpected_keys"] = [key for key in report["unexpected_keys"] if not key.startswith(tuple(known_parts))]
     _check_keys(folder, model, report, what, other_parts)
     return model.eval()
 

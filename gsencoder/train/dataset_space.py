@@ -54,9 +54,8 @@ def dataset_space(
     tables: list[np.ndarray] = []
     moments: Moments | None = None
     teacher: Teacher | None = None
-    view_bounds = np.linspace(0, views, len(scenes) + 1).round().astype(int)
-    for number, path in enumerate(scenes):
-        if teacher is not None and teacher.table is None and view_bounds[number] == view_bounds[number + 1]:
+    for path, count in zip(scenes, views_of_scenes(len(scenes), views), strict=True):
+        if teacher is not None and teacher.table is None and not count:
             continue
         scene, scene_teacher = open_scene(path)
         if teacher is not None and scene_teacher.space != teacher.space:
@@ -70,7 +69,7 @@ def dataset_space(
             continue
         moments = moments or Moments(teacher.space.channels)
         assert scene.views is not None
-        _add_maps(moments, teacher, scene.views, max(1, int(view_bounds[number + 1] - view_bounds[number])))
+        _add_maps(moments, teacher, scene.views, count)
     assert teacher is not None
     if tables:
         table = np.unique(np.concatenate(tables), axis=0)
@@ -78,6 +77,12 @@ def dataset_space(
         return space, space.standardize(to_coordinates(space.basis, table) if space.basis is not None else table)
     assert moments is not None
     return replace(_dense_space(moments, teacher, config), centered=center, scaled=scale), None
+
+
+def views_of_scenes(scenes: int, views: int) -> list[int]:
+    """How many of `views` maps are those of each scene, evenly distributed; the first scene has one at least."""
+    counts = [int(count) for count in np.diff(np.linspace(0, views, scenes + 1).round())]
+    return [max(1, counts[0]), *counts[1:]]
 
 
 def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:

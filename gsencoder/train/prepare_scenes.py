@@ -19,7 +19,8 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.text.table import TextTable
-from gsencoder.train.distributed import ProcessRank, fail_together
+from gsencoder.train.adapter_heads import measure_dataset_heads
+from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
 from gsencoder.types import Scene
 
@@ -77,6 +78,7 @@ def prepare_scenes(
     folder: Path,
     *,
     voxel: float,
+    heads: Sequence[str] = (),
     process: ProcessRank = ProcessRank(),
     track: Track = untracked,
 ) -> PreparedDataset:
@@ -90,6 +92,7 @@ def prepare_scenes(
         folder: folder of the prepared dataset; created if it does not exist.
         voxel: edge length of the encoder's grid cells in metres, from which the unit of a splat is estimated if it is
             unknown.
+        heads: names of the teacher's adapter heads that are measured over the dataset.
         process: rank of this process.
         track: wraps loops to show progress.
 
@@ -97,6 +100,8 @@ def prepare_scenes(
         InputError: in any process, a scene cannot be used, or the folder cannot.
     """
     sections = {name: plain(getattr(config, name)) for name in ("data", "seeds", "teacher", "prepare")}
+    # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.
+    sections["teacher"].pop("heads", None)
     made_with: dict[str, Any] = {
         "scenes": {path.name: str(path.resolve()) for path in training},
         "words": _text_table_digest(words),
@@ -109,12 +114,18 @@ def prepare_scenes(
             dataset = PreparedDataset(folder, made_with)
             dataset.remove_stale_maps()
             dataset.fit_space(training, read_views, config.prepare)
+            views = config.prepare.basis_views
+            measure_dataset_heads(dataset, heads, config.teacher, training, read_views, views)
     dataset = PreparedDataset(folder, made_with)
     missing = [path for path in [*training, *held_out] if not dataset.has_scene(path)]
     with fail_together():
         pass  # No process may start to prepare before all have listed the missing scenes.
+    share = missing[process.rank :: process.world_size]
     with fail_together():
-        assigned: Iterable[Path] = track(missing[process.rank :: process.world_size], "preparing scenes")
+        weights = read_views(share[0])[1].space.weights if share and process.world_size > 1 else ""
+    check_agreement("the teacher's weights", weights)
+    with fail_together():
+        assigned: Iterable[Path] = track(share, "preparing scenes")
         for path in assigned:
             scene, teacher = read_scene(path)
             with about(path):

@@ -12,18 +12,18 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import plain
-from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.fusion.heads.store import heads_digest
 from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.text.table import TextTable
-from gsencoder.train.adapter_heads import load_heads
+from gsencoder.train.adapter_heads import asked_heads, dataset_heads, render_heads
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.crops import SamplingConfig
-from gsencoder.train.distributed import ProcessRank, join_processes
+from gsencoder.train.distributed import ProcessRank, check_agreement, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
@@ -44,9 +44,13 @@ class TrainConfig(SourceConfig):
     """Settings of a training run."""
 
     tensorboard: bool = field(default=True, metadata={"help": "write TensorBoard events in addition to log.csv"})
-    heads: str = field(
-        default="",
-        metadata={"help": "file of the teacher's adapter heads, on whose outputs L_render is computed; empty = none"},
+    heads: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "names": True,
+            "help": "the teacher's adapter heads on whose outputs L_render is computed, such as siglip,sam.features; "
+            "they are stored beside the weights; empty = L_render compares the features themselves",
+        },
     )
     model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -123,7 +127,15 @@ def train(
         prepared_folder = Path(prepared) if prepared is not None else folder / "prepared"
         voxel = config.model.voxel
         dataset = prepare_scenes(
-            training, validation, words, config, prepared_folder, voxel=voxel, process=process, track=track
+            training,
+            validation,
+            words,
+            config,
+            prepared_folder,
+            voxel=voxel,
+            heads=asked_heads(config.heads, config.teacher),
+            process=process,
+            track=track,
         )
         return fit(
             dataset,
@@ -158,6 +170,10 @@ def fit(
         InputError: see `train`.
     """
     outputs, _ = dataset.load_space()
+    heads = dataset_heads(dataset, config.heads)
+    if len(heads.heads) < len(config.heads):
+        raise InputError(f"heads: {', '.join(config.heads)} names a head twice; its loss would count twice")
+    check_agreement("the heads of L_render", heads_digest(heads))
     class_balance = dataset.load_class_balance()
     recipe = SampleRecipe(
         encoder=config.model,
@@ -179,7 +195,7 @@ def fit(
         config.train,
         folder=work,
         settings=resume_settings(config, process, dataset),
-        heads=load_heads(find_file(config.heads, "heads"), outputs) if config.heads else (),
+        heads=render_heads(heads, outputs),
         process=process,
         device=device,
         tensorboard=config.tensorboard,
@@ -201,7 +217,7 @@ def resume_settings(config: TrainConfig, process: ProcessRank, dataset: Prepared
     shared = {name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
     for name in CHANGEABLE_ON_RESUME:
         del shared["train"][name]
-    heads = digest_files(find_file(config.heads, "heads")) if config.heads else ""
+    heads = f"{','.join(config.heads)} ({heads_digest(dataset_heads(dataset, config.heads))})" if config.heads else ""
     return {
         **shared,
         **{"space": dataset.fingerprint(), "prepared": dataset.settings, "heads": heads},

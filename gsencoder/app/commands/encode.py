@@ -17,10 +17,11 @@ from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
+from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads, heads_beside
 from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.load_encoder import Encoder, load_encoder
+from gsencoder.infer.load_encoder import Encoder, file_of_encoder, load_encoder
 from gsencoder.text.table import save_text_table
-from gsencoder.types import GaussianFeatures, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +63,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     paths = find_scenes(config.paths)
     with summary.step("weights"):
         encoder = load_encoder(config.weights, config.encode.device)
+        heads = heads_beside(file_of_encoder(config.weights))
     screen = console(config.quiet)
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
@@ -73,9 +75,11 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
                     scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
             scene = with_reported_up(scene, one, quiet=config.quiet)
             with about(scene.name):
-                _encode_into(folder, scene, encoder, config, one)
+                space = _encode_into(folder, scene, encoder, config, one)
             if encoder.words is not None:
                 save_text_table(folder / WORDS_FILE, encoder.words)
+            if heads is not None:
+                copy_heads(heads, folder / HEADS_FILE, space)
         screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
         where = "this scene" if config.basis_views else "the scenes held out of the training"
         screen.print(f"{out}: basis of the encoder: {describe_basis(one.results['basis'], where)}")
@@ -98,7 +102,8 @@ def _encode_into(
     encoder: Encoder,
     config: EncodeCommandConfig,
     summary: Summary,
-) -> None:
+) -> FeatureSpace:
+    """Encodes a scene and writes its features; returns their space."""
     assert scene.gaussians is not None
     unit = unit_of(scene, encoder.voxel)
     with summary.step("encode"):
@@ -124,6 +129,7 @@ def _encode_into(
         space=features.space.describe(),
         features="features.safetensors",
     )
+    return features.space
 
 
 def _figures_of_scene(scene: Scene, features: GaussianFeatures, encoder: Encoder, count: int) -> dict[str, float]:

@@ -10,7 +10,9 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
+from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads
 from gsencoder.fusion.store.package import PACKAGE_FILE, Form, save_arrays, save_package, save_ply
+from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -22,6 +24,14 @@ class PackConfig(CommonConfig):
     paths: tuple[str, ...] = field(
         default=(),
         metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
+    )
+    head: str = field(
+        default="",
+        metadata={"help": "adapter head whose outputs are packed, such as siglip; empty = the features themselves"},
+    )
+    text: TextConfig = field(
+        default_factory=TableTextConfig,
+        metadata={"help": "text tower of the space of head=, whose words are packed with its outputs"},
     )
     form: Form = field(
         default="compact",
@@ -48,6 +58,8 @@ class PackConfig(CommonConfig):
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        if not self.head and not isinstance(self.text, TableTextConfig):
+            raise InputError("text=: is for the outputs of an adapter head; give head= as well, or leave it out")
         if not 0 < self.error < 1:
             raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
         if self.decoded and self.form == "compact":
@@ -59,17 +71,35 @@ def run(config: PackConfig, summary: Summary) -> None:
     source = Path(config.paths[0])
     with summary.step("load"):
         scene = load_features(source)
+    words = None
+    if config.head:
+        # Heads need torch, which packing does without.
+        from gsencoder.app.commands.through_head import packed_through_head
+
+        with summary.step("head"):
+            scene, words = packed_through_head(scene, source, config.head, config.text)
     features = next(iter(scene.features.values()))
     out = config.out or Path("outputs") / scene.name / "package"
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         with summary.step("pack"):
             message = _write(folder, scene, features, config, summary)
-        if (source / WORDS_FILE).is_file():
-            if config.form == "compact":
-                save_text_table(folder / WORDS_FILE, load_text_table(source / WORDS_FILE), dtype="float16")
-            else:
-                copyfile(source / WORDS_FILE, folder / WORDS_FILE)
+        if config.head:
+            if words is not None:
+                save_text_table(folder / WORDS_FILE, words, dtype="float16" if config.form == "compact" else "float32")
+        else:
+            _write_beside(folder, source, features, config.form)
     console(config.quiet).print(f"{out}: {message}")
+
+
+def _write_beside(folder: Path, source: Path, features: GaussianFeatures, form: Form) -> None:
+    """Writes the words and the adapter heads that lie beside the features."""
+    if (source / WORDS_FILE).is_file():
+        if form == "compact":
+            save_text_table(folder / WORDS_FILE, load_text_table(source / WORDS_FILE), dtype="float16")
+        else:
+            copyfile(source / WORDS_FILE, folder / WORDS_FILE)
+    if (source / HEADS_FILE).is_file():
+        copy_heads(source / HEADS_FILE, folder / HEADS_FILE, features.space)
 
 
 def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:

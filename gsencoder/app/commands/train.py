@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from gsencoder.app.commands.basis_figures import basis_figures, describe_basis
+from gsencoder.app.commands.head_figures import describe_heads, head_figures
 from gsencoder.app.runs.output_folder import lies_in, output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
@@ -23,12 +24,16 @@ from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit
+from gsencoder.fusion.heads.measure import HeadSet
+from gsencoder.fusion.heads.store import save_heads
 from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.text.table import save_text_table
+from gsencoder.train.adapter_heads import asked_heads, dataset_heads
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
 from gsencoder.train.prepared_scene import PreparedScene
@@ -79,7 +84,15 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
         with summary.step("prepare"):
             dataset = prepare_scenes(
-                training, held_out, words, config, prepared, voxel=config.model.voxel, process=process, track=track
+                training,
+                held_out,
+                words,
+                config,
+                prepared,
+                voxel=config.model.voxel,
+                heads=asked_heads(config.heads, config.teacher),
+                process=process,
+                track=track,
             )
         if config.prepare_only:
             counts = f"{len(training)} scenes to train on, {len(held_out)} for validation"
@@ -106,12 +119,15 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
         if folder is None:
             return
         figures = encoder_basis_figures(done.outputs, dataset.scenes(names(held_out)))
-        write_results(folder, state.path, done, figures, config, summary)
+        heads = dataset_heads(dataset, asked_heads(config.heads, config.teacher))
+        write_results(folder, state.path, done, figures, heads, config, summary)
     scores = ", ".join(f"{name} {value:.3f}" for name, value in done.scores.items()) or "not validated"
     minutes = done.state.seconds / 60
     screen = console(config.quiet)
     screen.print(f"{out}: {done.state.step} steps in {minutes:.1f} minutes; {scores}")
     screen.print(f"{out}: basis: {describe_basis(figures, 'held-out scenes')}")
+    for line in describe_heads(heads):
+        screen.print(f"{out}: {line}")
 
 
 def names(paths: Sequence[Path]) -> list[str]:
@@ -132,16 +148,20 @@ def write_results(
     work: Path,
     done: Training,
     figures: dict[str, int | float],
+    heads: HeadSet,
     config: TrainCommandConfig,
     summary: Summary,
 ) -> None:
-    """Writes weights, words, log and pictures; scores and the figures of the basis go into weights and summary."""
+    """Writes weights, words, heads, log and pictures; scores and the figures of the basis go into weights and
+    summary."""
     steps, seconds = done.state.step, done.state.seconds
     made_by = {"settings": settings(config), "steps": steps, "seconds": seconds, "validation": done.scores}
     made_by["basis"] = figures
     save_weights(folder / WEIGHTS_FILE, done.encoder, done.outputs, made_by, dtype=config.store)
     if done.words is not None:
         save_text_table(folder / WORDS_FILE, done.words, dtype=config.store)
+    if heads.heads:
+        save_heads(folder / HEADS_FILE, heads)
     shutil.copy(work / LOG_FILE, folder / LOG_FILE)
     for name in (EVENTS_FOLDER, "validation"):
         if (work / name).is_dir():
@@ -152,6 +172,7 @@ def write_results(
         parameters=sum(value.numel() for value in done.encoder.parameters()),
         validation=done.scores,
         basis=figures,
+        heads=head_figures(heads),
         weights=WEIGHTS_FILE,
         log=LOG_FILE,
     )

@@ -27,6 +27,7 @@ class Option:
         member: the member of a choice that it belongs to, such as "teacher=onnx"; empty if it always applies.
         kind: "text" and "list" (of text) are taken literally; "value" is parsed.
         secret: its value is never shown or written.
+        names: it is a list of names, around which users of Hydra may write brackets.
     """
 
     key: str
@@ -38,6 +39,7 @@ class Option:
     member: str
     kind: Kind
     secret: bool = False
+    names: bool = False
 
 
 MAX_WORD = 200
@@ -201,6 +203,7 @@ def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
                     member=member,
                     kind=kind_of(annotation),
                     secret=item.metadata.get("secret", False),
+                    names=item.metadata.get("names", False) or is_list_of_words(annotation),
                 )
             )
     return options
