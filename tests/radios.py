@@ -120,6 +120,7 @@ def small_siglip2_text(folder: Path, channels: int = OUTPUTS["siglip"], *, kind:
     text = {**small, "vocab_size": len(letters), "max_position_embeddings": 32, "eos_token_id": 1, "bos_token_id": 2}
     vision = {**small, "patch_size": 4}
     if kind == "clip":
+        text["projection_dim"] = channels
         config = transformers.CLIPConfig(text_config=text, vision_config=vision, projection_dim=channels)
         model: Any = transformers.CLIPModel(config)
     else:
