@@ -243,6 +243,12 @@ def test_packed_outputs_of_a_head_are_asked_with_the_words_beside_them(
     assert load_heads(tmp_path / "q" / "heads.safetensors").names == load_heads(encoded / "heads.safetensors").names
 
 
+def test_questions_are_asked_with_words_of_a_head(world: World, encoded: Path, tmp_path: Path) -> None:
+    words = ("question=Where is it?", f"query={WORDS}", "dry_run=true", "choose.count=1")
+    run("ask", str(encoded), "head=siglip", *world.text, *EVERY_BOX, *words, f"out={tmp_path / 'a'}")
+    assert (tmp_path / "a" / "prompt.txt").is_file()
+
+
 def test_tokens_are_outputs_of_the_head_for_rendered_features(world: World, encoded: Path, tmp_path: Path) -> None:
     def tokens(*words: str) -> tuple[np.ndarray, str]:
         folder = tmp_path / str(len(list(tmp_path.iterdir())))

@@ -302,3 +302,29 @@ def test_the_file_of_heads_lies_beside_weights_and_graphs_and_is_copied_for_its_
     with pytest.raises(InputError, match="damaged"):
         copy_heads(tmp_path / "heads.safetensors", tmp_path / "x", SPACE)
     assert not (tmp_path / "x").exists()
+
+
+def test_a_fusion_that_continues_from_its_cache_samples_the_cells_of_all_views(tmp_path: Path) -> None:
+    from training_scenes import DenseSideTeacher
+    from training_scenes import scene as a_scene
+
+    from gsencoder.fusion.fuse import FuseConfig, fuse
+
+    class Expensive(DenseSideTeacher):
+        cheap = False
+        asked = 0
+
+        def feature_map(self, views: Any, view: int) -> FeatureMap:
+            Expensive.asked += 1
+            return super().feature_map(views, view)
+
+    scene, config = a_scene(0), FuseConfig(basis=False)
+    plain = fuse(scene, Expensive(), config, sample_cells=True).sample
+    fuse(scene, Expensive(), config, work=tmp_path / "work")
+    Expensive.asked = 0
+    continued = fuse(scene, Expensive(), config, work=tmp_path / "work", sample_cells=True).sample
+    assert plain is not None
+    assert continued is not None
+    assert Expensive.asked == 0
+    np.testing.assert_allclose(continued.vectors(), plain.vectors(), rtol=1e-3, atol=1e-3)
+    assert fuse(scene, Expensive(), config).sample is None

@@ -56,15 +56,16 @@ def head_features(
     """
     with about(head.name):
         check_heads_space(backbone, features.space)
-    rows = np.flatnonzero(features.seen)
-    first, inverse = equal_rows(features.features[rows])
-    distinct = rows[first]
-    outputs = np.empty((len(distinct), head.channels), np.float32)
-    for start in range(0, len(distinct), CHUNK):
-        part = distinct[start : start + CHUNK]
-        outputs[start : start + CHUNK] = head_outputs(head.head, features.decode(part))
+    seen = np.flatnonzero(features.seen)
+    first, inverse = equal_rows(features.features[seen])
+    # Ordered by group, so that the outputs of a few groups at a time are written to all their rows.
+    order = np.argsort(inverse, kind="stable")
+    rows, group = seen[order], inverse[order]
     values = np.zeros((len(features), head.channels), np.float32)
-    values[rows] = outputs[inverse]
+    for start in range(0, len(first), CHUNK):
+        outputs = head_outputs(head.head, features.decode(seen[first[start : start + CHUNK]]))
+        begin, end = np.searchsorted(group, (start, start + CHUNK))
+        values[rows[begin:end]] = outputs[group[begin:end] - start]
     return GaussianFeatures(
         features=values,
         weights=features.weights,

@@ -5,6 +5,7 @@ basis that keeps the energy of the backbone's vectors. What it drops may be smal
 so the outputs for the projected vectors are compared with those for the full ones.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.device import choose_device
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.basis_fit import WORST
 from gsencoder.fusion.cell_sample import CellSample
@@ -127,13 +129,15 @@ def _measure(head: Head, vectors: Float32[np.ndarray, "n D"], projected: Float32
 
 
 def head_outputs(head: Head, vectors: Float32[np.ndarray, "n D"]) -> Float32[np.ndarray, "n E"]:
-    """The outputs of a head, computed by chunks in float32.
+    """The outputs of a head, computed by chunks in float32, on a GPU if there is one.
 
     Raises:
         InputError: outputs that are not finite.
     """
+    device = choose_device("auto")
+    body = head.body if device.type == "cpu" else copy.deepcopy(head.body).to(device)
     with torch.inference_mode():
-        parts = [head.body(part) for part in torch.from_numpy(vectors).split(CHUNK)]
+        parts = [body(part.to(device)).cpu() for part in torch.from_numpy(vectors).split(CHUNK)]
         outputs = torch.cat(parts) if parts else torch.zeros(0, head.channels)
     if not torch.isfinite(outputs).all():
         raise InputError(f"heads: outputs of {head.name} are not finite; check the features and the teacher's weights")
