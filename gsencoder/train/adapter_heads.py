@@ -17,6 +17,7 @@ from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.cell_sample import CellSample
 from gsencoder.fusion.heads.measure import HeadSet, measure_heads
 from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
+from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import choose_heads, has_head, load_heads, save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE, check_heads_space
 from gsencoder.fusion.teachers import Teacher
@@ -65,36 +66,44 @@ def asked_heads(loss_heads: Sequence[str], teacher: TeacherConfig) -> tuple[str,
     return tuple(dict.fromkeys([*loss_heads, *stored_heads(teacher)]))
 
 
+def missing_heads(dataset: PreparedDataset, names: Sequence[str], teacher: TeacherConfig) -> list[Head]:
+    """The teacher's heads of some names that are not stored in a prepared dataset yet.
+
+    Raises:
+        InputError: the teacher has no such heads, or the dataset's file of heads is damaged.
+    """
+    path = dataset.folder / HEADS_FILE
+    stored = load_heads(path) if path.is_file() else None
+    if stored is not None and all(has_head(stored, name) for name in names):
+        return []
+    known = stored.names if stored is not None else ()
+    return [head for head in heads_of(teacher, names) if head.name not in known]
+
+
 def measure_dataset_heads(
     dataset: PreparedDataset,
-    names: Sequence[str],
-    teacher: TeacherConfig,
+    heads: Sequence[Head],
     scenes: Sequence[Path],
     open_scene: Callable[[Path], tuple[Scene, Teacher]],
     views: int,
 ) -> None:
-    """Measures the teacher's heads over the maps that the dataset's output space was computed from, and stores them in
-    its folder. Heads that are stored there already stay as they are.
+    """Measures heads over the maps that the dataset's output space was computed from, and adds them to its folder.
 
     Args:
         dataset: with its output space.
-        names: of the heads.
-        teacher: its settings.
+        heads: those of `missing_heads`.
         scenes: all scenes to train on.
         open_scene: reads a scene without making Gaussians, and builds its teacher.
         views: number of maps.
 
     Raises:
-        InputError: the teacher has no such heads, or its weights are not those of the dataset.
+        InputError: the teacher's weights are not those of the dataset, or see `measure_heads`.
     """
-    if not names:
+    if not heads:
         return
     path, outputs = dataset.folder / HEADS_FILE, dataset.load_space()[0]
     stored = load_heads(path) if path.is_file() else HeadSet(space=outputs.space)
     check_heads_space(stored.space, outputs.space)
-    if all(has_head(stored, name) for name in names):
-        return
-    missing = [head for head in heads_of(teacher, names) if head.name not in stored.names]
     sample = CellSample(views)
     for scene_path, count in zip(scenes, views_of_scenes(len(scenes), views), strict=True):
         if count:
@@ -103,7 +112,7 @@ def measure_dataset_heads(
             assert scene.views is not None
             for view in even_indices(len(scene.views), count):
                 sample.add(of_scene.feature_map(scene.views, int(view)))
-    measured = measure_heads(missing, sample, outputs.space, outputs.basis)
+    measured = measure_heads(heads, sample, outputs.space, outputs.basis)
     save_heads(path, HeadSet(space=outputs.space, heads=(*stored.heads, *measured.heads)))
 
 

@@ -19,7 +19,7 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.text.table import TextTable
-from gsencoder.train.adapter_heads import measure_dataset_heads
+from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads
 from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
 from gsencoder.types import Scene
@@ -113,14 +113,15 @@ def prepare_scenes(
         if process.is_first:
             dataset = PreparedDataset(folder, made_with)
             dataset.remove_stale_maps()
+            # Read first, since a head that is not there is an error before the teacher has made a map.
+            missing = missing_heads(dataset, heads, config.teacher)
             dataset.fit_space(training, read_views, config.prepare)
-            views = config.prepare.basis_views
-            measure_dataset_heads(dataset, heads, config.teacher, training, read_views, views)
+            measure_dataset_heads(dataset, missing, training, read_views, config.prepare.basis_views)
     dataset = PreparedDataset(folder, made_with)
-    missing = [path for path in [*training, *held_out] if not dataset.has_scene(path)]
+    unprepared = [path for path in [*training, *held_out] if not dataset.has_scene(path)]
     with fail_together():
         pass  # No process may start to prepare before all have listed the missing scenes.
-    share = missing[process.rank :: process.world_size]
+    share = unprepared[process.rank :: process.world_size]
     with fail_together():
         weights = read_views(share[0])[1].space.weights if share and process.world_size > 1 else ""
     check_agreement("the teacher's weights", weights)

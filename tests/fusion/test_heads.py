@@ -256,7 +256,7 @@ def test_groups_of_equal_rows_give_the_rows_back(rows: int) -> None:
 
 
 def test_rows_whose_keys_collide_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Both rows have the key 0 if all factors are 0 but for their lowest bit, and the bits of the rows sum to 2⁶⁴.
+    # With factors of 1 the keys of rows of the same numbers in another order are equal.
     values = np.array([[1, 2, 0], [2, 1, 0], [1, 2, 0]], np.float32)
 
     class Zeros:

@@ -23,6 +23,7 @@ from gsencoder.train.adapter_heads import (
     asked_heads,
     dataset_heads,
     measure_dataset_heads,
+    missing_heads,
     render_heads,
 )
 from gsencoder.train.dataset_space import views_of_scenes
@@ -136,7 +137,8 @@ def test_a_head_is_measured_once_over_the_maps_of_the_output_space(
 
     def measure(*names: str) -> None:
         scenes = [Path("a"), Path("b")]
-        measure_dataset_heads(dataset, names, RadioConfig(), scenes, lambda path: (ThreeViews(), MapTeacher()), 4)  # type: ignore[arg-type, return-value]
+        missing = missing_heads(dataset, names, RadioConfig())
+        measure_dataset_heads(dataset, missing, scenes, lambda path: (ThreeViews(), MapTeacher()), 4)  # type: ignore[arg-type, return-value]
 
     MapTeacher.asked = 0
     measure("clip.summary")

@@ -139,7 +139,10 @@ def run(config: ExportConfig, summary: Summary) -> None:
     )
     write_json(f"{config.out}.summary.json", summary.to_dict())
     heads = heads_beside(file_of_encoder(config.weights))
-    if heads is not None:
+    if heads is None:
+        # Those of a file that was replaced.
+        heads_of_graph(config.out).unlink(missing_ok=True)
+    else:
         copy_heads(heads, heads_of_graph(config.out), encoder.outputs.space)
         screen.print(f"{heads_of_graph(config.out)}: the adapter heads that take its features; keep it beside the file")
     screen.print(

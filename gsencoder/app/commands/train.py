@@ -96,7 +96,10 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
             )
         if config.prepare_only:
             counts = f"{len(training)} scenes to train on, {len(held_out)} for validation"
-            console(config.quiet or not process.is_first).print(f"{dataset.folder}: {counts}")
+            screen = console(config.quiet or not process.is_first)
+            screen.print(f"{dataset.folder}: {counts}")
+            for line in describe_heads(dataset_heads(dataset, asked_heads(config.heads, config.teacher))):
+                screen.print(f"{dataset.folder}: {line}")
             return
         with fail_together():
             if process.is_first:
