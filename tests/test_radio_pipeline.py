@@ -28,6 +28,7 @@ from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.text.build import vocabulary_of
 from gsencoder.text.reference_nouns import REFERENCE_NOUNS
+from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.text.transformers_tower import TransformersTextConfig
 from gsencoder.types import GaussianFeatures
 
@@ -181,6 +182,20 @@ def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(
         LocalizeConfig(min_probability=0.0, threshold=ThresholdConfig(kind="quantile", quantile=0.9)),
     )
     np.testing.assert_allclose(made.relevancy[0][features.seen], cosines[features.seen], atol=1e-4)
+
+
+def test_a_text_table_of_the_width_of_a_head_is_asked(
+    fused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for channels in (16, 12):
+        vectors = np.random.default_rng(0).normal(size=(3, channels)).astype(np.float32)
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        save_text_table(tmp_path / f"w{channels}.safetensors", make_text_table(["mug", "bed", "lamp"], vectors, "own"))
+    asked = ("localize", str(fused), "head=siglip", "query=mug", *EVERY_BOX, "pictures=0", f"out={tmp_path / 'b'}")
+    line = refusal(capsys, *asked, f"words={tmp_path / 'w12.safetensors'}")
+    assert "gives vectors of 16 channels, and the words of 'own' have 12" in line
+    run(*asked, f"words={tmp_path / 'w16.safetensors'}")
+    assert results_of(tmp_path / "b")["space"].endswith(" · own")
 
 
 def test_training_stores_the_heads_of_its_loss_and_those_asked_for_besides(trained: Path) -> None:

@@ -13,7 +13,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.cell_sample import CellSample
 from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.heads.store import load_heads
+from gsencoder.fusion.heads.store import load_heads, save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.fusion.teachers.radio import RadioConfig
@@ -27,6 +27,7 @@ from gsencoder.train.adapter_heads import (
     render_heads,
 )
 from gsencoder.train.dataset_space import views_of_scenes
+from gsencoder.train.prepare import PreparedDataset
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=6)
@@ -90,7 +91,7 @@ def test_maps_are_spread_over_scenes_and_the_first_has_one(scenes: int, views: i
     assert counts == expected
 
 
-class Dataset:
+class Dataset(PreparedDataset):
     """A folder with an output space, as `measure_dataset_heads` uses a prepared dataset."""
 
     def __init__(self, folder: Path) -> None:
@@ -130,10 +131,8 @@ def of_teacher(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return read
 
 
-def test_a_head_is_measured_once_over_the_maps_of_the_output_space(
-    tmp_path: Path, of_teacher: Any, no_jaxtyping: None
-) -> None:
-    dataset: Any = Dataset(tmp_path)
+def test_a_head_is_measured_once_over_the_maps_of_the_output_space(tmp_path: Path, of_teacher: Any) -> None:
+    dataset = Dataset(tmp_path)
 
     def measure(*names: str) -> None:
         scenes = [Path("a"), Path("b")]
@@ -164,3 +163,13 @@ def test_a_head_is_measured_once_over_the_maps_of_the_output_space(
     assert dataset_heads(dataset, []).names == ()
     with pytest.raises(InputError, match="heads=dino: not among the heads at hand: clip.summary, sam.features"):
         dataset_heads(dataset, ["dino"])
+
+
+def test_heads_of_another_backbone_in_the_folder_of_a_dataset_are_refused(tmp_path: Path, of_teacher: Any) -> None:
+    dataset = Dataset(tmp_path)
+    other = HeadSet(space=FeatureSpace(name="s", channels=6, weights="other"), heads=(measured("clip.summary", 4),))
+    save_heads(tmp_path / HEADS_FILE, other)
+    missing = missing_heads(dataset, ["sam.features"], RadioConfig())
+    assert [head.name for head in missing] == ["sam.features"]
+    with pytest.raises(InputError, match=r"heads take features of \(s · 6 channels · other\)"):
+        measure_dataset_heads(dataset, missing, [], lambda path: None, 4)  # type: ignore[arg-type, return-value]
