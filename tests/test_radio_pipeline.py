@@ -224,8 +224,7 @@ def test_encoded_features_carry_the_heads_of_the_weights(
     assert results_of(tmp_path / "b")["boxes"]
 
 
-@pytest.mark.parametrize("protocol", ["localization", "naming"])
-@pytest.mark.parametrize("source", ["weights", "fused"])
+@pytest.mark.parametrize(("source", "protocol"), [("weights", "localization"), ("fused", "naming")])
 def test_outputs_of_a_head_are_evaluated(
     world: World, trained: Path, tmp_path: Path, source: str, protocol: str
 ) -> None:
@@ -345,8 +344,14 @@ def test_heads_of_another_backbone_are_refused(
     ("words", "message"),
     [
         (("head=dino", "query=mug"), "head=dino: not among the heads at hand: siglip.summary, siglip.features, sam"),
-        (("head=sam", "query=mug"), "head=sam.features: words are compared with summary heads"),
-        (("head=siglip.features", "query=mug"), "give head=siglip.summary, of a model with a text side"),
+        (
+            ("head=sam", "query=mug"),
+            "head sam.features (vit-h): leads to no model with a text side (siglip2, siglip, clip)",
+        ),
+        (
+            ("head=siglip.features", "query=mug"),
+            "words are compared with summary heads, since outputs of feature heads are not aligned",
+        ),
         (("query=mug",), "there is no words.safetensors beside these features"),
     ],
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.heads.apply import head_features
 from gsencoder.fusion.heads.measure import HeadSet, MeasuredHead
-from gsencoder.fusion.heads.names import text_kind
+from gsencoder.fusion.heads.names import TEXT_KINDS, text_kind
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import find_head, load_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE
@@ -87,20 +87,25 @@ def words_of_head(head: Head, given: str, text: TextConfig) -> Words:
         text: the text tower of that model.
 
     Raises:
-        InputError: the head is no summary head, no words are given, or they are of another model.
+        InputError: the head leads to no model with a text side, or is no summary head; no words are given, or they are
+            of another model.
     """
+    if not head.text:
+        raise InputError(
+            f"head {head.describe()}: leads to no model with a text side ({', '.join(TEXT_KINDS)}), so words cannot be "
+            "compared with its outputs; give the head of one that has"
+        )
     if head.part != "summary":
-        adapter = head.name.rpartition(".")[0]
         raise InputError(
             f"head={head.name}: words are compared with summary heads, since outputs of feature heads are not aligned "
-            f"with text; give head={adapter}.summary, of a model with a text side (CLIP, SigLIP)"
+            f"with text; give head={head.name.rpartition('.')[0]}.summary"
         )
     if given:
         words = words_of_table(load_text_table(given), text)
     elif isinstance(text, TableTextConfig):
         raise InputError(
             f"head={head.name}: no words lead into its space; give text=transformers text.model=FOLDER, the text side "
-            f"of {head.model or head.text or 'its model'}, or words=FILE"
+            f"of {head.model or f'its {head.text} model'}, or words=FILE"
         )
     else:
         words = vocabulary_of(text)
@@ -132,7 +137,7 @@ def check_head_words(head: Head, words: Words, tower: TextTower | None) -> None:
             f"{name} gives vectors of {head.channels} channels, and {described} have {words.space.channels}; give the "
             "text side of the model that the head leads to"
         )
-    if not head.text or not isinstance(tower, TransformersTower):
+    if not isinstance(tower, TransformersTower):
         return
     kind = text_kind(tower.model_type)
     # SigLIP2 models of one resolution are SigLIP models for transformers.
