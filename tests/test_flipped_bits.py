@@ -21,6 +21,9 @@ from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive
 from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint
+from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
+from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.heads.store import load_heads, save_heads
 from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_package
 from gsencoder.fusion.teacher_maps import read_map, write_map
@@ -31,7 +34,6 @@ from gsencoder.reconstruct.checkpoint import State, load_state, save_state
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
-from gsencoder.train.adapter_heads import load_heads, save_heads
 from gsencoder.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE
 from gsencoder.types import FeatureSpace, Scene, Views
@@ -88,8 +90,19 @@ def encoder(folder: Path) -> Made:
 
 
 def heads(folder: Path) -> Made:
-    save_heads(folder / "h", {"clip": (torch.nn.Sequential(torch.nn.Linear(4, 3)), np.ones(3), 2.0)})
-    return folder / "h", lambda: [head.state_dict() for head, _ in load_heads(folder / "h", an_output_space()["s"])]
+    head = Head(name="clip.summary", body=torch.nn.Sequential(torch.nn.Linear(4, 3)), text="clip", model="ViT-H")
+    fit = HeadFit(cells=3, cosine=0.5, worst=0.25)
+    one = MeasuredHead(head=head, mean=np.ones(3, np.float32), scale=2.0, fit=fit)
+    save_heads(folder / "h", HeadSet(space=an_output_space()["s"].space, heads=(one,)))
+
+    def read() -> Any:
+        made = load_heads(folder / "h")
+        return made.space, [
+            (each.name, each.head.text, each.head.model, each.head.body.state_dict(), each.mean, each.scale, each.fit)
+            for each in made.heads
+        ]
+
+    return folder / "h", read
 
 
 def prepared_file(folder: Path, name: str) -> Made:

@@ -26,7 +26,6 @@ from gsencoder.fusion.store.folder import load_features
 from gsencoder.models.weights import load_weights
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train import TrainConfig, train
-from gsencoder.train.adapter_heads import save_heads
 
 pytestmark = pytest.mark.slow
 
@@ -123,36 +122,6 @@ def test_what_was_prepared_serves_the_next_run(rooms: Path, trained: Path, tmp_p
     first, second = (load_weights(out / "encoder.safetensors")[0] for out in (trained, tmp_path / "again"))
     for name, value in first.state_dict().items():
         assert np.array_equal(value.numpy(), second.state_dict()[name].numpy())
-
-
-def test_a_training_goes_on_only_with_heads_of_the_same_content(
-    rooms: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import torch
-
-    def head(scale: float) -> dict[str, Any]:
-        layers = torch.nn.Sequential(torch.nn.Linear(channels, 2))
-        torch.nn.init.constant_(layers[0].weight, scale)
-        torch.nn.init.zeros_(layers[0].bias)
-        return {"own": (layers, np.zeros(2), 1.0)}
-
-    def interrupted(*arguments: Any) -> None:
-        raise KeyboardInterrupt
-
-    channels = load_weights(trained / "encoder.safetensors")[1].channels
-    save_heads(tmp_path / "heads", head(0.1))
-    save_heads(tmp_path / "moved", head(0.1))
-    scenes = [str(rooms / f"room_{number}") for number in range(3)]
-    words = f"teacher.words={rooms / 'words.safetensors'}"
-    prepared = f"prepared={trained.with_name('encoder.prepared')}"
-    run = ["train", *scenes, "holdout=room_2", words, prepared, f"out={tmp_path / 'run'}", *QUICK, "tensorboard=false"]
-    with monkeypatch.context() as patch:
-        patch.setattr("gsencoder.app.commands.train.write_results", interrupted)
-        assert cli.main([*run, f"heads={tmp_path / 'heads'}"]) == 130
-    save_heads(tmp_path / "heads", head(0.2))
-    loud = [word for word in run if word != "quiet=true"]
-    assert "was made with heads=" in refusal(capsys, *loud, f"heads={tmp_path / 'heads'}")
-    assert cli.main([*run, f"heads={tmp_path / 'moved'}"]) == 0
 
 
 def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trained: Path, tmp_path: Path) -> None:

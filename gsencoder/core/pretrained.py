@@ -1,7 +1,7 @@
 """Models of transformers in folders on disk: loaded without a network, without pickles, and without a folder's code."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,15 @@ EXTRA = "pip install 'gsencoder[teachers]'"
 VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
 
 
-def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = "warn", **options: Any) -> Any:
+def load_pretrained(
+    loader: Any,
+    folder: Path,
+    what: str,
+    *,
+    other_parts: str = "warn",
+    known_parts: Sequence[str] = (),
+    **options: Any,
+) -> Any:
     """A model with exactly the weights of a folder, in evaluation mode.
 
     Args:
@@ -22,6 +30,8 @@ def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = 
         what: who loads it, for messages.
         other_parts: what is done about weights of modules that the class does not have, such as the other tower of a
             joint model: "warn" or "ignore".
+        known_parts: what keys of weights begin with that are read from the same files by other means, and need no
+            warning.
         options: further arguments of `from_pretrained`.
 
     Raises:
@@ -33,6 +43,7 @@ def load_pretrained(loader: Any, folder: Path, what: str, *, other_parts: str = 
     weight_files(folder, what)
     with _readable(folder, what):
         model, report = _from_pretrained(loader, str(folder), use_safetensors=True, **options)
+    report["unexpected_keys"] = [key for key in report["unexpected_keys"] if not key.startswith(tuple(known_parts))]
     _check_keys(folder, model, report, what, other_parts)
     return model.eval()
 
@@ -92,7 +103,7 @@ def weight_files(folder: Path, what: str) -> list[Path]:
     return files
 
 
-def _from_pretrained(loader: Any, source: str | None, **options: Any) -> tuple[Any, Mapping[str, Any]]:
+def _from_pretrained(loader: Any, source: str | None, **options: Any) -> tuple[Any, dict[str, Any]]:
     """A model and the report of which of its weights were there."""
     with quiet_transformers():
         # Sizes that do not match are reported with the keys that do not, instead of an error that names none.

@@ -10,6 +10,9 @@ from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.fusion.heads.apply import head_features
+from gsencoder.fusion.heads.measure import HeadSet, MeasuredHead, measure_heads
+from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder
@@ -72,6 +75,48 @@ def space_of_words(encoder: Encoder, words: Words) -> str | None:
             "those of one: give its words (teacher.words= or text=), or name it with space="
         )
     return fitting[0]
+
+
+def head_source(source: FeatureSource, heads: HeadSet, head: MeasuredHead, text_encoder: str) -> FeatureSource:
+    """A source that applies an adapter head to the features of another one.
+
+    Args:
+        source: features of the backbone that the head takes.
+        heads: of which the head is one.
+        head: which.
+        text_encoder: what turns words into the head's space.
+    """
+
+    def outputs(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
+        features, seconds = source(scene)
+        start = time.perf_counter()
+        through = head_features(features, head, heads.space, text_encoder=text_encoder)
+        return through, {**seconds, "head": time.perf_counter() - start}
+
+    return outputs
+
+
+def fused_head_source(
+    teacher: TeacherConfig, head: Head, text_encoder: str, config: FuseConfig = FuseConfig()
+) -> FeatureSource:
+    """A source that fuses a teacher's maps, measures an adapter head over them, and applies it.
+
+    Args:
+        teacher: configuration of the teacher.
+        head: of its backbone.
+        text_encoder: what turns words into the head's space.
+        config: settings of fusion.
+    """
+
+    def outputs(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
+        fusion = fuse(scene, build_teacher(teacher, scene, None), config, sample_cells=True)
+        assert fusion.sample is not None
+        start = time.perf_counter()
+        heads = measure_heads([head], fusion.sample, fusion.features.space, fusion.features.basis)
+        through = head_features(fusion.features, heads.heads[0], heads.space, text_encoder=text_encoder)
+        return through, {**fusion.seconds, "head": time.perf_counter() - start}
+
+    return outputs
 
 
 def load_scenes(

@@ -21,6 +21,7 @@ from gsencoder.core.runtime.clock import Clock, timed
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
+from gsencoder.fusion.cell_sample import CellSample
 from gsencoder.fusion.checkpoint import open_checkpoint, remaining_views
 from gsencoder.fusion.lift import FeatureSums, map_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
@@ -68,6 +69,7 @@ class Fusion:
             cells of all views with each cell weighted by its distance from the mean; 0 without a basis.
         projections: how well a basis that was given represents the teacher's vectors in the views that this call added;
             None if the scene has a basis of its own, or none.
+        sample: cells of the teacher's maps of all views; None if they were not asked for.
     """
 
     features: GaussianFeatures
@@ -76,6 +78,7 @@ class Fusion:
     seconds: dict[str, float]
     truncation: float
     projections: ProjectionSums | None = None
+    sample: CellSample | None = None
 
 
 def fuse(
@@ -85,6 +88,7 @@ def fuse(
     *,
     basis: FeatureBasis | None = None,
     work: Path | None = None,
+    sample_cells: bool = False,
     track: Track = untracked,
 ) -> Fusion:
     """Lifts a teacher's maps onto the scene's Gaussians.
@@ -100,6 +104,7 @@ def fuse(
         basis: fuse in the coordinates of this basis, which scenes that are trained on together share; None = one of the
             scene's own, where `config` asks for one.
         work: folder for maps and running sums; an interrupted run is continued from it.
+        sample_cells: whether cells of the maps of all views are collected, for `Fusion.sample`.
         track: wraps the loops over views to show progress.
 
     Raises:
@@ -122,6 +127,7 @@ def fuse(
             subspace = find_subspace(teacher, maps, rows, config, track, one_pass=checkpoint is None)
         # Where the mean alone is unknown, it is computed along the way; never in a run that may start in the middle.
         moments = Moments(teacher.space.channels, second=False) if subspace.mean is None else None
+        sample = CellSample(len(rows))
         projections = ProjectionSums() if basis is not None else None
         columns = subspace.basis.rank if subspace.basis is not None else teacher.space.channels
         sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table)
@@ -141,6 +147,12 @@ def fuse(
                 _add_cells(moments, feature_map)
             if projections is not None and basis is not None:
                 timed("basis")(projections.add_map)(basis, feature_map)
+            if sample_cells and checkpoint is None:
+                sample.add(feature_map)
+        if sample_cells and checkpoint is not None:
+            # A run that was continued has lifted some views before; their maps are read from their files.
+            for view in rows:
+                sample.add(maps(view))
         features, weights = sums.finish()
     if not (weights > 0).any():
         raise InputError(f"fuse: none of {len(rows)} views of {scene.name} sees any Gaussian; check poses and units")
@@ -156,6 +168,7 @@ def fuse(
         seconds=clock.seconds,
         truncation=subspace.truncation,
         projections=projections,
+        sample=sample if sample_cells else None,
     )
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from gsencoder.core.files.model_files import find_file
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.infer.encode.chunks import EncodeConfig
@@ -56,6 +57,19 @@ class Encoder(Protocol):
         track: Track = untracked,
     ) -> dict[str, GaussianFeatures]:
         """Such features in all spaces; see `gsencoder.infer.encode.encode.encode_spaces`."""
+
+
+def file_of_encoder(weights: str) -> Path:
+    """The file of an encoder; what lies beside it belongs to it.
+
+    Raises:
+        InputError: there is none.
+    """
+    if Path(weights).suffix.lower() == SUFFIX:
+        return find_file(weights, "weights")
+    from gsencoder.models.weights import find_weights
+
+    return find_weights(weights)
 
 
 def load_encoder(weights: str, device: Device = "auto") -> Encoder:

@@ -90,6 +90,8 @@ class TransformersTower:
         identity: "transformers:" and a digest of weights, configuration, tokenizer and reading.
         pooling: of token vectors; "output" where the model has an output in the joint space.
         channels: of its vectors.
+        model_type: kind of the model, as its configuration states it.
+        lower: whether phrases are lower-cased and lose their punctuation.
     """
 
     def __init__(self, config: TransformersTextConfig) -> None:
@@ -111,6 +113,7 @@ class TransformersTower:
         from gsencoder.core.runtime.device import choose_device
 
         self.name = folder.resolve().name
+        self.model_type = str(stated.model_type)
         self._kind = JOINT.get(stated.model_type)
         self.pooling = _choose_pooling(folder, stated.model_type, config.pooling)
         text = getattr(stated, "text_config", stated)
@@ -127,10 +130,10 @@ class TransformersTower:
             )
         self._device = choose_device(config.device)
         self._model = model.to(self._device)
-        self._lower = self._kind is not None and self._kind.lower if config.lower == "auto" else config.lower == "yes"
+        self.lower = self._kind is not None and self._kind.lower if config.lower == "auto" else config.lower == "yes"
         files = [folder / "config.json", *sorted(folder.glob("*.safetensors"))]
         files += sorted({path for pattern in TOKENIZER_FILES for path in folder.glob(pattern)})
-        self.identity = f"transformers:{digest_files(*files, settings=(self.pooling, self._lower))}"
+        self.identity = f"transformers:{digest_files(*files, settings=(self.pooling, self.lower))}"
         last = torch.tensor([[len(self._tokenizer) - 1]], device=self._device)
         self.channels = len(self._pooled({"input_ids": last, "attention_mask": torch.ones_like(last)}))
 
@@ -143,7 +146,7 @@ class TransformersTower:
         return unit(np.stack([self._vector(phrase) for phrase in phrases]))
 
     def _vector(self, phrase: str) -> Float32[np.ndarray, " D"]:
-        text = canonical(phrase) if self._lower else phrase
+        text = canonical(phrase) if self.lower else phrase
         bare = self._tokenizer(text, add_special_tokens=False)["input_ids"]
         check_known(phrase, bare, self._tokenizer.unk_token_id)
         count = len(self._tokenizer(text)["input_ids"])

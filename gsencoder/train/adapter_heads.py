@@ -1,15 +1,12 @@
-"""Adapter heads of a teacher on disk: small MLPs from the features of its backbone to other feature spaces.
+"""Adapter heads of the teacher in a training: measured once for a prepared dataset, and used by the render loss.
 
-RADIO's adapters map backbone features to those of CLIP, SigLIP, DINO or SAM. Distilled features must work with them as
-the teacher's features do, so the render loss can be computed on the outputs of the heads (SplatDistill Eq. 4). For each
-head a file holds its layers, and the mean and the scale of its outputs for the teacher's features. Both sides of the
-loss are decoded from the dataset's basis first; if the basis drops components that a head needs, raise
-`prepare.fusion.max_rank`.
+Distilled features must work with the heads as the teacher's features do, so the render loss can be computed on their
+outputs (SplatDistill Eq. 4). Both sides of the loss are decoded from the dataset's basis first, so a head sees the
+teacher's vectors without what the basis drops; the dataset's file of heads states what that costs each of them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,17 +14,21 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive, open_archive, write_archive
+from gsencoder.core.even_indices import even_indices
+from gsencoder.fusion.cell_sample import CellSample
+from gsencoder.fusion.heads.measure import HeadSet, measure_heads
+from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
+from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.heads.store import choose_heads, has_head, load_heads, save_heads
+from gsencoder.fusion.store.heads_file import HEADS_FILE, check_heads_space
+from gsencoder.fusion.teachers import MissingInput, Teacher
+from gsencoder.fusion.teachers.build import TeacherConfig
+from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.train.dataset_space import views_of_scenes
 from gsencoder.train.losses import AdapterHead
-
-LAYER_TYPES: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
-    "linear": (nn.Linear, ("weight", "bias")),
-    "layernorm": (nn.LayerNorm, ("weight", "bias")),
-    "gelu": (nn.GELU, ()),
-    "relu": (nn.ReLU, ()),
-}
-"""The layer types that a head may have, with the names of their parameters."""
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.types import Scene
 
 
 class FeatureDecoder(nn.Module):
@@ -48,104 +49,103 @@ class FeatureDecoder(nn.Module):
         return out
 
 
-class Residual(nn.Sequential):
-    """A residual block: x + f(x), where f applies the layers in sequence."""
+def render_heads(heads: HeadSet, outputs: OutputSpace) -> list[tuple[AdapterHead, nn.Module]]:
+    """Heads as the render loss takes them, each with a decoder from standard units to its input.
 
-    def forward(self, x: Float[Tensor, "n C"]) -> Float[Tensor, "n C"]:
-        out: Tensor = x + super().forward(x)
-        return out
+    Raises:
+        InputError: they are of another backbone than the outputs.
+    """
+    if not heads.heads:
+        return []
+    check_heads_space(heads.space, outputs.space)
+    decode = FeatureDecoder(outputs)
+    return [(AdapterHead(each.head.body, torch.from_numpy(each.mean), each.scale), decode) for each in heads.heads]
 
 
-def save_heads(path: Path, heads: Mapping[str, tuple[nn.Sequential, np.ndarray, float]]) -> None:
-    """Writes adapter heads to a file.
+def teacher_of_heads(teachers: Mapping[str, TeacherConfig], heads: Sequence[str]) -> str:
+    """The name of the teacher that adapter heads belong to; the first teacher where none has heads.
+
+    Raises:
+        InputError: heads are named, and several teachers have some.
+    """
+    with_heads = [name for name, config in teachers.items() if isinstance(config, RadioConfig)]
+    if heads and len(with_heads) > 1:
+        raise InputError(
+            f"heads={','.join(heads)}: {' and '.join(with_heads)} have adapter heads; expected one such teacher"
+        )
+    return with_heads[0] if with_heads else next(iter(teachers))
+
+
+def asked_heads(loss_heads: Sequence[str], teachers: Mapping[str, TeacherConfig]) -> tuple[str, ...]:
+    """The names of the heads that a training needs: those of the render loss, and those that are stored beside the
+    weights besides."""
+    stored = [name for config in teachers.values() for name in stored_heads(config)]
+    return tuple(dict.fromkeys([*loss_heads, *stored]))
+
+
+def missing_heads(dataset: PreparedDataset, names: Sequence[str], teacher: TeacherConfig) -> list[Head]:
+    """The teacher's heads of some names that are not stored in a prepared dataset yet.
+
+    Raises:
+        InputError: the teacher has no such heads, or the dataset's file of heads is damaged.
+    """
+    path = dataset.folder / HEADS_FILE
+    stored = load_heads(path) if path.is_file() else None
+    if stored is not None and all(has_head(stored, name) for name in names):
+        return []
+    known = stored.names if stored is not None else ()
+    return [head for head in heads_of(teacher, names) if head.name not in known]
+
+
+def measure_dataset_heads(
+    dataset: PreparedDataset,
+    heads: Sequence[Head],
+    scenes: Sequence[Path],
+    open_scene: Callable[[Path], tuple[Scene, Teacher]],
+    views: int,
+    *,
+    optional: bool = False,
+) -> None:
+    """Measures heads over the maps that the dataset's output space was computed from, and adds them to its folder.
 
     Args:
-        path: the file.
-        heads: for each name, the layers (linear, layer norm, GELU, ReLU, or `Residual` blocks of these), and the mean
-            [E] and scale of their outputs.
+        dataset: with its output space.
+        heads: those of `missing_heads`.
+        scenes: all scenes to train on.
+        open_scene: reads a scene without making Gaussians, and builds its teacher.
+        views: number of maps.
+        optional: leave out scenes that lack what the teacher needs.
 
     Raises:
-        InputError: a layer of another type, or the disk is full.
+        InputError: the teacher's weights are not those of the dataset, or see `measure_heads`.
     """
-    arrays: dict[str, np.ndarray] = {}
-    header = []
-    for name, (layers, mean, scale) in heads.items():
-        arrays[f"{name}.mean"] = mean.astype(np.float32)
-        header.append({"name": name, "layers": _describe_layers(layers, name, arrays), "scale": float(scale)})
-    write_archive(path, arrays, {"heads": header})
+    if not heads:
+        return
+    path, outputs = dataset.folder / HEADS_FILE, dataset.load_space()[0]
+    stored = load_heads(path) if path.is_file() else HeadSet(space=outputs.space)
+    check_heads_space(stored.space, outputs.space)
+    sample = CellSample(views)
+    for scene_path, count in zip(scenes, views_of_scenes(len(scenes), views), strict=True):
+        try:
+            if count:
+                scene, of_scene = open_scene(scene_path)
+                check_heads_space(of_scene.space, outputs.space)
+                assert scene.views is not None
+                for view in even_indices(len(scene.views), count):
+                    sample.add(of_scene.feature_map(scene.views, int(view)))
+        except MissingInput:
+            if not optional:
+                raise
+    measured = measure_heads(heads, sample, outputs.space, outputs.basis)
+    save_heads(path, HeadSet(space=outputs.space, heads=(*stored.heads, *measured.heads)))
 
 
-def _describe_layers(layers: nn.Sequential, name: str, arrays: dict[str, np.ndarray]) -> list[Any]:
-    """The names of the layers' types, residual blocks as nested lists; parameters are added to `arrays`."""
-    layer_types: list[Any] = []
-    for number, layer in enumerate(layers):
-        key = f"{name}.{number}"
-        if isinstance(layer, Residual):
-            layer_types.append(_describe_layers(layer, key, arrays))
-            continue
-        layer_type = next((layer_type for layer_type, (cls, _) in LAYER_TYPES.items() if type(layer) is cls), None)
-        if layer_type is None:
-            raise InputError(f"heads: {key}: expected {', '.join(LAYER_TYPES)} or Residual, got {type(layer).__name__}")
-        layer_types.append(layer_type)
-        for parameter in LAYER_TYPES[layer_type][1]:
-            arrays[f"{key}.{parameter}"] = getattr(layer, parameter).detach().float().numpy()
-    return layer_types
-
-
-def load_heads(path: Path, outputs: OutputSpace) -> list[tuple[AdapterHead, nn.Module]]:
-    """Loads adapter heads for features of an output space.
-
-    Returns:
-        The heads, each with a decoder from standard units to its input.
+def dataset_heads(dataset: PreparedDataset, names: Sequence[str]) -> HeadSet:
+    """Heads of a prepared dataset, by name; none for no names.
 
     Raises:
-        InputError: the file is missing or damaged, or is for features with another number of channels.
+        InputError: one is not stored, or the file is damaged.
     """
-    decode = FeatureDecoder(outputs)
-    heads: list[tuple[AdapterHead, nn.Module]] = []
-    with open_archive(path) as file:
-        for entry in file.value("heads", list):
-            name, layer_types, scale = entry.get("name"), entry.get("layers"), entry.get("scale")
-            if (
-                not isinstance(name, str)
-                or not isinstance(layer_types, list)
-                or not layer_types
-                or not isinstance(scale, float)
-            ):
-                raise InputError(f"expected heads with name, layers and scale, got {str(entry)[:80]}")
-            layers, width = _read_layers(file, layer_types, name, outputs.space.channels)
-            mean = torch.from_numpy(file.array(f"{name}.mean", "float32", (width,)).copy())
-            heads.append((AdapterHead(nn.Sequential(*layers), mean, scale), decode))
-    return heads
-
-
-def _read_layers(file: Archive, layer_types: Sequence[Any], name: str, width: int) -> tuple[list[nn.Module], int]:
-    """Reads layers with inputs of `width` channels; returns them and the number of channels of their outputs."""
-    layers: list[nn.Module] = []
-    for number, layer_type in enumerate(layer_types):
-        key = f"{name}.{number}"
-        if isinstance(layer_type, list):
-            inner, out = _read_layers(file, layer_type, key, width)
-            if out != width:
-                raise InputError(f"{key}: expected a residual block with {width} output channels, got {out}")
-            layers.append(Residual(*inner))
-        elif layer_type == "linear":
-            weight = file.array(f"{key}.weight", "float32", (key, width))
-            linear = nn.Linear(width, len(weight))
-            width = len(weight)
-            bias = file.array(f"{key}.bias", "float32", (width,))
-            linear.weight.data, linear.bias.data = torch.from_numpy(weight.copy()), torch.from_numpy(bias.copy())
-            layers.append(linear)
-        elif layer_type == "layernorm":
-            norm = nn.LayerNorm(width)
-            for parameter in LAYER_TYPES[layer_type][1]:
-                value = file.array(f"{key}.{parameter}", "float32", (width,))
-                getattr(norm, parameter).data = torch.from_numpy(value.copy())
-            layers.append(norm)
-        elif layer_type in LAYER_TYPES:
-            layers.append(LAYER_TYPES[layer_type][0]())
-        else:
-            raise InputError(
-                f"{key}: expected {', '.join(LAYER_TYPES)} or a list of these, got {str(layer_type)[:20]!r}"
-            )
-    return layers, width
+    if not names:
+        return HeadSet(space=dataset.load_space()[0].space)
+    return choose_heads(load_heads(dataset.folder / HEADS_FILE), names)

@@ -72,9 +72,8 @@ def dataset_space(
     missing: MissingInput | None = None
     moments: Moments | None = None
     teacher: Teacher | None = None
-    view_bounds = np.linspace(0, views, len(scenes) + 1).round().astype(int)
-    for number, path in enumerate(scenes):
-        if teacher is not None and teacher.table is None and view_bounds[number] == view_bounds[number + 1]:
+    for path, count in zip(scenes, views_of_scenes(len(scenes), views), strict=True):
+        if teacher is not None and teacher.table is None and not count:
             continue
         try:
             scene, scene_teacher = open_scene(path)
@@ -86,8 +85,7 @@ def dataset_space(
             if scene_teacher.table is None:
                 assert scene.views is not None
                 moments = moments or Moments(scene_teacher.space.channels)
-                count = max(1, int(view_bounds[number + 1] - view_bounds[number]))
-                _add_maps(moments, scene_teacher, scene.views, count)
+                _add_maps(moments, scene_teacher, scene.views, max(1, count))
         except MissingInput as error:
             if not optional:
                 raise
@@ -108,6 +106,12 @@ def dataset_space(
     assert moments is not None
     outputs = replace(_dense_space(moments, teacher, config), centered=center, scaled=scale)
     return DatasetSpace(outputs=outputs, kinds=tuple(kinds))
+
+
+def views_of_scenes(scenes: int, views: int) -> list[int]:
+    """How many of `views` maps are those of each scene, evenly distributed; the first scene has one at least."""
+    counts = [int(count) for count in np.diff(np.linspace(0, views, scenes + 1).round())]
+    return [max(1, counts[0]), *counts[1:]]
 
 
 def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:

@@ -19,6 +19,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 
+MAX_VALUE = 64
+"""Largest number of characters of a value that processes compare."""
 STOPPED_ELSEWHERE = "training: another process stopped; its own message says why"
 
 
@@ -153,6 +155,34 @@ def sum_over_processes(values: Tensor) -> Tensor:
     if distributed.is_available() and distributed.is_initialized():
         distributed.all_reduce(values)
     return values
+
+
+def check_agreement(what: str, value: str) -> None:
+    """Checks that all processes have the same value of something, such as the digest of a teacher's weights.
+
+    Args:
+        what: what it is the value of, for the error.
+        value: of this process, at most `MAX_VALUE` characters of ASCII; empty = this process has none, and any fits.
+
+    Raises:
+        InputError: in every process: two processes have different values; both are named.
+    """
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return
+    own = torch.zeros(MAX_VALUE, dtype=torch.uint8)
+    own[: len(value)] = torch.frombuffer(bytearray(value.encode("ascii")), dtype=torch.uint8) if value else own[:0]
+    if distributed.get_backend() == "nccl":
+        own = own.cuda()
+    gathered = [torch.zeros_like(own) for _ in range(distributed.get_world_size())]
+    distributed.all_gather(gathered, own)
+    values = [bytes(each.tolist()).rstrip(b"\0").decode("ascii") for each in gathered]
+    known = [(rank, each) for rank, each in enumerate(values) if each]
+    for rank, each in known:
+        if each != known[0][1]:
+            raise InputError(
+                f"training: {what} of process {known[0][0]} are {known[0][1]}, those of process {rank} are {each}; "
+                "give all processes the same files"
+            )
 
 
 @contextmanager

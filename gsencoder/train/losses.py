@@ -194,7 +194,8 @@ def render_loss(
         weights: weights of the cells in the loss.
         config: settings of the matching loss.
         heads: adapter heads, each with a decoder from standard units to its input; the loss is summed over the outputs
-            of the heads. Without heads the features themselves are compared.
+            of the heads. Both sides are decoded from the dataset's basis, so what it drops of the teacher's vectors is
+            missing in both. Without heads the features themselves are compared.
     """
     rendered = blend.render(predicted.float())
     if config.divide_by_alpha:

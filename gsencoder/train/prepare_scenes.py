@@ -24,7 +24,8 @@ from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
-from gsencoder.train.distributed import ProcessRank, fail_together
+from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
+from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together
 from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PrepareConfig, PreparedDataset
 from gsencoder.types import Scene
 
@@ -99,6 +100,7 @@ def prepare_scenes(
     folder: Path,
     *,
     voxel: float,
+    heads: Sequence[str] = (),
     process: ProcessRank = ProcessRank(),
     track: Track = untracked,
 ) -> dict[str, PreparedDataset]:
@@ -114,6 +116,7 @@ def prepare_scenes(
         folder: folder of the prepared dataset, or of one for each of several teachers; created if it does not exist.
         voxel: edge length of the encoder's grid cells in metres, from which the unit of a splat is estimated if it is
             unknown.
+        heads: names of the teacher's adapter heads that are measured over the dataset.
         process: rank of this process.
         track: wraps loops to show progress.
 
@@ -136,11 +139,16 @@ def prepare_scenes(
     several = len(teachers) > 1
     with fail_together():
         if process.is_first:
+            with_heads = teacher_of_heads(teachers, heads)
             for name, path in folders.items():
                 dataset = PreparedDataset(path, made_with[name])
                 dataset.remove_stale_maps()
+                open_scene, views = partial(reader.with_views, name), config.prepare.basis_views
+                # Read first, since a head that is not there is an error before the teacher has made a map.
+                unmeasured = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
                 with about(f"teacher {name}") if several else nullcontext():
-                    dataset.fit_space(training, partial(reader.with_views, name), config.prepare, optional=several)
+                    dataset.fit_space(training, open_scene, config.prepare, optional=several)
+                    measure_dataset_heads(dataset, unmeasured, training, open_scene, views, optional=several)
     datasets = {name: PreparedDataset(path, made_with[name]) for name, path in folders.items()}
     missing = {
         path: [name for name, dataset in datasets.items() if not dataset.has_scene(path)]
@@ -149,8 +157,12 @@ def prepare_scenes(
     with fail_together():
         pass  # No process may start to prepare before all have listed the missing scenes.
     with fail_together():
-        unprepared = [path for path, names in missing.items() if names]
-        assigned: Iterable[Path] = track(unprepared[process.rank :: process.world_size], "preparing scenes")
+        share = [path for path, names in missing.items() if names][process.rank :: process.world_size]
+        weights = reader.weights_of_teachers(share[0]) if share and process.world_size > 1 else {}
+    for name in teachers:
+        check_agreement(f"the weights of teacher {name}" if several else "the teacher's weights", weights.get(name, ""))
+    with fail_together():
+        assigned: Iterable[Path] = track(share, "preparing scenes")
         for path in assigned:
             _prepare_scene(path, missing[path], datasets, reader, config.prepare, optional=several)
     with fail_together():
@@ -178,11 +190,13 @@ def _made_with(
     training: Sequence[Path], words: Words | None, teacher: TeacherConfig, config: SourceConfig, voxel: float
 ) -> dict[str, Any]:
     """Everything that the preparation for a teacher depends on, as JSON values."""
+    # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.
+    of_teacher = {name: value for name, value in plain(teacher).items() if name != "heads"}
     return {
         "scenes": {path.name: str(path.resolve()) for path in training},
         "words": _words_digest(words),
         **{name: plain(getattr(config, name)) for name in ("data", "seeds")},
-        "teacher": plain(teacher),
+        "teacher": of_teacher,
         "prepare": plain(config.prepare),
         **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras, "voxel": voxel},
     }
@@ -256,6 +270,17 @@ class _SceneReader:
         with about(path):
             scene = self._load(path)
             return scene, self.teacher(name, scene)
+
+    def weights_of_teachers(self, path: Path) -> dict[str, str]:
+        """The digests of the weights of the teachers that a scene has, by their names."""
+        with about(path):
+            scene, weights = self._load(path), dict[str, str]()
+            for name in self.config.teachers_by_name:
+                try:
+                    weights[name] = self.teacher(name, scene).space.weights
+                except MissingInput:
+                    continue
+        return weights
 
     def with_gaussians(self, path: Path) -> Scene:
         """A scene with views and Gaussians, of known unit, named by its path."""

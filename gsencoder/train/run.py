@@ -12,21 +12,20 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import plain
-from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.fusion.heads.store import heads_digest
 from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.text.build import Words, closed_table
 from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable
-from gsencoder.train.adapter_heads import load_heads
+from gsencoder.train.adapter_heads import asked_heads, dataset_heads, render_heads, teacher_of_heads
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.crops import SamplingConfig
-from gsencoder.train.distill import Heads
-from gsencoder.train.distributed import ProcessRank, join_processes
+from gsencoder.train.distributed import ProcessRank, check_agreement, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
@@ -49,9 +48,13 @@ class TrainConfig(SourceConfig):
     """Settings of a training run."""
 
     tensorboard: bool = field(default=True, metadata={"help": "write TensorBoard events in addition to log.csv"})
-    heads: str = field(
-        default="",
-        metadata={"help": "file of the teacher's adapter heads, on whose outputs L_render is computed; empty = none"},
+    heads: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "names": True,
+            "help": "the teacher's adapter heads on whose outputs L_render is computed, such as siglip,sam.features; "
+            "they are stored beside the weights; empty = L_render compares the features themselves",
+        },
     )
     model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -128,7 +131,15 @@ def train(
         prepared_folder = Path(prepared) if prepared is not None else folder / "prepared"
         voxel = config.model.voxel
         datasets = prepare_scenes(
-            training, validation, words, config, prepared_folder, voxel=voxel, process=process, track=track
+            training,
+            validation,
+            words,
+            config,
+            prepared_folder,
+            voxel=voxel,
+            heads=asked_heads(config.heads, config.teachers_by_name),
+            process=process,
+            track=track,
         )
         return fit(
             datasets,
@@ -163,6 +174,11 @@ def fit(
         InputError: see `train`.
     """
     outputs = OutputSpaces(by_teacher={name: dataset.load_space()[0] for name, dataset in datasets.items()})
+    with_heads = teacher_of_heads(config.teachers_by_name, config.heads)
+    heads = dataset_heads(datasets[with_heads], config.heads)
+    if len(heads.heads) < len(config.heads):
+        raise InputError(f"heads: {', '.join(config.heads)} names a head twice; its loss would count twice")
+    check_agreement("the heads of L_render", heads_digest(heads))
     weights = config.loss.teacher_weights or (1.0,) * len(datasets)
     if len(weights) != len(datasets):
         raise InputError(
@@ -196,7 +212,7 @@ def fit(
         config.train,
         folder=work,
         settings=resume_settings(config, process, datasets),
-        heads=_heads(config, outputs),
+        heads={with_heads: render_heads(heads, outputs[with_heads])},
         process=process,
         device=device,
         tensorboard=config.tensorboard,
@@ -216,16 +232,6 @@ def _table_of(words: Words, dataset: PreparedDataset) -> TextTable:
     return closed_table(words.including(dataset.load_kinds()) if isinstance(words, OpenVocabulary) else words)
 
 
-def _heads(config: TrainConfig, outputs: OutputSpaces) -> dict[str, Heads]:
-    """The adapter heads of the file `heads`, for the only teacher."""
-    if not config.heads:
-        return {}
-    if len(outputs) > 1:
-        raise InputError("heads: adapter heads belong to the features of one teacher; expected no others in teachers=")
-    (name,) = outputs
-    return {name: load_heads(find_file(config.heads, "heads"), outputs[name])}
-
-
 def resume_settings(
     config: TrainConfig, process: ProcessRank, datasets: Mapping[str, PreparedDataset]
 ) -> dict[str, Any]:
@@ -236,7 +242,9 @@ def resume_settings(
     shared = {name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
     for name in CHANGEABLE_ON_RESUME:
         del shared["train"][name]
-    heads = digest_files(find_file(config.heads, "heads")) if config.heads else ""
+    with_heads = teacher_of_heads(config.teachers_by_name, config.heads)
+    digest = heads_digest(dataset_heads(datasets[with_heads], config.heads))
+    heads = f"{','.join(config.heads)} ({digest})" if config.heads else ""
     spaces = {name: dataset.fingerprint() for name, dataset in datasets.items()}
     prepared = {name: dataset.settings for name, dataset in datasets.items()}
     if len(datasets) == 1:

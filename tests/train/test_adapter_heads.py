@@ -1,6 +1,8 @@
-"""Adapter heads on disk, and what the render loss does behind them."""
+"""Adapter heads in a training: what the render loss does behind them, and how they are measured over a dataset."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,10 +10,25 @@ import torch
 from torch import nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import write_archive
+from gsencoder.fusion.cell_sample import CellSample
+from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
+from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.heads.store import load_heads, save_heads
+from gsencoder.fusion.store.heads_file import HEADS_FILE
+from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.adapter_heads import FeatureDecoder, Residual, load_heads, save_heads
-from gsencoder.types import FeatureBasis, FeatureSpace
+from gsencoder.train.adapter_heads import (
+    FeatureDecoder,
+    asked_heads,
+    dataset_heads,
+    measure_dataset_heads,
+    missing_heads,
+    render_heads,
+)
+from gsencoder.train.dataset_space import views_of_scenes
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=6)
 
@@ -24,71 +41,135 @@ def outputs(rank: int = 3) -> OutputSpace:
     return OutputSpace(space=SPACE, mean=mean, scale=2.0, basis=basis)
 
 
+def measured(name: str, channels: int, scale: float = 2.0, inputs: int = 6) -> MeasuredHead:
+    torch.manual_seed(channels)
+    body = nn.Sequential(nn.Linear(inputs, 8), nn.GELU(), nn.Linear(8, channels))
+    mean = np.arange(channels, dtype=np.float32)
+    fit = HeadFit(cells=5, cosine=0.9, worst=0.5)
+    return MeasuredHead(head=Head(name=name, body=body), mean=mean, scale=scale, fit=fit)
+
+
 @pytest.mark.parametrize("rank", [0, 3])
 def test_decoding_undoes_standard_units(rank: int) -> None:
     space = outputs(rank)
     standard = np.random.default_rng(1).normal(size=(5, space.channels)).astype(np.float32)
     restored = space.restore(standard)
     expected = restored if space.basis is None else restored @ space.basis.components + space.mean
-    found = FeatureDecoder(space)(torch.from_numpy(standard)).numpy()
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    decoded = FeatureDecoder(space)(torch.from_numpy(standard)).numpy()
+    np.testing.assert_allclose(decoded, expected, atol=1e-5)
 
 
-def test_heads_that_are_read_give_what_the_written_ones_gave(tmp_path: Path) -> None:
-    layers = nn.Sequential(nn.Linear(6, 8), nn.GELU(), nn.Linear(8, 4))
-    mean = np.arange(4, dtype=np.float32)
-    save_heads(
-        tmp_path / "h", {"clip": (layers, mean, 2.0), "dino": (nn.Sequential(nn.Linear(6, 5)), np.zeros(5), 1.0)}
-    )
-    (clip, decode), (dino, _) = load_heads(tmp_path / "h", outputs())
+def test_heads_of_the_loss_give_standard_units_of_their_space_and_have_no_gradient() -> None:
+    one, other = measured("clip.summary", 4), measured("sam.features", 5, scale=1.0)
+    (clip, decode), (sam, _) = render_heads(HeadSet(space=SPACE, heads=(one, other)), outputs())
     standard = torch.randn(7, 3)
     features = decode(standard)
-    expected = (layers(features) - torch.from_numpy(mean)) / (2.0 / 4**0.5)
+    expected = (one.head.body(features) - torch.from_numpy(one.mean)) / (2.0 / 4**0.5)
     torch.testing.assert_close(clip(features), expected)
-    assert dino(features).shape == (7, 5)
+    assert sam(features).shape == (7, 5)
     assert not any(value.requires_grad for value in clip.parameters())
+    assert render_heads(HeadSet(space=SPACE), outputs()) == []
 
 
-def test_norms_and_residual_blocks_as_radio_has_them_come_back(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    block = Residual(nn.LayerNorm(8), nn.GELU(), nn.Linear(8, 8))
-    layers = nn.Sequential(nn.Linear(6, 8), block, nn.LayerNorm(8), nn.ReLU(), nn.Linear(8, 4))
-    for parameter in layers.parameters():
-        nn.init.normal_(parameter)
-    save_heads(tmp_path / "h", {"siglip": (layers, np.zeros(4), 2.0)})
-    ((head, _),) = load_heads(tmp_path / "h", outputs())
-    x = torch.randn(7, 6)
-    torch.testing.assert_close(head(x), layers(x))
+def test_heads_of_another_backbone_are_refused() -> None:
+    other = FeatureSpace(name="s", channels=6, weights="1234")
+    with pytest.raises(InputError, match=r"heads take features of \(s · 6 channels · 1234\), and these are of \(s · 6"):
+        render_heads(HeadSet(space=other, heads=(measured("clip.summary", 4),)), outputs())
 
 
-def test_layers_that_a_file_cannot_hold_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"clip\.1: expected linear, layernorm, gelu, relu or Residual, got Tanh"):
-        save_heads(tmp_path / "h", {"clip": (nn.Sequential(nn.Linear(6, 4), nn.Tanh()), np.zeros(4), 1.0)})
-
-
-def test_heads_for_features_of_another_width_are_refused(tmp_path: Path) -> None:
-    save_heads(tmp_path / "h", {"clip": (nn.Sequential(nn.Linear(9, 4)), np.zeros(4), 1.0)})
-    with pytest.raises(InputError, match=r"expected clip\.0\.weight"):
-        load_heads(tmp_path / "h", outputs())
+def test_a_training_asks_for_the_heads_of_its_loss_and_for_those_that_are_stored_besides() -> None:
+    teacher = RadioConfig(heads=("siglip", "clip"))
+    assert asked_heads(("sam", "siglip"), teacher) == ("sam", "siglip", "clip")
+    assert asked_heads((), PaletteConfig()) == ()
 
 
 @pytest.mark.parametrize(
-    "entry",
-    [
-        {},
-        {"name": "a", "layers": [], "scale": 1.0},
-        {"name": 3, "layers": ["linear"], "scale": 1.0},
-        {"name": "a", "layers": ["tanh"], "scale": 1.0},
-    ],
+    ("scenes", "views", "expected"), [(3, 6, [2, 2, 2]), (2, 5, [2, 3]), (4, 2, [1, 1, 1, 0]), (1, 256, [256])]
 )
-def test_a_file_that_lists_no_heads_is_refused(tmp_path: Path, entry: dict) -> None:
-    write_archive(tmp_path / "h", {"x": np.zeros(1, np.float32)}, {"heads": [entry]})
-    with pytest.raises(InputError, match=r"expected heads with name, layers|a\.0: expected linear, layernorm"):
-        load_heads(tmp_path / "h", outputs())
+def test_maps_are_spread_over_scenes_and_the_first_has_one(scenes: int, views: int, expected: list[int]) -> None:
+    counts = views_of_scenes(scenes, views)
+    assert counts == expected
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("inf")])
-def test_a_scale_that_is_none_is_refused(tmp_path: Path, scale: float) -> None:
-    save_heads(tmp_path / "h", {"clip": (nn.Sequential(nn.Linear(6, 4)), np.zeros(4), scale)})
-    with pytest.raises(InputError, match="scale"):
-        load_heads(tmp_path / "h", outputs())
+class Dataset(PreparedDataset):
+    """A folder with an output space, as `measure_dataset_heads` uses a prepared dataset."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def load_space(self) -> tuple[OutputSpace, None]:
+        return outputs(), None
+
+
+class MapTeacher:
+    """Maps of random vectors, which counts how often it is asked."""
+
+    space = SPACE
+    asked = 0
+
+    def feature_map(self, views: Any, view: int) -> FeatureMap:
+        MapTeacher.asked += 1
+        features = np.random.default_rng(view).normal(size=(4, 5, 6)).astype(np.float32)
+        features[0, 0] = np.nan
+        return FeatureMap(features=features, grid_from_image=np.array([[1.0, 0, 0], [0, 1, 0]]), space=self.space)
+
+
+class ThreeViews:
+    """A scene with three views, of which nothing is looked at."""
+
+    views = (0, 1, 2)
+
+
+@pytest.fixture
+def of_teacher(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    heads = {name: measured(name, 4).head for name in ("clip.summary", "sam.features")}
+
+    def read(teacher: Any, names: Any) -> list[Head]:
+        return [heads[name] for name in names]
+
+    monkeypatch.setattr("gsencoder.train.adapter_heads.heads_of", read)
+    return read
+
+
+def test_a_head_is_measured_once_over_the_maps_of_the_output_space(tmp_path: Path, of_teacher: Any) -> None:
+    dataset = Dataset(tmp_path)
+
+    def measure(*names: str) -> None:
+        scenes = [Path("a"), Path("b")]
+        missing = missing_heads(dataset, names, RadioConfig())
+        measure_dataset_heads(dataset, missing, scenes, lambda path: (ThreeViews(), MapTeacher()), 4)  # type: ignore[arg-type, return-value]
+
+    MapTeacher.asked = 0
+    measure("clip.summary")
+    assert MapTeacher.asked == 4
+    sample = CellSample(4)
+    for view in (0, 2, 0, 2):
+        sample.add(MapTeacher().feature_map(None, view))
+    vectors = sample.vectors()
+    assert len(vectors) == 4 * 19
+    stored = load_heads(tmp_path / HEADS_FILE)
+    (head,) = stored.heads
+    full = head.head.body(torch.from_numpy(vectors)).detach().numpy()
+    np.testing.assert_allclose(head.mean, full.mean(axis=0), atol=1e-5)
+    assert head.scale == pytest.approx(np.sqrt(((full - full.mean(axis=0)) ** 2).sum(axis=1).mean()), rel=1e-5)
+    assert head.fit.cells == len(vectors)
+    assert -1 <= head.fit.worst < head.fit.cosine < 1
+    MapTeacher.asked = 0
+    measure("clip.summary")
+    assert MapTeacher.asked == 0
+    measure("clip.summary", "sam.features")
+    assert load_heads(tmp_path / HEADS_FILE).names == ("clip.summary", "sam.features")
+    assert dataset_heads(dataset, ["sam"]).names == ("sam.features",)
+    assert dataset_heads(dataset, []).names == ()
+    with pytest.raises(InputError, match="heads=dino: not among the heads at hand: clip.summary, sam.features"):
+        dataset_heads(dataset, ["dino"])
+
+
+def test_heads_of_another_backbone_in_the_folder_of_a_dataset_are_refused(tmp_path: Path, of_teacher: Any) -> None:
+    dataset = Dataset(tmp_path)
+    other = HeadSet(space=FeatureSpace(name="s", channels=6, weights="other"), heads=(measured("clip.summary", 4),))
+    save_heads(tmp_path / HEADS_FILE, other)
+    missing = missing_heads(dataset, ["sam.features"], RadioConfig())
+    assert [head.name for head in missing] == ["sam.features"]
+    with pytest.raises(InputError, match=r"heads take features of \(s · 6 channels · other\)"):
+        measure_dataset_heads(dataset, missing, [], lambda path: None, 4)  # type: ignore[arg-type, return-value]

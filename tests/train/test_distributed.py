@@ -11,6 +11,7 @@ import torch
 from gsencoder.core.errors import InputError
 from gsencoder.train.distributed import (
     ProcessRank,
+    check_agreement,
     fail_together,
     first_host,
     gpu_index,
@@ -133,3 +134,37 @@ def test_one_process_leaves_a_block_as_it_entered_it() -> None:
         pass
     with pytest.raises(InputError, match="its own"), fail_together():
         raise InputError("its own")
+
+
+AGREE = """
+from pathlib import Path
+
+from gsencoder.train.distributed import check_agreement, join_processes
+
+if __name__ == "__main__":
+    with join_processes("cpu") as (process, device):
+        check_agreement("the teacher's weights", "8a1f")
+        check_agreement("the teacher's weights", "" if process.is_first else "8a1f")
+        try:
+            check_agreement("the teacher's weights", "8a1f" if process.is_first else "77b0")
+        except Exception as error:
+            Path(f"{__file__}.{process.rank}").write_text(f"{type(error).__name__}: {error}")
+"""
+
+
+@pytest.mark.alone
+def test_processes_with_different_weights_all_stop_and_name_both_digests(tmp_path: Path) -> None:
+    path = tmp_path / "run.py"
+    path.write_text(AGREE)
+    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run([*launcher, str(path)], timeout=120, env=environment, capture_output=True, check=True)
+    message = (
+        "InputError: training: the teacher's weights of process 0 are 8a1f, those of process 1 are 77b0; give all "
+        "processes the same files"
+    )
+    assert [Path(f"{path}.{rank}").read_text() for rank in (0, 1)] == [message, message]
+
+
+def test_one_process_agrees_with_itself() -> None:
+    check_agreement("the teacher's weights", "8a1f")

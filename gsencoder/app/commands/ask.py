@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import load_words
+from gsencoder.app.commands.query_words import asked_scene, load_words
 from gsencoder.app.commands.views import shown_scene
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import printable
@@ -24,7 +24,8 @@ from gsencoder.infer.ask.questions import BatchQuestion, read_questions
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
 from gsencoder.infer.localize.localize import LocalizeConfig, select_features
 from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.types import Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +54,13 @@ class AskCommandConfig(CommonConfig):
     )
     words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
     space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
+    head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
+            "features themselves are"
+        },
+    )
     photos: str = field(
         default="", metadata={"help": "the scene that was fused; its photographs are shown instead of renders"}
     )
@@ -90,15 +98,11 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
         check_question(config.task, config.question)
     with summary.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
-        # A box can be asked about without words.
-        stated = config.words or not isinstance(config.text, TableTextConfig)
-        space = select_features(scene, config.space or None)[1].space
-        has_words = bool(stated) or table_path(folder, space.text_encoder) is not None
-        words = load_words(folder, space, config.words, config.text) if has_words else None
+        scene, words = _scene_and_words(scene, folder, config)
     asker = Asker(
         scene,
         words,
-        space=config.space or None,
+        space=None if config.head else config.space or None,
         config=config.ask,
         localization=config.localize,
         views=config.choose,
@@ -117,6 +121,16 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
     if server is not None:
         screen.print(printable(row["answer"]), soft_wrap=True)
     screen.print(f"{out}: {len(row['views'])} pictures, {PROMPT}, {REQUEST}" + (f", {ANSWER}" if server else ""))
+
+
+def _scene_and_words(scene: Scene, folder: Path, config: AskCommandConfig) -> tuple[Scene, Words | None]:
+    """The scene with the features that are asked, and the words; a box can be asked about without words."""
+    if config.head:
+        return asked_scene(scene, folder, head=config.head, space=config.space, given=config.words, text=config.text)
+    space = select_features(scene, config.space or None)[1].space
+    stated = config.words or not isinstance(config.text, TableTextConfig)
+    known = stated or table_path(folder, space.text_encoder) is not None
+    return scene, load_words(folder, space, config.words, config.text) if known else None
 
 
 def ask_file(

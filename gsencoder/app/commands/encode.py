@@ -17,10 +17,11 @@ from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.store.folder import FEATURES_FILE, file_of_teacher, save_features
+from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads, heads_beside
 from gsencoder.fusion.store.words import save_tables
 from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.load_encoder import Encoder, load_encoder
-from gsencoder.types import GaussianFeatures, Scene
+from gsencoder.infer.load_encoder import Encoder, file_of_encoder, load_encoder
+from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +67,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     paths = find_scenes(config.paths)
     with summary.step("weights"):
         encoder = load_encoder(config.weights, config.encode.device)
+        heads = heads_beside(file_of_encoder(config.weights))
     screen = console(config.quiet)
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
@@ -77,7 +79,10 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
                     scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
             scene = with_reported_up(scene, one, quiet=config.quiet)
             with about(scene.name):
-                _encode_into(folder, scene, encoder, config, one)
+                spaces = _encode_into(folder, scene, encoder, config, one)
+            if heads is not None:
+                others = [space for space in encoder.spaces.values() if space not in spaces]
+                copy_heads(heads, folder / HEADS_FILE, spaces, left_out=others)
         screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
         where = "this scene" if config.basis_views else "the scenes held out of the training"
         for name, figures in one.results.get("teachers", {"": one.results}).items():
@@ -102,7 +107,8 @@ def _encode_into(
     encoder: Encoder,
     config: EncodeCommandConfig,
     summary: Summary,
-) -> None:
+) -> list[FeatureSpace]:
+    """Encodes a scene and writes its features and words; returns the spaces that were written."""
     assert scene.gaussians is not None
     unit = unit_of(scene, encoder.voxel)
     with summary.step("encode"):
@@ -132,6 +138,7 @@ def _encode_into(
         metres_per_unit=unit,
         **(next(iter(figures.values())) if single else {"teachers": figures}),
     )
+    return [features.space for features in by_teacher.values()]
 
 
 def _requested(by_teacher: dict[str, GaussianFeatures], names: tuple[str, ...]) -> dict[str, GaussianFeatures]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
+from gsencoder.app.commands.through_head import words_of_head
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
@@ -32,12 +33,23 @@ from gsencoder.evaluate.protocols.localization import (
     scores_by_name,
 )
 from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming, naming_scores
-from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, load_scenes, space_of_words
+from gsencoder.evaluate.sources import (
+    FeatureSource,
+    encoder_source,
+    fused_head_source,
+    fusion_source,
+    head_source,
+    load_scenes,
+    space_of_words,
+)
 from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.fusion.heads.of_teacher import heads_of
+from gsencoder.fusion.heads.store import find_head, load_heads
+from gsencoder.fusion.store.heads_file import heads_beside
 from gsencoder.fusion.teachers.build import TeacherConfig, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.load_encoder import load_encoder
+from gsencoder.infer.load_encoder import file_of_encoder, load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.text.build import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene
@@ -80,6 +92,13 @@ class EvaluateConfig(CommonConfig):
         default="",
         metadata={"help": "of an encoder with several teachers, the one that is evaluated; empty = that of the words"},
     )
+    head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head whose outputs are evaluated, such as siglip, with the words of text=; empty = the "
+            "features themselves"
+        },
+    )
     protocol: LocalizationProtocol | NamingProtocol | AbsentProtocol = field(default_factory=LocalizationProtocol)
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -93,17 +112,7 @@ class EvaluateConfig(CommonConfig):
 
 def run(config: EvaluateConfig, summary: Summary) -> None:
     """Evaluates, prints the scores, and writes them with one row for each object or name."""
-    words = words_of(config.teacher, config.text)
-    if words is None:
-        raise InputError(
-            f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words= or text="
-        )
-    if config.weights:
-        retain_freed_memory()
-        encoder = load_encoder(config.weights, config.encode.device)
-        source = encoder_source(encoder, config.encode, config.space or space_of_words(encoder, words))
-    else:
-        source = fusion_source(config.teacher, words, config.fusion)
+    source, words = _source_of_head(config) if config.head else _source(config)
     out = config.out or Path("outputs") / "evaluate" / config.protocol.name
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         if isinstance(config.protocol, NamingProtocol):
@@ -115,6 +124,42 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
     screen = console(config.quiet)
     screen.print(names_table(summary.results))
     screen.print(f"{out}: {scores_line(summary.results)}")
+
+
+def _source(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
+    """The source of the features, and the words that they are compared with."""
+    words = words_of(config.teacher, config.text)
+    if words is None:
+        raise InputError(
+            f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words= or text="
+        )
+    if config.weights:
+        retain_freed_memory()
+        encoder = load_encoder(config.weights, config.encode.device)
+        return encoder_source(encoder, config.encode, config.space or space_of_words(encoder, words)), words
+    return fusion_source(config.teacher, words, config.fusion), words
+
+
+def _source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
+    """The source of the outputs of an adapter head, and the words that they are compared with."""
+    table = getattr(config.teacher, "words", "") if isinstance(config.text, TableTextConfig) else ""
+    if config.weights:
+        path = heads_beside(file_of_encoder(config.weights))
+        if path is None:
+            raise InputError(
+                f"head={config.head}: no adapter heads lie beside the weights {config.weights}; train with "
+                f"heads=[{config.head}]"
+            )
+        heads = load_heads(path)
+        head = find_head(heads, config.head)
+        words = words_of_head(head.head, table, config.text)
+        retain_freed_memory()
+        encoder = load_encoder(config.weights, config.encode.device)
+        source = encoder_source(encoder, config.encode, config.space or heads.space.name)
+        return head_source(source, heads, head, words.space.text_encoder), words
+    (own,) = heads_of(config.teacher, [config.head], "head")
+    words = words_of_head(own, table, config.text)
+    return fused_head_source(config.teacher, own, words.space.text_encoder, config.fusion), words
 
 
 def _scenes(config: EvaluateConfig) -> Iterator[tuple[Scene, float]]:

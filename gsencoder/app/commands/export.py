@@ -16,7 +16,9 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
+from gsencoder.fusion.store.heads_file import copy_heads, heads_beside, heads_of_graph
 from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.load_encoder import file_of_encoder
 from gsencoder.infer.onnx.export import (
     COSINE,
     TOLERANCE,
@@ -134,6 +136,13 @@ def run(config: ExportConfig, summary: Summary) -> None:
         **space_figures(encoder),
     )
     write_json(f"{config.out}.summary.json", summary.to_dict())
+    heads = heads_beside(file_of_encoder(config.weights))
+    if heads is None:
+        # Those of a file that was replaced.
+        heads_of_graph(config.out).unlink(missing_ok=True)
+    else:
+        copy_heads(heads, heads_of_graph(config.out), list(encoder.spaces.values()))
+        screen.print(f"{heads_of_graph(config.out)}: the adapter heads that take its features; keep it beside the file")
     screen.print(
         f"{config.out}: {len(model) / 1e6:.1f} MB; {agreement} on {len(compared)} clouds of {min(compared):,} to "
         f"{max(compared):,} Gaussians"

@@ -1,12 +1,14 @@
 """`gsencoder fuse SCENE… teacher=…`: per-Gaussian features from a teacher's maps of the views."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from gsencoder.app.commands.basis_figures import describe_basis
+from gsencoder.app.commands.head_figures import describe_heads, head_figures
 from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
@@ -19,8 +21,13 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
+from gsencoder.fusion.heads.measure import measure_heads
+from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
+from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.heads.store import save_heads
 from gsencoder.fusion.orbit_views import INSIDE, CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
+from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -69,6 +76,7 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     paths = find_scenes(config.paths)
     with summary.step("teacher"):
         words = words_of(config.teacher, config.text)
+        heads = heads_of(config.teacher, stored_heads(config.teacher), "teacher.heads")
     outputs = load_weights_spaces(config.basis) if config.basis else None
     screen = console(config.quiet)
 
@@ -78,8 +86,9 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             with one.step("teacher"):
                 teacher = build_teacher(config.teacher, scene, words)
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
-            fusion = fuse_scene(scene, teacher, config, one, out, basis=basis)
+            fusion = fuse_scene(scene, teacher, config, one, out, basis=basis, sample_cells=bool(heads))
             write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
+            lines = write_heads(folder, heads, fusion, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
         seen, total = one.results["seen"], one.results["gaussians"]
         screen.print(
@@ -87,6 +96,8 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             f"({describe_basis(one.results, 'this scene')}), "
             f"from {one.results['views']} views"
         )
+        for line in lines:
+            screen.print(f"{out}: {line}")
 
     run_scenes(
         paths,
@@ -165,10 +176,12 @@ def fuse_scene(
     out: Path,
     *,
     basis: FeatureBasis | None = None,
+    sample_cells: bool = False,
 ) -> Fusion:
     """Fuses, in a given basis or in one of the scene's own, and adds the seconds of the steps to the summary."""
     work = None if teacher.cheap else work_folder(out)
-    fusion = fuse(scene, teacher, config.fusion, basis=basis, work=work, track=Progress(quiet=config.quiet))
+    track = Progress(quiet=config.quiet)
+    fusion = fuse(scene, teacher, config.fusion, basis=basis, work=work, sample_cells=sample_cells, track=track)
     summary.add_seconds(fusion.seconds)
     return fusion
 
@@ -197,3 +210,15 @@ def write_features(
         space=features.space.describe(),
         features="features.safetensors",
     )
+
+
+def write_heads(folder: Path, heads: Sequence[Head], fusion: Fusion, summary: Summary) -> list[str]:
+    """Measures adapter heads over the maps that were fused, writes them, and adds their figures to the summary; returns
+    a line for each head."""
+    if fusion.sample is None:
+        return []
+    with summary.step("heads"):
+        measured = measure_heads(heads, fusion.sample, fusion.features.space, fusion.features.basis)
+        save_heads(folder / HEADS_FILE, measured)
+    summary.results.update(heads=head_figures(measured))
+    return describe_heads(measured)

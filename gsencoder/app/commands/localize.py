@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.app.commands.query_words import load_words, query_words
+from gsencoder.app.commands.query_words import asked_scene, query_words
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.progress import console
@@ -18,7 +18,7 @@ from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features
+from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.types import Localization
 
@@ -34,6 +34,13 @@ class LocalizeCommandConfig(CommonConfig):
     queries: str = field(default="", metadata={"help": "a text file with one query a line"})
     words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
     space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
+    head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
+            "features themselves are"
+        },
+    )
     pictures: int = field(default=4, metadata={"help": "number of views drawn for each word; 0 = none"})
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
@@ -56,11 +63,13 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         scene = load_features(folder)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
         scene, _ = with_up(scene)
-        space = select_features(scene, config.space or None)[1].space
-        table = load_words(folder, space, config.words, config.text)
+        asked, table = asked_scene(
+            scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
+        )
     with summary.step("localize"):
-        localization = localize(scene, words, table, config.localize, space=config.space or None)
+        localization = localize(asked, words, table, config.localize)
     out = config.out or Path("outputs") / scene.name / "boxes"
+    summary.results["space"] = next(iter(asked.features.values())).space.describe()
     boxes = localization_to_json(localization)
     summary.results.update(boxes=boxes, thresholds=dict(zip(words, localization.thresholds.tolist(), strict=True)))
     summary.results.update(words=words_to_json(localization))

@@ -10,9 +10,11 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
+from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads
 from gsencoder.fusion.store.package import PACKAGE_FILE, Form, save_arrays, save_package, save_ply
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features
+from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -26,6 +28,14 @@ class PackConfig(CommonConfig):
         metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
     )
     space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
+    head: str = field(
+        default="",
+        metadata={"help": "adapter head whose outputs are packed, such as siglip; empty = the features themselves"},
+    )
+    text: TextConfig = field(
+        default_factory=TableTextConfig,
+        metadata={"help": "text tower of the space of head=, whose words are packed with its outputs"},
+    )
     form: Form = field(
         default="compact",
         metadata={
@@ -51,6 +61,8 @@ class PackConfig(CommonConfig):
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        if not self.head and not isinstance(self.text, TableTextConfig):
+            raise InputError("text=: is for the outputs of an adapter head; give head= as well, or leave it out")
         if not 0 < self.error < 1:
             raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
         if self.decoded and self.form == "compact":
@@ -62,17 +74,36 @@ def run(config: PackConfig, summary: Summary) -> None:
     source = Path(config.paths[0])
     with summary.step("load"):
         scene = load_features(source)
-        _, features = select_features(scene, config.space or None)
+    words = None
+    if config.head:
+        # Heads need torch, which packing does without.
+        from gsencoder.app.commands.through_head import packed_through_head
+
+        with summary.step("head"):
+            scene, words = packed_through_head(scene, source, config.head, config.text, space=config.space)
+    _, features = select_features(scene, None if config.head else config.space or None)
     out = config.out or Path("outputs") / scene.name / "package"
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         with summary.step("pack"):
             message = _write(folder, scene, features, config, summary)
-        words = table_path(source, features.space.text_encoder)
-        if words is not None and config.form == "compact":
-            save_text_table(folder / WORDS_FILE, load_text_table(words), dtype="float16")
-        elif words is not None:
-            copyfile(words, folder / WORDS_FILE)
+        if config.head:
+            if words is not None:
+                save_text_table(folder / WORDS_FILE, words, dtype="float16" if config.form == "compact" else "float32")
+        else:
+            _write_beside(folder, source, scene, features, config.form)
     console(config.quiet).print(f"{out}: {message}")
+
+
+def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFeatures, form: Form) -> None:
+    """Writes the words and the adapter heads of the features that lie beside them."""
+    words = table_path(source, features.space.text_encoder)
+    if words is not None and form == "compact":
+        save_text_table(folder / WORDS_FILE, load_text_table(words), dtype="float16")
+    elif words is not None:
+        copyfile(words, folder / WORDS_FILE)
+    if (source / HEADS_FILE).is_file():
+        others = [each.space for each in scene.features.values() if each is not features]
+        copy_heads(source / HEADS_FILE, folder / HEADS_FILE, [features.space], left_out=others)
 
 
 def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:

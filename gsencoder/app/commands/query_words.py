@@ -1,14 +1,16 @@
 """The words of query= and queries=, and what turns them into vectors of the feature space."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.fusion.store.words import table_path
+from gsencoder.infer.localize.localize import select_features
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, vocabulary_of, words_of_table
 from gsencoder.text.table import load_text_table
-from gsencoder.types import FeatureSpace
+from gsencoder.types import FeatureSpace, Scene
 
 MAX_QUERIES_BYTES = 1 << 20
 """Largest size of a file of queries, bytes."""
@@ -41,6 +43,38 @@ def _lines_of(file: Path) -> list[str]:
         return data.decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"queries: {file} cannot be read as text: {error}") from error
+
+
+def asked_scene(
+    scene: Scene,
+    folder: Path,
+    *,
+    head: str = "",
+    space: str = "",
+    given: str = "",
+    text: TextConfig = TableTextConfig(),
+) -> tuple[Scene, Words]:
+    """A scene with the one feature set that words are compared with, and the words.
+
+    Args:
+        scene: of the folder.
+        folder: of the features.
+        head: name of an adapter head; empty = the features themselves are asked.
+        space: name of the feature set; empty where there is only one.
+        given: a file of words; empty = those beside the features, or for a head those of `text`.
+        text: a text tower.
+
+    Raises:
+        InputError: there is no such feature set or head, or no words, or the words are not those of the head's space.
+    """
+    if head:
+        # Heads need torch, which finding boxes does without.
+        from gsencoder.app.commands.through_head import asked_through_head
+
+        return asked_through_head(scene, folder, head, space=space, given=given, text=text)
+    _, features = select_features(scene, space or None)
+    words = load_words(folder, features.space, given, text)
+    return replace(scene, features={features.space.name: features}), words
 
 
 def load_words(folder: Path, space: FeatureSpace, given: str, text: TextConfig = TableTextConfig()) -> Words:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from gsencoder.app.commands.basis_figures import basis_figures, describe_basis
+from gsencoder.app.commands.head_figures import describe_heads, head_figures
 from gsencoder.app.runs.output_folder import lies_in, output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
@@ -23,11 +24,15 @@ from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit
+from gsencoder.fusion.heads.measure import HeadSet
+from gsencoder.fusion.heads.store import save_heads
+from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.store.words import save_tables
 from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
+from gsencoder.train.adapter_heads import asked_heads, dataset_heads, teacher_of_heads
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
 from gsencoder.train.prepared_scene import PreparedScene
@@ -77,12 +82,25 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 # Opened now, so that an out= that cannot be written is an error before hours of work.
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
         with summary.step("prepare"):
+            heads_asked = asked_heads(config.heads, config.teachers_by_name)
             datasets = prepare_scenes(
-                training, held_out, words, config, prepared, voxel=config.model.voxel, process=process, track=track
+                training,
+                held_out,
+                words,
+                config,
+                prepared,
+                voxel=config.model.voxel,
+                heads=heads_asked,
+                process=process,
+                track=track,
             )
+            with_heads = datasets[teacher_of_heads(config.teachers_by_name, heads_asked)]
         if config.prepare_only:
             counts = f"{len(training)} scenes to train on, {len(held_out)} for validation"
-            console(config.quiet or not process.is_first).print(f"{prepared}: {counts}")
+            screen = console(config.quiet or not process.is_first)
+            screen.print(f"{prepared}: {counts}")
+            for line in describe_heads(dataset_heads(with_heads, heads_asked)):
+                screen.print(f"{prepared}: {line}")
             return
         with fail_together():
             if process.is_first:
@@ -108,7 +126,8 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
             name: encoder_basis_figures(done.outputs[name], dataset.scenes(names(held_out)))
             for name, dataset in datasets.items()
         }
-        write_results(folder, state.path, done, figures, config, summary)
+        heads = dataset_heads(with_heads, heads_asked)
+        write_results(folder, state.path, done, figures, heads, config, summary)
     scores = ", ".join(f"{name} {value:.3f}" for name, value in done.scores.items()) or "not validated"
     minutes = done.state.seconds / 60
     screen = console(config.quiet)
@@ -116,6 +135,8 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
     for name, of_teacher in figures.items():
         of = f" for {name}" if len(figures) > 1 else ""
         screen.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
+    for line in describe_heads(heads):
+        screen.print(f"{out}: {line}")
 
 
 def names(paths: Sequence[Path]) -> list[str]:
@@ -136,16 +157,19 @@ def write_results(
     work: Path,
     done: Training,
     figures: dict[str, dict[str, int | float]],
+    heads: HeadSet,
     config: TrainCommandConfig,
     summary: Summary,
 ) -> None:
-    """Writes weights, words, log and pictures; scores and the figures of each teacher's basis go into weights and
+    """Writes weights, words, heads, log and pictures; scores and the figures of each basis go into weights and
     summary."""
     steps, seconds = done.state.step, done.state.seconds
     made_by = {"settings": settings(config), "steps": steps, "seconds": seconds, "validation": done.scores}
     made_by["basis"] = figures if len(figures) > 1 else next(iter(figures.values()))
     save_weights(folder / WEIGHTS_FILE, done.encoder, done.outputs, made_by, dtype=config.store)
     save_tables(folder, done.tables, done.outputs, dtype=config.store)
+    if heads.heads:
+        save_heads(folder / HEADS_FILE, heads)
     shutil.copy(work / LOG_FILE, folder / LOG_FILE)
     for name in (EVENTS_FOLDER, "validation"):
         if (work / name).is_dir():
@@ -156,6 +180,7 @@ def write_results(
         parameters=sum(value.numel() for value in done.encoder.parameters()),
         validation=done.scores,
         basis=made_by["basis"],
+        heads=head_figures(heads),
         weights=WEIGHTS_FILE,
         log=LOG_FILE,
     )

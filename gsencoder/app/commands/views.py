@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import load_words, query_words
+from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.commands.through_head import features_for_heads, heads_of_folder
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
@@ -12,7 +13,10 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import write_archive
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.fusion.heads.apply import head_space, head_tokens
+from gsencoder.fusion.heads.store import find_head
 from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.store.heads_file import check_heads_space
 from gsencoder.infer.localize.localization_json import box_to_json, words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features
 from gsencoder.infer.views.choose import choose_views
@@ -41,6 +45,20 @@ class ViewsCommandConfig(CommonConfig):
     queries: str = field(default="", metadata={"help": "a text file with one query a line"})
     words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
     space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
+    head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
+            "features themselves are"
+        },
+    )
+    token_head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head that rendered features of grid= are put through, such as siglip.features; empty = "
+            "that of head="
+        },
+    )
     photos: str = field(
         default="", metadata={"help": "the scene that was fused; its photographs are shown instead of renders"}
     )
@@ -68,6 +86,8 @@ class ViewsCommandConfig(CommonConfig):
             raise InputError(f"grid: expected rows and columns, such as [27,27], got {list(self.grid)}")
         if self.grid:
             tower_grid(1, 1, (self.grid[0], self.grid[1]))
+        elif self.token_head:
+            raise InputError("token_head: is for rendered features; give grid= as well, or leave it out")
 
 
 def run(config: ViewsCommandConfig, summary: Summary) -> None:
@@ -81,9 +101,10 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     if config.query or config.queries or config.choose.method == "greedy":
         with summary.step("localize"):
             words = query_words(config.query, config.queries)
-            space = select_features(scene, config.space or None)[1].space
-            table = load_words(folder, space, config.words, config.text)
-            localization = localize(scene, words, table, config.localize, space=config.space or None)
+            asked, table = asked_scene(
+                scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
+            )
+            localization = localize(asked, words, table, config.localize)
             assert scene.gaussians is not None
             targets = targets_of(scene.gaussians, localization, config.boxes)
         absent = {word: describe_absent(value) for word, value in localization.absent.items()}
@@ -120,10 +141,27 @@ def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
 
 
 def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:
-    """Writes rendered features as tokens [V, rows · columns, D] float32, under the name "tokens"."""
+    """Writes rendered features as tokens [V, rows · columns, D] float32, under the name "tokens".
+
+    With an adapter head they are outputs of the head for the rendered features of the backbone, as in SplatDistill's
+    sec. 3.4: heads are not linear, so rendering the outputs for the Gaussians would give others.
+    """
     assert scene.gaussians is not None
-    _, features = select_features(scene, config.space or None)
+    name, option = config.token_head or config.head, "token_head" if config.token_head else "head"
+    head = None
+    if name:
+        heads = heads_of_folder(Path(config.paths[0]), name, option)
+        features = features_for_heads(scene, heads, config.space)
+        check_heads_space(heads.space, features.space)
+        head = find_head(heads, name, option)
+        space = head_space(features.space, head)
+    else:
+        _, features = select_features(scene, config.space or None)
+        space = features.space
     grid = (config.grid[0], config.grid[1])
     blends = token_blends(scene.gaussians, views.cameras, grid, fit=config.fit, config=BlendConfig(near=views.near))
-    tokens = feature_tokens(blends, features).numpy()
-    write_archive(path, {"tokens": tokens}, {"space": features.space.describe(), "grid": list(grid), "fit": config.fit})
+    tokens = feature_tokens(blends, features)
+    if head is not None:
+        tokens = head_tokens(tokens, head)
+    header = {"space": space.describe(), "grid": list(grid), "fit": config.fit}
+    write_archive(path, {"tokens": tokens.numpy()}, header)

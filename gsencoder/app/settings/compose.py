@@ -22,7 +22,6 @@ from gsencoder.app.settings.config import CommonConfig, typed
 from gsencoder.app.settings.config_store import EXPERIMENT, groups_of, store_settings
 from gsencoder.app.settings.options import (
     Option,
-    is_list_of_words,
     join_list,
     near,
     options_by_key,
@@ -218,8 +217,8 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
                 raise InputError(f"{key}: expected one of {', '.join(names)}{got}")
         elif option is not None and option.kind != "value":
             if not (sweep and SWEPT_TEXT.fullmatch(value)):
-                # Users of Hydra write brackets around a list; text may begin with one, words of a closed set do not.
-                bracketed = is_list_of_words(option.annotation) and re.fullmatch(r"\[(.*)\]", value)
+                # Users of Hydra write brackets around a list; text may begin with one, names do not.
+                bracketed = option.names and re.fullmatch(r"\[(.*)\]", value)
                 written = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
         elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
             written = f"[{value}]"

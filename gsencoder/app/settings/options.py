@@ -28,6 +28,7 @@ class Option:
         kind: "text" and "list" (of text) are taken literally; "value" is parsed.
         secret: its value is never shown or written.
         several: the choice of which it takes several members, by name; empty for other options.
+        names: it is a list of names, around which users of Hydra may write brackets.
     """
 
     key: str
@@ -40,6 +41,7 @@ class Option:
     kind: Kind
     secret: bool = False
     several: str = ""
+    names: bool = False
 
 
 MAX_WORD = 200
@@ -213,6 +215,7 @@ def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
                     kind=kind_of(annotation),
                     secret=item.metadata.get("secret", False),
                     several=item.metadata.get("several", ""),
+                    names=item.metadata.get("names", False) or is_list_of_words(annotation),
                 )
             )
     return options

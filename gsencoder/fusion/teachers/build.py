@@ -48,7 +48,10 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
     if isinstance(config, PaletteConfig):
         raise InputError("text=: teacher=palette has the words of its eleven colors; leave out text=")
     if isinstance(config, RadioConfig):
-        raise InputError("text=: no text tower speaks for the features of RADIO's backbone; leave out text=")
+        raise InputError(
+            "text=: no text tower speaks for the features of RADIO's backbone; leave out text= here, and give it "
+            "where an adapter head is asked: localize head=siglip text=…"
+        )
     if isinstance(config, OnnxConfig) and config.classes:
         raise InputError("text=: the classes of teacher.classes= have vectors of their own; leave out one of the two")
     if isinstance(config, OnnxConfig) and not config.joint:

@@ -1,6 +1,7 @@
 """The `radio` teacher: RADIO's backbone features through transformers, which SplatDistill distils (sec. 3.2)."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +12,12 @@ from gsencoder.core.pretrained import load_pretrained, read_config
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+WHAT = "teacher radio"
+ADAPTERS = "radio_model.adaptors."
+"""What the keys of adapter heads begin with in the files of weights; `gsencoder.fusion.heads.radio` reads them."""
+PICKLED = (".tar", ".pth", ".pt", ".bin", ".ckpt")
+"""What names of files end with that are opened by unpickling them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +30,14 @@ class RadioConfig:
     )
     size: int = field(default=768, metadata={"help": "longer side of the resized picture in pixels"})
     words: str = field(default="", metadata={"help": "text table that leads into the space; empty if none"})
+    heads: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "names": True,
+            "help": "adapter heads that are stored with the features, such as siglip or sam: NAME.summary, "
+            "NAME.features, or NAME for the one that is meant most often",
+        },
+    )
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where the backbone runs"})
 
     def __post_init__(self) -> None:
@@ -31,7 +46,7 @@ class RadioConfig:
 
 
 class RadioTeacher:
-    """The backbone's patch features as they are: adapters lead from them into other spaces, linear heads or not."""
+    """The backbone's patch features as they are: adapter heads lead from them into other spaces."""
 
     table = None
     mean = None
@@ -48,17 +63,13 @@ class RadioTeacher:
         Raises:
             InputError: transformers is missing, or the folder holds no RADIO.
         """
-        if not config.model:
-            raise InputError("teacher radio: teacher.model= is missing: the folder of a RADIO model")
-        folder = find_file(config.model, "teacher.model", folder=True)
-        stated = read_config(folder, "teacher radio")
+        folder = radio_folder(config)
+        check_radio(folder)
         from transformers import AutoModel
 
         from gsencoder.core.runtime.device import choose_device
 
-        if stated.model_type != "radio":
-            raise InputError(f"teacher radio: {folder} holds a {stated.model_type} model, expected radio")
-        model = load_pretrained(AutoModel, folder, "teacher radio")
+        model = load_pretrained(AutoModel, folder, WHAT, known_parts=(ADAPTERS,))
         device = choose_device(config.device).type
         self._model, self._device, self.config = model.to(device), device, config
         self._digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("config.json")]))
@@ -96,3 +107,31 @@ class RadioTeacher:
 
     def settings(self) -> dict[str, Any]:
         return {"name": "radio", "model": self._digest, "size": self.config.size}
+
+
+def radio_folder(config: RadioConfig) -> Path:
+    """The folder of a RADIO model.
+
+    Raises:
+        InputError: none is named or there, or a file is.
+    """
+    if not config.model:
+        raise InputError(f"{WHAT}: teacher.model= is missing: the folder of a RADIO model")
+    if config.model.lower().endswith(PICKLED) or Path(config.model).is_file():
+        raise InputError(
+            f"{WHAT}: teacher.model={config.model} is a file, and files of pickles, such as .pth.tar, are never "
+            "opened; give the folder of the Hugging Face release, with config.json and safetensors"
+        )
+    return find_file(config.model, "teacher.model", folder=True)
+
+
+def check_radio(folder: Path) -> int:
+    """Checks that a folder states that it holds a RADIO model; returns the channels of its backbone.
+
+    Raises:
+        InputError: it does not, or transformers cannot read its configuration.
+    """
+    stated = read_config(folder, WHAT)
+    if stated.model_type != "radio":
+        raise InputError(f"{WHAT}: {folder} holds a {stated.model_type} model, expected radio")
+    return int(stated.hidden_size)

@@ -1,0 +1,170 @@
+"""Features and words through an adapter head (`head=`), for the commands that read a folder of features."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.fusion.heads.apply import head_features
+from gsencoder.fusion.heads.measure import HeadSet, MeasuredHead
+from gsencoder.fusion.heads.names import TEXT_KINDS, text_kind
+from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.heads.store import find_head, load_heads
+from gsencoder.fusion.store.heads_file import HEADS_FILE
+from gsencoder.infer.localize.localize import select_features
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of, words_of_table
+from gsencoder.text.open_vocabulary import OpenVocabulary
+from gsencoder.text.table import TextTable, load_text_table
+from gsencoder.text.towers import TextTower
+from gsencoder.text.transformers_tower import TransformersTower
+from gsencoder.types import GaussianFeatures, Scene
+
+
+def asked_through_head(
+    scene: Scene, folder: Path, head: str, *, space: str, given: str, text: TextConfig
+) -> tuple[Scene, Words]:
+    """A scene with the outputs of a head as its only features, and the words that they are compared with; arguments and
+    errors are those of `gsencoder.app.commands.query_words.asked_scene`."""
+    heads = heads_of_folder(folder, head)
+    chosen = find_head(heads, head)
+    words = words_of_head(chosen.head, given, text)
+    return scene_through_head(scene, heads, chosen, space=space, text_encoder=words.space.text_encoder), words
+
+
+def packed_through_head(
+    scene: Scene, folder: Path, head: str, text: TextConfig, *, space: str = ""
+) -> tuple[Scene, TextTable | None]:
+    """A scene with the outputs of a head as its only features, and the words to store beside them, if a tower is given.
+
+    Raises:
+        InputError: see `asked_through_head`.
+    """
+    heads = heads_of_folder(folder, head)
+    chosen = find_head(heads, head)
+    if isinstance(text, TableTextConfig):
+        return scene_through_head(scene, heads, chosen, space=space), None
+    words = closed_table(words_of_head(chosen.head, "", text))
+    return scene_through_head(scene, heads, chosen, space=space, text_encoder=words.space.text_encoder), words
+
+
+def heads_of_folder(folder: Path, name: str, option: str = "head") -> HeadSet:
+    """The adapter heads beside the features or the weights in a folder.
+
+    Args:
+        folder: of the features or the weights.
+        name: of the head that is asked for, for the error.
+        option: of the command, for the error.
+
+    Raises:
+        InputError: there are none, or the file is damaged.
+    """
+    path = folder / HEADS_FILE
+    if not path.is_file():
+        raise InputError(
+            f"{option}={name}: there is no {HEADS_FILE} in {folder}; fuse with teacher.heads=[{name}], or train with "
+            f"heads=[{name}] and encode with these weights"
+        )
+    return load_heads(path)
+
+
+def scene_through_head(
+    scene: Scene, heads: HeadSet, head: MeasuredHead, *, space: str = "", text_encoder: str = ""
+) -> Scene:
+    """The scene with the outputs of a head as its only features.
+
+    Raises:
+        InputError: the features are of another backbone than the head's.
+    """
+    features = features_for_heads(scene, heads, space)
+    outputs = head_features(features, head, heads.space, text_encoder=text_encoder)
+    return replace(scene, features={outputs.space.name: outputs})
+
+
+def features_for_heads(scene: Scene, heads: HeadSet, space: str = "") -> GaussianFeatures:
+    """The features that heads take: those of `space`, or of several teachers' those of the heads' backbone.
+
+    Raises:
+        InputError: there are no such features.
+    """
+    if not space and len(scene.features) > 1:
+        own = [features for features in scene.features.values() if features.space == heads.space]
+        if own:
+            return own[0]
+    return select_features(scene, space or None)[1]
+
+
+def words_of_head(head: Head, given: str, text: TextConfig) -> Words:
+    """The words that a head's outputs are compared with.
+
+    Args:
+        head: a summary head, whose outputs lie in the space of a model with a text side.
+        given: a file of words; empty = the vocabulary of `text`.
+        text: the text tower of that model.
+
+    Raises:
+        InputError: the head leads to no model with a text side, or is no summary head; no words are given, or they are
+            of another model.
+    """
+    if not head.text:
+        raise InputError(
+            f"head {head.describe()}: leads to no model with a text side ({', '.join(TEXT_KINDS)}), so words cannot be "
+            "compared with its outputs; give the head of one that has"
+        )
+    if head.part != "summary":
+        raise InputError(
+            f"head={head.name}: words are compared with summary heads, since outputs of feature heads are not aligned "
+            f"with text; give head={head.name.rpartition('.')[0]}.summary"
+        )
+    if given:
+        words = words_of_table(load_text_table(given), text)
+    elif isinstance(text, TableTextConfig):
+        raise InputError(
+            f"head={head.name}: no words lead into its space; give text=transformers text.model=FOLDER, the text side "
+            f"of {head.model or f'its {head.text} model'}, or words=FILE"
+        )
+    else:
+        words = vocabulary_of(text)
+    tower = None
+    if isinstance(words, OpenVocabulary) and not isinstance(text, TableTextConfig):
+        tower = words.tower
+    check_head_words(head, words, tower)
+    return words
+
+
+def check_head_words(head: Head, words: Words, tower: TextTower | None) -> None:
+    """Checks that words fit a head: its channels, and the kind of its model where both are known.
+
+    Args:
+        head: a summary head.
+        words: compared with its outputs.
+        tower: of the words, where it was given.
+
+    Raises:
+        InputError: they do not; both are named.
+
+    Warns:
+        SceneWarning: phrases of a SigLIP2 head are embedded as they are written.
+    """
+    name = f"head {head.describe()}"
+    described = f"the words of {tower.name!r}" if tower is not None else f"the words of {words.space.text_encoder!r}"
+    if words.space.channels != head.channels:
+        raise InputError(
+            f"{name} gives vectors of {head.channels} channels, and {described} have {words.space.channels}; give the "
+            "text side of the model that the head leads to"
+        )
+    if not isinstance(tower, TransformersTower):
+        return
+    kind = text_kind(tower.model_type)
+    # SigLIP2 models of one resolution are SigLIP models for transformers.
+    if kind.removesuffix("2") != head.text.removesuffix("2"):
+        raise InputError(
+            f"{name} leads to a {head.text} model, and {described} are those of a {tower.model_type} model; give the "
+            "text side of the model that the head leads to"
+        )
+    if head.text == "siglip2" and not tower.lower:
+        warnings.warn(
+            f"{name}: SigLIP2 was trained on phrases in lower case without punctuation, and transformers takes "
+            f"{tower.name!r} for a SigLIP model, which was not; give text.lower=yes",
+            SceneWarning,
+            stacklevel=2,
+        )

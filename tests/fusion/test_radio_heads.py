@@ -1,0 +1,259 @@
+"""RADIO's adapter heads in the layout of the real releases: what they compute, and what is refused by name."""
+
+import json
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from radios import SMALL, change_config, change_weights, head_weights, small_radio
+from splats import front_camera
+from torch.nn import functional
+
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.heads.names import text_kind
+from gsencoder.fusion.heads.of_teacher import heads_of
+from gsencoder.fusion.heads.radio import Head, read_radio_heads
+from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.types import Views
+
+pytest.importorskip("transformers")
+
+
+def by_hand(folder: Path, prefix: str, version: str, inner: int, x: torch.Tensor) -> torch.Tensor:
+    """A head as NVlabs' modules define it, from the keys of the file alone."""
+    from safetensors.torch import load_file
+
+    weights = {
+        key.removeprefix(prefix): value
+        for key, value in load_file(folder / "model.safetensors").items()
+        if key.startswith(prefix)
+    }
+
+    def linear(key: str, x: torch.Tensor) -> torch.Tensor:
+        return functional.linear(x, weights[f"{key}.weight"], weights[f"{key}.bias"])
+
+    def norm(key: str, x: torch.Tensor) -> torch.Tensor:
+        return functional.layer_norm(x, x.shape[-1:], weights[f"{key}.weight"], weights[f"{key}.bias"])
+
+    if version == "v1":
+        x = norm("norm", linear("fc1", x)).relu()
+        for number in range(inner):
+            x = norm(f"inner.{3 * number + 1}", linear(f"inner.{3 * number}", x)).relu()
+        return linear("fc2", x)
+    if "pre_norm.0.weight" in weights:
+        x = functional.gelu(norm("pre_norm.0", x))
+    x = linear("fc1", x)
+    for number in range(inner):
+        x = x + linear(f"blocks.{number}.2", functional.gelu(norm(f"blocks.{number}.0", x)))
+    return linear("final.2", functional.gelu(norm("final.0", x)))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_radio(tmp_path_factory.mktemp("models") / "radio")
+
+
+def read(folder: Path, *names: str) -> list[Head]:
+    return read_radio_heads(folder, names, SMALL["hidden_size"])
+
+
+@pytest.mark.parametrize(
+    ("version", "spatial", "inner", "pre_norm"),
+    [
+        ("v2", None, 2, False),
+        ("v2", None, 0, True),
+        ("v1", None, 0, False),
+        ("v1", "v2", 1, False),
+        ("v2", "v1", 2, True),
+    ],
+)
+def test_a_head_computes_what_its_form_says(
+    tmp_path: Path, version: str, spatial: str | None, inner: int, pre_norm: bool
+) -> None:
+    small_radio(tmp_path, version=version, spatial_version=spatial, inner=inner, pre_norm=pre_norm)
+    x = torch.randn(7, 24)
+    for head in read(tmp_path, "siglip.summary", "siglip.features", "sam.summary", "sam.features"):
+        adapter, _, part = head.name.rpartition(".")
+        module, form = ("head_mlp", version) if part == "summary" else ("feat_mlp", spatial or version)
+        expected = by_hand(tmp_path, f"radio_model.adaptors.{adapter}.{module}.", form, inner, x)
+        torch.testing.assert_close(head.body(x), expected, rtol=1e-4, atol=1e-5)
+        assert not any(value.requires_grad for value in head.body.parameters())
+
+
+def test_a_name_alone_means_the_summary_head_of_a_model_with_a_text_side(folder: Path) -> None:
+    siglip, sam = read(folder, "siglip", "sam")
+    assert (siglip.name, siglip.text, siglip.model) == ("siglip.summary", "siglip", "ViT-SO400M-14-SigLIP-384")
+    assert (sam.name, sam.text, sam.part) == ("sam.features", "", "features")
+    assert siglip.describe() == "siglip.summary (ViT-SO400M-14-SigLIP-384)"
+
+
+@pytest.mark.parametrize(
+    ("descriptions", "kind"),
+    [
+        (("open_clip ViT-H-14-378-quickgelu", "clip"), "clip"),
+        (("open_clip ViT-SO400M-14-SigLIP-384", "clip"), "siglip"),
+        (("siglip2 siglip2-g-384", "siglip2-g"), "siglip2"),
+        (("", "siglip2-g"), "siglip2"),
+        (("dino_v2 dinov2_vitg14_reg", "dino_v2"), ""),
+    ],
+)
+def test_kinds_of_models_with_a_text_side(descriptions: tuple[str, str], kind: str) -> None:
+    assert text_kind(*descriptions) == kind
+
+
+def test_the_teacher_of_a_head_is_that_of_its_name_or_its_number(folder: Path, tmp_path: Path) -> None:
+    small_radio(tmp_path, teachers=[{"type": "siglip2", "model": "siglip2-g-384"}, {"type": "sam"}])
+    (head,) = read(tmp_path, "siglip")
+    assert (head.text, head.model) == ("siglip2", "siglip2-g-384")
+    change_config(tmp_path, args={"mlp_version": "v2"})
+    (head,) = read(tmp_path, "siglip")
+    assert (head.text, head.model) == ("siglip", "")
+
+
+def test_bfloat16_weights_in_several_files_are_read(folder: Path, tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    weights = load_file(folder / "model.safetensors")
+    half = {key: value.bfloat16() for key, value in weights.items()}
+    keys = sorted(half)
+    for number, part in enumerate((keys[::2], keys[1::2])):
+        save_file({key: half[key] for key in part}, tmp_path / f"model-{number}.safetensors", {"format": "pt"})
+    (tmp_path / "config.json").write_text((folder / "config.json").read_text())
+    (one,), (other,) = read(folder, "sam"), read(tmp_path, "sam")
+    x = torch.randn(3, 24)
+    torch.testing.assert_close(one.body(x), other.body(x), rtol=0.05, atol=0.05)
+    save_file({"radio_model.summary_idxs": torch.zeros(2)}, tmp_path / "more.safetensors", {"format": "pt"})
+    with pytest.raises(InputError, match=r"radio_model\.summary_idxs is in two files"):
+        read(tmp_path, "sam")
+
+
+def drop(part: str) -> Any:
+    return lambda weights: {key: value for key, value in weights.items() if part not in key}
+
+
+def add(key: str) -> Any:
+    return lambda weights: {**weights, key: torch.zeros(2)}
+
+
+def replaced(key: str, value: torch.Tensor) -> Any:
+    return lambda weights: {**weights, key: value}
+
+
+SUMMARY = "radio_model.adaptors.siglip.head_mlp."
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (drop("siglip.head_mlp.blocks.1.0"), rf"2 of its weights are missing: {SUMMARY}blocks\.1\.0\.bias"),
+        (drop("siglip.head_mlp"), rf"config\.json states it, but no weights begin with {SUMMARY}"),
+        (add(f"{SUMMARY}blocks.2.0.weight"), r"1 of its weights are not part of a head of form v2: .*blocks\.2\.0"),
+        (add(f"{SUMMARY}fc1.parametrizations.weight.0.scale"), "are in spectral reparametrization, which is not supp"),
+        (replaced(f"{SUMMARY}fc1.weight", torch.zeros(20, 23)), r"fc1\.weight is \[20, 23\], and config\.json states"),
+        (replaced(f"{SUMMARY}fc1.bias", torch.full((20,), torch.nan)), r"fc1\.bias has values that are not finite"),
+        (add("radio_model.feature_normalizer.mean"), "has a feature normalizer, which transformers does not apply"),
+    ],
+)
+def test_weights_that_are_no_such_head_are_refused_by_name(tmp_path: Path, change: Any, message: str) -> None:
+    small_radio(tmp_path)
+    change_weights(tmp_path, change)
+    with pytest.raises(InputError, match=f"heads of {tmp_path}: siglip.*{message}") as error:
+        read(tmp_path, "siglip")
+    assert "\n" not in str(error.value)
+
+
+def sizes(**changes: Any) -> dict[str, Any]:
+    section = {"input_dim": 24, "hidden_dim": 20, "output_dim": 16, "num_inner": 2, **changes}
+    return {"adaptor_configs": {"siglip": {"head_idx": 0, "summary": section, "feature": section}}}
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "message"),
+    [
+        ("siglip", {"args": {"mlp_version": "v3"}}, r"unknown form \(args\.mlp_version=v3\); expected v1 or v2"),
+        ("siglip", {"args": None}, r"unknown form \(args\.mlp_version=None\)"),
+        (
+            "sam",
+            {"args": {"mlp_version": "v2", "spatial_mlp_version": "attn"}},
+            r"sam\.features: is an attention head \(args\.spatial_mlp_version=attn\), which is not supported",
+        ),
+        ("siglip", {"args": {"mlp_version": "v1"}}, r"of its weights are missing: .*head_mlp\.fc2\.bias"),
+        ("siglip.features", sizes(upsample_factor=2), r"siglip\.features: is an upsampling head \(upsample_factor=2\)"),
+        ("siglip", sizes(input_dim=32), "takes 32 channels and the backbone has 24: a head of another backbone"),
+        ("siglip", sizes(output_dim="16"), r"expected summary\.output_dim of adaptor_configs, got 16"),
+        ("siglip", sizes(num_inner=-1), r"expected summary\.num_inner of adaptor_configs, got -1"),
+        ("siglip", sizes(hidden_dim=10**9), r"expected summary\.hidden_dim of adaptor_configs"),
+        ("siglip", {"adaptor_configs": None}, r"has no adaptor_configs: the folder was written without adapter heads"),
+        ("dino_v2", {}, r"dino_v2: there is no such adapter; config\.json has sam, siglip"),
+        ("sam.tokens", {}, r"sam\.tokens: there is no such adapter"),
+    ],
+)
+def test_a_configuration_of_no_such_head_is_refused(
+    tmp_path: Path, name: str, config: dict[str, Any], message: str
+) -> None:
+    small_radio(tmp_path)
+    change_config(tmp_path, **config)
+    with pytest.raises(InputError, match=message) as error:
+        read(tmp_path, name)
+    assert "\n" not in str(error.value)
+
+
+def test_a_head_that_is_named_twice_is_read_once(folder: Path) -> None:
+    assert [head.name for head in read(folder, "siglip", "sam", "siglip.summary")] == ["siglip.summary", "sam.features"]
+
+
+@pytest.mark.parametrize("name", ["radio-v2.5-h.pth.tar", "model.pth"])
+def test_files_of_pickles_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"\x80\x04")
+    with pytest.raises(InputError, match=r"is a file, and files of pickles, such as \.pth\.tar, are never opened"):
+        RadioTeacher(RadioConfig(model=str(tmp_path / name)))
+    with pytest.raises(InputError, match="are never opened"):
+        heads_of(RadioConfig(model=str(tmp_path / name)), ["siglip"])
+
+
+def test_heads_of_a_teacher_without_any_and_files_of_heads_are_refused(folder: Path) -> None:
+    with pytest.raises(InputError, match="heads=siglip: teacher=palette has no adapter heads; teacher=radio has some"):
+        heads_of(PaletteConfig(), ["siglip"])
+    with pytest.raises(InputError, match=r"heads=old\.safetensors: expected names of the teacher's adapter heads"):
+        heads_of(RadioConfig(model=str(folder)), ["old.safetensors"])
+    assert heads_of(PaletteConfig(), []) == []
+
+
+def test_the_backbone_of_a_release_is_loaded_without_its_code_and_without_warnings(folder: Path) -> None:
+    import transformers
+
+    assert "auto_map" in json.loads((folder / "config.json").read_text())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        teacher = RadioTeacher(RadioConfig(model=str(folder), size=32, device="cpu"))
+    image = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    views = Views(cameras=front_camera(32, 32), names=("a",), images=[image])
+    made = teacher.feature_map(views, 0).features
+    assert made is not None
+    model = transformers.RadioModel.from_pretrained(folder, ignore_mismatched_sizes=False).eval()
+    pixels = torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1)[None]
+    with torch.no_grad():
+        expected = model(pixel_values=pixels).features[0].numpy()
+    np.testing.assert_allclose(made.reshape(-1, 24), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_weights_of_another_head_do_not_matter(folder: Path, tmp_path: Path) -> None:
+    small_radio(tmp_path)
+    configs = json.loads((tmp_path / "config.json").read_text())["adaptor_configs"]
+    change_config(tmp_path, adaptor_configs={"siglip": configs["siglip"]})
+    change_weights(tmp_path, drop("adaptors.sam.head_mlp"))
+    (head,) = read(tmp_path, "siglip")
+    assert head.name == "siglip.summary"
+    with pytest.raises(InputError, match=re.escape("sam: there is no such adapter; config.json has siglip")):
+        read(tmp_path, "sam")
+
+
+def test_random_heads_of_the_tests_have_the_keys_that_releases_have() -> None:
+    keys = head_weights("", "v2", {"input_dim": 3, "hidden_dim": 4, "output_dim": 5, "num_inner": 1}, pre_norm=True)
+    expected = {"pre_norm.0", "fc1", "blocks.0.0", "blocks.0.2", "final.0", "final.2"}
+    assert {key.rpartition(".")[0] for key in keys} == expected
