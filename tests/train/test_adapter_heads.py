@@ -25,6 +25,7 @@ from gsencoder.train.adapter_heads import (
     measure_dataset_heads,
     missing_heads,
     render_heads,
+    teacher_of_heads,
 )
 from gsencoder.train.dataset_space import views_of_scenes
 from gsencoder.train.prepare import PreparedDataset
@@ -79,8 +80,18 @@ def test_heads_of_another_backbone_are_refused() -> None:
 
 def test_a_training_asks_for_the_heads_of_its_loss_and_for_those_that_are_stored_besides() -> None:
     teacher = RadioConfig(heads=("siglip", "clip"))
-    assert asked_heads(("sam", "siglip"), teacher) == ("sam", "siglip", "clip")
-    assert asked_heads((), PaletteConfig()) == ()
+    assert asked_heads(("sam", "siglip"), {"radio": teacher}) == ("sam", "siglip", "clip")
+    assert asked_heads((), {"palette": PaletteConfig()}) == ()
+    assert asked_heads((), {"palette": PaletteConfig(), "radio": teacher}) == ("siglip", "clip")
+
+
+def test_heads_belong_to_the_one_teacher_that_has_some() -> None:
+    radio, palette = RadioConfig(), PaletteConfig()
+    assert teacher_of_heads({"palette": palette, "radio": radio}, ["sam"]) == "radio"
+    assert teacher_of_heads({"palette": palette}, []) == "palette"
+    assert teacher_of_heads({"a": radio, "b": radio}, []) == "a"
+    with pytest.raises(InputError, match="heads=sam: a and b have adapter heads; expected one such teacher"):
+        teacher_of_heads({"a": radio, "b": radio}, ["sam"])
 
 
 @pytest.mark.parametrize(
