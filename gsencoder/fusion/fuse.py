@@ -22,7 +22,7 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.fusion.checkpoint import open_checkpoint, remaining_views
-from gsencoder.fusion.lift import FeatureSums, map_rows, view_matrix
+from gsencoder.fusion.lift import FeatureSums, distinct_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import BlendConfig
@@ -39,8 +39,12 @@ class FuseConfig:
     )
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
     blend: BlendConfig = field(default_factory=BlendConfig)
-    energy: float = field(default=0.999, metadata={"help": "share of a dense teacher's energy that the basis keeps"})
-    table_energy: float = field(default=0.9999, metadata={"help": "the same for coded maps (labels, regions)"})
+    energy: float = field(
+        default=0.999, metadata={"help": "share of the energy of a teacher's vectors that the basis keeps"}
+    )
+    table_energy: float = field(
+        default=0.9999, metadata={"help": "the same for maps that share a table (labels, captions)"}
+    )
     max_rank: int = field(default=128, metadata={"help": "largest rank of the basis; 0 = as many as the energy asks"})
     basis: bool = field(default=True, metadata={"help": "fuse in a low-rank basis; false = in all channels"})
     narrow: int = field(default=64, metadata={"help": "teachers with no more channels than this keep all of them"})
@@ -235,9 +239,8 @@ def find_subspace(
 
 @timed("basis")
 def _add_cells(moments: Moments, feature_map: FeatureMap) -> None:
-    """Adds the cells of a map that have features."""
-    rows = map_rows(feature_map)
-    moments.add(rows[np.isfinite(rows[:, 0])])
+    """Adds the vectors of a map: each cell of a dense one, each region of a coded one."""
+    moments.add(distinct_rows(feature_map))
 
 
 def _truncation(basis: FeatureBasis, table: Float32[np.ndarray, "C D"]) -> float:
