@@ -18,6 +18,7 @@ from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_view
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.text.table import TextTable
 from gsencoder.train.distributed import ProcessRank, fail_together
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
@@ -134,8 +135,8 @@ def _scene_readers(config: SourceConfig, words: TextTable | None, voxel: float) 
     shared: list[Teacher] = []
 
     def teacher_of(scene: Scene) -> Teacher:
-        # The labels teacher depends on the objects of the scene; any other teacher is built once for all scenes.
-        if isinstance(config.teacher, LabelsConfig):
+        # Objects and masks belong to a scene; any other teacher is built once for all scenes.
+        if isinstance(config.teacher, (LabelsConfig, RegionsConfig)):
             return build_teacher(config.teacher, scene, words)
         if not shared:
             shared.append(build_teacher(config.teacher, scene, words))

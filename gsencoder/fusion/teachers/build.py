@@ -9,13 +9,16 @@ from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.fusion.teachers.regions.build import build_regions
+from gsencoder.fusion.teachers.regions.captioned import CaptionedRegions
+from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
 from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable, load_text_table, make_text_table
 from gsencoder.types import Scene
 
-TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig | SegmenterConfig
+TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig | SegmenterConfig | RegionsConfig
 
 
 def text_table_of(config: TeacherConfig) -> TextTable | None:
@@ -53,14 +56,19 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
             "text=: the features of teacher=onnx are taken for those of the text tower if teacher.joint=true says that "
             "both belong to one joint model, such as CLIP; other backbones have no words"
         )
-    if isinstance(config, (OnnxConfig, SegmenterConfig)) and config.words:
+    if isinstance(config, RegionsConfig) and config.vector == "map" and not config.joint:
+        raise InputError(
+            "text=: means over regions are taken for vectors of the text tower if teacher.joint=true says that "
+            "teacher.model= and text= belong to one joint model, such as CLIP; other backbones have no words"
+        )
+    if isinstance(config, (OnnxConfig, SegmenterConfig, RegionsConfig)) and config.words:
         raise InputError("text= and teacher.words= both say what words are; leave out one of them")
     return vocabulary_of(text)
 
 
 def words_beside(teacher: Teacher, words: Words | None) -> TextTable | None:
     """The table that is stored with a teacher's features: of a tower, with the names that the teacher knows."""
-    if isinstance(words, OpenVocabulary) and isinstance(teacher, (LabelsTeacher, SegmenterTeacher)):
+    if isinstance(words, OpenVocabulary) and isinstance(teacher, (LabelsTeacher, SegmenterTeacher, CaptionedRegions)):
         words = words.including(teacher.kinds)
     return closed_table(words) if words is not None else None
 
@@ -95,6 +103,8 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
                 "table that has their names (teacher.words=)"
             )
         return SegmenterTeacher(config, words)
+    if isinstance(config, RegionsConfig):
+        return build_regions(config, scene, words)
     assert words is not None
     if isinstance(words, OpenVocabulary):
         words = words.including(sorted({o.name for o in scene.objects if o.name is not None}))
