@@ -83,10 +83,10 @@ class RegionsConfig:
         },
     )
     rest: Literal["none", "mean"] = field(
-        default="none",
+        default="mean",
         metadata={
-            "help": "vector=captions: what pixels without a captioned region are: none = nothing is known of them; "
-            "mean = something else, the direction of the text side's mean"
+            "help": "vector=captions: what pixels without a captioned region are: mean = something else, the direction "
+            "of the text side's mean; none = nothing is known of them, they have no feature"
         },
     )
     words: str = field(
@@ -142,8 +142,8 @@ class RegionsConfig:
             raise InputError(f"sam: makes the masks of masks=sam, and masks is {self.masks}")
         if self.vector == "captions" and (self.model or self.joint):
             raise InputError("model, joint: belong to vector=map and vector=crop, and vector is captions")
-        if self.vector != "captions" and (self.captions or self.rest != "none"):
-            raise InputError(f"captions, rest: belong to vector=captions, and vector is {self.vector}")
+        if self.vector != "captions" and self.captions:
+            raise InputError(f"captions: are the vectors of vector=captions, and vector is {self.vector}")
         if not 1 <= self.min_pixels <= 1 << 31:
             raise InputError(f"min_pixels: expected a number from 1, got {self.min_pixels}")
         if not 1 <= self.points <= 256:

@@ -164,8 +164,8 @@ def label_paths(folder: Path, names: Sequence[str]) -> list[Path]:
         first = stems[list(names).index(missing[0])]
         raise InputError(
             f"teacher.folder: {folder}: {len(missing)} of {len(names)} views have no label image, first "
-            f"{missing[0]!r}; expected {first} with the ending {', '.join(LABEL_SUFFIXES)} (the view's name with another "
-            "ending; its folders may be left out where the rest is the name of no other view)"
+            f"{missing[0]!r}; expected {first} with the ending {', '.join(LABEL_SUFFIXES)} (the view's name "
+            "with another ending; its folders may be left out where the rest is the name of no other view)"
         )
     if len(set(paths)) < len(paths):
         double = next(path for path in paths if paths.count(path) > 1)
