@@ -35,12 +35,15 @@ class LabelFiles(PictureFiles[Int32[np.ndarray, "H W"]]):
         return self._nearest(view, labels)
 
 
-def label_files(paths: Sequence[Path], views: Views) -> LabelFiles:
-    """Label images of views.
+def label_files(paths: Sequence[Path], views: Views) -> PictureFiles[Any]:
+    """Label images of views, read on access.
 
     Args:
         paths: a file for each view.
         views: where their photographs come from files, labels belong to the pixels of these files; else to the cameras.
+
+    Returns:
+        int32 [H, W] for each view, 0 = none.
     """
     pictures: Any = views.images
     rows = list(range(len(views)))

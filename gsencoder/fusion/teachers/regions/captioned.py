@@ -51,8 +51,6 @@ class CaptionedRegions:
         self.mean = words.mean
         with about("teacher regions: captions"):
             vectors = words.encode(self.kinds)
-        if not np.isfinite(vectors).all():
-            raise InputError("teacher regions: vectors of captions are not finite; check the text tower")
         if rest:
             direction = words.mean.astype(np.float64)
             direction /= np.sqrt((direction * direction).sum() + 1e-24)

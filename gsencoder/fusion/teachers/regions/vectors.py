@@ -142,15 +142,15 @@ class MapVectors:
         """Means over regions.
 
         Raises:
-            InputError: the teacher gives no vector in a region, as where its grid leaves out the border of a picture.
+            InputError: the teacher gives no finite vector in a region.
         """
         dense = self.teacher.feature_map(views, view)
         means = region_means(dense, labels, regions)
         bad = np.flatnonzero(~np.isfinite(means).all(axis=1))
         if bad.size:
             raise InputError(
-                f"teacher regions: view {views.names[view]!r}: {bad.size} of {len(regions)} regions have vectors that "
-                f"are not finite, first label {regions[bad[0]]}; check the model, and how pictures are given to it"
+                f"teacher regions: view {views.names[view]!r}: {bad.size} of {len(regions)} regions have no finite "
+                f"vector, first label {regions[bad[0]]}; check the model, and how pictures are given to it"
             )
         return means
 
@@ -163,7 +163,8 @@ def region_means(
 ) -> Float32[np.ndarray, "n D"]:
     """The mean vector of a dense map over the pixels of each region: cells weighted by their pixels in it.
 
-    A pixel beyond the border of the grid takes the nearest cell.
+    A pixel beyond the border of the grid takes the nearest cell; cells without a vector count for nothing, and a region
+    without any other is NaN.
 
     Args:
         dense: of the same view.
@@ -179,4 +180,8 @@ def region_means(
     cells = dense.height * dense.width
     counts = np.bincount(codes[inside].astype(np.int64) * cells + cell[inside], minlength=len(regions) * cells)
     counts = counts.reshape(len(regions), cells).astype(np.float64)
-    return ((counts @ map_rows(dense).astype(np.float64)) / counts.sum(axis=1, keepdims=True)).astype(np.float32)
+    rows = map_rows(dense)
+    known = np.isfinite(rows).all(axis=1)
+    counts = counts[:, known]
+    sizes = counts.sum(axis=1, keepdims=True)
+    return ((counts @ rows[known].astype(np.float64)) / np.where(sizes > 0, sizes, np.nan)).astype(np.float32)
