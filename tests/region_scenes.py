@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
+from onnx import TensorProto, helper
 from scene_files import save
 from splats import front_camera, random_gaussians
 
@@ -58,3 +60,22 @@ def scene_object(label: int, name: str | None) -> SceneObject:
 def toy_words(*names: str, channels: int = 8) -> TextTable:
     rows = [np.random.default_rng(list(name.encode())).normal(size=channels) for name in names]
     return make_text_table(names, unit(np.stack(rows)), "toy")
+
+
+def save_net(path: Path, *nodes: Any) -> Path:
+    """A graph from `image` [1, 3, h, w] to `out`."""
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "h", "w"])
+    output = helper.make_tensor_value_info("out", TensorProto.FLOAT, None)
+    graph = helper.make_graph(list(nodes), "net", [image], [output])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), path)
+    return path
+
+
+def save_colors(path: Path) -> Path:
+    """Cells of 4×4 pixels with their mean color."""
+    return save_net(path, helper.make_node("AveragePool", ["image"], ["out"], kernel_shape=[4, 4], strides=[4, 4]))
+
+
+def save_pool(path: Path) -> Path:
+    """The mean color of a picture."""
+    return save_net(path, helper.make_node("GlobalAveragePool", ["image"], ["out"]))

@@ -4,13 +4,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
 import transformers
-from onnx import TensorProto, helper
+from onnx import helper
 from PIL import Image
-from region_scenes import HEIGHT, WIDTH, labels_of, region_scene, toy_words, write_masks
+from region_scenes import (
+    HEIGHT,
+    WIDTH,
+    labels_of,
+    region_scene,
+    save_colors,
+    save_net,
+    save_pool,
+    toy_words,
+    write_masks,
+)
 from scene_files import save
 
 from gsencoder.core.errors import InputError, SceneWarning
@@ -31,25 +40,6 @@ PLAIN = {"scale": 1.0, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
 SMALL: dict[str, Any] = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
 VISION = {**SMALL, "image_size": 8, "patch_size": 4}
 TEXT = {**SMALL, "vocab_size": 8, "max_position_embeddings": 12, "eos_token_id": 3, "bos_token_id": 2}
-
-
-def save_net(path: Path, *nodes: Any) -> Path:
-    """A graph from `image` [1, 3, h, w] to `out`."""
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "h", "w"])
-    output = helper.make_tensor_value_info("out", TensorProto.FLOAT, None)
-    graph = helper.make_graph(list(nodes), "net", [image], [output])
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), path)
-    return path
-
-
-def save_colors(path: Path) -> Path:
-    """Cells of 4×4 pixels with their mean color."""
-    return save_net(path, helper.make_node("AveragePool", ["image"], ["out"], kernel_shape=[4, 4], strides=[4, 4]))
-
-
-def save_pool(path: Path) -> Path:
-    """The mean color of a picture."""
-    return save_net(path, helper.make_node("GlobalAveragePool", ["image"], ["out"]))
 
 
 def build(masks: Path, model: Path, vector: str, words: TextTable | None = None, **options: Any) -> Teacher:

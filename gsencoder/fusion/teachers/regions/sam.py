@@ -157,7 +157,7 @@ class SamMasks:
             return _Input(tensor=inputs["pixel_values"].to(self._device), rows=rows, columns=columns)
         side = self._side
         squeezed = np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR))
-        values = normalized(squeezed, 255, self._mean, self._std).transpose(2, 0, 1)[None]
+        values = normalized(squeezed, 255.0, self._mean, self._std).transpose(2, 0, 1)[None]
         return _Input(tensor=torch.from_numpy(np.ascontiguousarray(values)).to(self._device), rows=side, columns=side)
 
     def _logits_of_picture(self, logits: Any, prepared: _Input, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
