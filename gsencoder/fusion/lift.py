@@ -36,8 +36,8 @@ def distinct_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "n D"]:
     once, so that a region counts however few pixels it has; of others each cell that has a vector."""
     if feature_map.codes is not None:
         assert feature_map.table is not None
-        codes = np.unique(feature_map.codes)
-        return feature_map.table[codes[codes >= 0]]
+        counts = np.bincount(feature_map.codes.ravel() + 1, minlength=len(feature_map.table) + 1)
+        return feature_map.table[counts[1:] > 0]
     rows = map_rows(feature_map)
     return rows[np.isfinite(rows[:, 0])]
 

@@ -27,6 +27,7 @@ DECODER = {
     "iou_head_hidden_dim": 16,
     "iou_head_depth": 2,
 }
+PARTS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
 
 
 def sam() -> Any:
@@ -245,6 +246,29 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
     assert bare is not None
     with pytest.raises(InputError, match="masks=sam: the scene has no pictures"):
         SamMasks(config).labels(bare, 0)
+
+
+def test_the_published_form_of_sam2_a_model_of_videos_makes_masks_of_pictures(saved: Any) -> None:
+    folder, model = saved(sam2)
+    parts = {name: getattr(model.config, name).to_dict() for name in PARTS}
+    sizes = {
+        "memory_attention_hidden_size": 32,
+        "memory_attention_num_layers": 1,
+        "memory_attention_feed_forward_hidden_size": 32,
+        "memory_attention_rope_feat_sizes": [4, 4],
+        "memory_encoder_hidden_size": 32,
+        "memory_encoder_output_channels": 16,
+        "memory_fuser_embed_dim": 32,
+        "memory_fuser_intermediate_dim": 32,
+    }
+    of_pictures = SamMasks(config_of(folder)).proposals(photograph())
+    video = transformers.Sam2VideoModel(transformers.Sam2VideoConfig(**parts, **sizes))
+    assert not video.load_state_dict(model.state_dict(), strict=False).unexpected_keys
+    video.save_pretrained(folder)
+    of_videos = SamMasks(config_of(folder)).proposals(photograph())
+    assert len(of_videos) == len(of_pictures) > 3
+    for one, other in zip(of_videos, of_pictures, strict=True):
+        np.testing.assert_array_equal(full(one), full(other))
 
 
 def test_folders_of_other_models_are_refused(saved: Any, tmp_path: Path) -> None:

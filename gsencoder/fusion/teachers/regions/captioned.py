@@ -141,6 +141,9 @@ class CaptionedRegions:
 
 def codes_of(labels: Int32[np.ndarray, "H W"], row_of: dict[int, int]) -> Int32[np.ndarray, "H W"]:
     """For each pixel the row of its label, −1 for labels without one."""
-    values, inverse = np.unique(labels, return_inverse=True)
-    rows = np.array([row_of.get(int(value), -1) if value > 0 else -1 for value in values], np.int32)
-    return rows[inverse.reshape(labels.shape)]
+    if not row_of:
+        return np.full(labels.shape, -1, np.int32)
+    known = np.array(sorted(row_of), np.int32)
+    rows = np.array([row_of[int(label)] for label in known], np.int32)
+    nearest = np.searchsorted(known, labels).clip(max=len(known) - 1)
+    return np.where(known[nearest] == labels, rows[nearest], np.int32(-1))
