@@ -23,8 +23,8 @@ class OnnxRegionOptions:
     size: int = field(
         default=0,
         metadata={
-            "help": "pixels along the longer side of the picture (map), or the side of a square crop (crop); 0 = 448 "
-            "and 224; a model of a fixed size has its own"
+            "help": "pixels along the longer side of the picture (map), or the side of a square crop (crop; a model of "
+            "a fixed size has its own); 0 = 448 and 224"
         },
     )
     scale: float = field(default=255.0, metadata={"help": "8-bit values are divided by this, then mean and std apply"})
