@@ -146,11 +146,11 @@ def fuse(
             if projections is not None and basis is not None:
                 timed("basis")(projections.add_map)(basis, feature_map)
         features, weights = sums.finish()
+    mean = subspace.mean if moments is None else moments.mean.astype(np.float32)
+    assert mean is not None
     if not (weights > 0).any():
         raise InputError(f"fuse: none of {len(rows)} views of {scene.name} sees any Gaussian; check poses and units")
 
-    mean = subspace.mean if moments is None else moments.mean.astype(np.float32)
-    assert mean is not None
     return Fusion(
         features=GaussianFeatures(
             features=features, weights=weights, mean=mean, space=teacher.space, basis=subspace.basis

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from region_scenes import HEIGHT, WIDTH, region_scene, save_colors
 from torch.nn.functional import interpolate
 
 from gsencoder.core.errors import InputError
+from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
 from gsencoder.fusion.teachers.regions.sam import Proposal, SamMasks, grid_points, mask_iou, paint, stability, suppress
@@ -242,6 +244,9 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
     assert len(made.table) == len(large)
     np.testing.assert_array_equal(made.codes >= 0, np.isin(labels, large))
     assert teacher.settings()["masks"] == "sam"
+    empty = build_teacher(replace(config, min_iou=1.0), scene, None)
+    with pytest.raises(InputError, match="no view has any cell with features"):
+        fuse(scene, empty)
     bare = region_scene(images=None).views
     assert bare is not None
     with pytest.raises(InputError, match="masks=sam: the scene has no pictures"):
