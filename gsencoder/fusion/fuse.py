@@ -23,7 +23,7 @@ from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.fusion.cell_sample import CellSample
 from gsencoder.fusion.checkpoint import open_checkpoint, remaining_views
-from gsencoder.fusion.lift import FeatureSums, map_rows, view_matrix
+from gsencoder.fusion.lift import FeatureSums, distinct_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import BlendConfig
@@ -40,8 +40,12 @@ class FuseConfig:
     )
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
     blend: BlendConfig = field(default_factory=BlendConfig)
-    energy: float = field(default=0.999, metadata={"help": "share of a dense teacher's energy that the basis keeps"})
-    table_energy: float = field(default=0.9999, metadata={"help": "the same for coded maps (labels, regions)"})
+    energy: float = field(
+        default=0.999, metadata={"help": "share of the energy of a teacher's vectors that the basis keeps"}
+    )
+    table_energy: float = field(
+        default=0.9999, metadata={"help": "the same for maps that share a table (labels, captions)"}
+    )
     max_rank: int = field(default=128, metadata={"help": "largest rank of the basis; 0 = as many as the energy asks"})
     basis: bool = field(default=True, metadata={"help": "fuse in a low-rank basis; false = in all channels"})
     narrow: int = field(default=64, metadata={"help": "teachers with no more channels than this keep all of them"})
@@ -154,11 +158,11 @@ def fuse(
             for view in rows:
                 sample.add(maps(view))
         features, weights = sums.finish()
+    mean = subspace.mean if moments is None else moments.mean.astype(np.float32)
+    assert mean is not None
     if not (weights > 0).any():
         raise InputError(f"fuse: none of {len(rows)} views of {scene.name} sees any Gaussian; check poses and units")
 
-    mean = subspace.mean if moments is None else moments.mean.astype(np.float32)
-    assert mean is not None
     return Fusion(
         features=GaussianFeatures(
             features=features, weights=weights, mean=mean, space=teacher.space, basis=subspace.basis
@@ -248,9 +252,8 @@ def find_subspace(
 
 @timed("basis")
 def _add_cells(moments: Moments, feature_map: FeatureMap) -> None:
-    """Adds the cells of a map that have features."""
-    rows = map_rows(feature_map)
-    moments.add(rows[np.isfinite(rows[:, 0])])
+    """Adds the vectors of a map: each cell of a dense one, each region of a coded one."""
+    moments.add(distinct_rows(feature_map))
 
 
 def _truncation(basis: FeatureBasis, table: Float32[np.ndarray, "C D"]) -> float:

@@ -26,17 +26,30 @@ def map_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "P D"]:
         rows = (shares @ feature_map.table) / np.where(weights > 0, weights, np.float32(np.nan))
         return rows.astype(np.float32)
     assert feature_map.codes is not None
-    codes = feature_map.codes.ravel()
-    return np.where((codes >= 0)[:, None], feature_map.table[codes], np.float32(np.nan))
+    # The row behind the last one is what code −1 takes.
+    padded = np.concatenate([feature_map.table, np.full((1, feature_map.space.channels), np.nan, np.float32)])
+    return padded[feature_map.codes.ravel()]
+
+
+def distinct_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "n D"]:
+    """The vectors of a map that its basis and mean are computed from: of a coded map each row of its table that occurs,
+    once, so that a region counts however few pixels it has; of others each cell that has a vector."""
+    if feature_map.codes is not None:
+        assert feature_map.table is not None
+        counts = np.bincount(feature_map.codes.ravel() + 1, minlength=len(feature_map.table) + 1)
+        return feature_map.table[counts[1:] > 0]
+    rows = map_rows(feature_map)
+    return rows[np.isfinite(rows[:, 0])]
 
 
 class FeatureSums:
-    """Sums over views of weighted features and of weights; for maps with a table, of the weight of each of its rows.
+    """Sums over views of weighted features and of weights; for maps that share a table, of the weight of each of its
+    rows.
 
     Attributes:
-        sums: Σ Bᵀ @ maps in coordinates of the basis (or channels); of maps with a table Σ Bᵀ @ shares, where the
-            shares of a code are one_hot(code).
-        weights: Σ Bᵀ @ 1; zero where maps have a table, since their weights are the row sums.
+        sums: Σ Bᵀ @ maps in coordinates of the basis (or channels); of maps with one table Σ Bᵀ @ shares, where the
+            shares of a code are one_hot(code), if all maps share it.
+        weights: Σ Bᵀ @ 1; zero where maps share a table, since their weights are the row sums.
         views: how many views were added.
     """
 
@@ -47,7 +60,7 @@ class FeatureSums:
         gaussians: number of rows.
         columns: coordinates or channels of a row.
         basis: whose coordinates are summed; None = channels.
-        table: of the maps; None = dense maps.
+        table: that all maps share; None = dense maps, or maps with a table each.
         """
         self.basis, self.table, self.views = basis, table, 0
         # numpy, not torch, allocates what is large: its arrays lie in huge pages, which fill many times faster.
@@ -60,18 +73,11 @@ class FeatureSums:
         """Adds a view: sums += Bᵀ @ (share · maps), weights += Bᵀ @ share, with the share of each row in the mask."""
         self.views += 1
         share = row_mask(mask, b.lattice) if mask is not None else None
-        if self.table is not None and feature_map.shares is not None:
-            shares = feature_map.shares.reshape(-1, len(self.table))
-            if share is not None:
-                shares = shares * share[:, None]
-            b.lift_into(torch.from_numpy(shares), torch.from_numpy(self.sums))
-            return
         if self.table is not None:
-            assert feature_map.codes is not None
-            codes = feature_map.codes.ravel()
-            if share is not None:
-                codes = np.where(share > 0.5, codes, np.int32(-1))
-            b.lift_codes_into(torch.from_numpy(codes), torch.from_numpy(self.sums))
+            _lift_shares_into(b, feature_map, share, self.sums)
+            return
+        if feature_map.codes is not None:
+            self._add_coded(b, feature_map, share)
             return
         vectors = map_rows(feature_map)
         scale = np.isfinite(vectors[:, 0]).astype(np.float32)
@@ -85,6 +91,17 @@ class FeatureSums:
         b.lift_into(torch.from_numpy(maps), torch.from_numpy(self.sums))
         b.lift_into(torch.from_numpy(scale[:, None]), torch.from_numpy(self.weights[:, None]))
 
+    def _add_coded(self, b: Blend, feature_map: FeatureMap, share: Float32[np.ndarray, " P"] | None) -> None:
+        """Adds a coded map with a table of its own: as one of a shared table, and turned into vectors at once."""
+        table = feature_map.table
+        assert table is not None
+        if not len(table):
+            return
+        sums = np.zeros((len(self.weights), len(table)), np.float32)
+        _lift_shares_into(b, feature_map, share, sums)
+        self.sums += sums @ (to_coordinates(self.basis, table) if self.basis is not None else table)
+        self.weights += sums.sum(axis=1)
+
     @timed("lift")
     def finish(self) -> tuple[Float32[np.ndarray, "N columns"], Float32[np.ndarray, " N"]]:
         """Divides, once: (features, weights); rows without weight are zero."""
@@ -97,6 +114,26 @@ class FeatureSums:
         seen = weights > np.finfo(np.float32).tiny
         features = np.divide(sums, weights[:, None], where=seen[:, None], out=np.zeros_like(sums))
         return features, np.where(seen, weights, 0).astype(np.float32)
+
+
+def _lift_shares_into(
+    b: Blend,
+    feature_map: FeatureMap,
+    share: Float32[np.ndarray, " P"] | None,
+    sums: Float32[np.ndarray, "N C"],
+) -> None:
+    """Adds Bᵀ @ shares of a coded or mixed map, with the share of each row in the mask."""
+    if feature_map.shares is not None:
+        shares = feature_map.shares.reshape(-1, sums.shape[1])
+        if share is not None:
+            shares = shares * share[:, None]
+        b.lift_into(torch.from_numpy(shares), torch.from_numpy(sums))
+        return
+    assert feature_map.codes is not None
+    codes = feature_map.codes.ravel()
+    if share is not None:
+        codes = np.where(share > 0.5, codes, np.int32(-1))
+    b.lift_codes_into(torch.from_numpy(codes), torch.from_numpy(sums))
 
 
 def view_matrix(

@@ -20,27 +20,34 @@ from gsencoder.types import FeatureMap, FeatureSpace, Views
 SMALLEST_SCALE = 1e-30
 
 
-def write_map(path: Path, feature_map: FeatureMap) -> None:
+def write_map(path: Path, feature_map: FeatureMap, *, with_table: bool = False) -> None:
     """Writes a dense or mixed map as float16, each channel divided by its largest magnitude: float16 holds values up to
     65,504 with three digits, and backbones have channels that are a hundred times larger than others. Cells that are
-    not finite are no part of the map, and are marked as such.
+    not finite are no part of the map, and are marked as such. Codes are written as they are.
+
+    Args:
+        path: the file.
+        feature_map: to write.
+        with_table: write the table of a coded or mixed map, too, because it is that of no other map.
 
     Raises:
         InputError: the disk is full, or the system refuses.
     """
+    arrays = {"grid": feature_map.grid_from_image}
+    if with_table:
+        assert feature_map.table is not None
+        arrays["table"] = feature_map.table
+    if feature_map.codes is not None:
+        write_archive(path, {**arrays, "codes": feature_map.codes}, {})
+        return
     mixed = feature_map.shares is not None
     values = feature_map.shares if mixed else feature_map.features
-    assert values is not None, "coded maps are as quickly made as read"
+    assert values is not None
     valid = np.isfinite(values).all(axis=-1)
     values = np.where(valid[..., None], values, np.float32(0))
     scale = np.maximum(np.abs(values).max(axis=(0, 1), initial=0), np.float32(SMALLEST_SCALE))
-    arrays = {
-        "shares" if mixed else "features": (values / scale).astype(np.float16),
-        "channel_scale": scale,
-        "valid": valid.astype(np.uint8),
-        "grid": feature_map.grid_from_image,
-    }
-    write_archive(path, arrays, {})
+    arrays["shares" if mixed else "features"] = (values / scale).astype(np.float16)
+    write_archive(path, {**arrays, "channel_scale": scale, "valid": valid.astype(np.uint8)}, {})
 
 
 def read_map(path: Path, space: FeatureSpace, table: Float32[np.ndarray, "C D"] | None = None) -> FeatureMap:
@@ -49,16 +56,21 @@ def read_map(path: Path, space: FeatureSpace, table: Float32[np.ndarray, "C D"] 
     Args:
         path: the file.
         space: of the map.
-        table: of a mixed map.
+        table: of a mixed map whose file does not hold it.
 
     Raises:
         InputError: the file is damaged, or of another space.
     """
     with open_archive(path) as file:
+        grid = file.array("grid", "float64", (2, 3))
+        if "table" in file:
+            table = file.array("table", "float32", ("C", space.channels))
+        if "codes" in file:
+            codes = file.array("codes", "int32", ("h", "w"))
+            return FeatureMap(codes=codes, table=table, grid_from_image=grid, space=space)
         name, columns = ("features", space.channels) if table is None else ("shares", len(table))
         values = file.array(name, "float16", ("h", "w", columns)).astype(np.float32)
         values *= file.array("channel_scale", "float32", (columns,))
-        grid = file.array("grid", "float64", (2, 3))
         if table is not None:
             return FeatureMap(shares=values, table=table, grid_from_image=grid, space=space)
         features = values
@@ -67,7 +79,8 @@ def read_map(path: Path, space: FeatureSpace, table: Float32[np.ndarray, "C D"] 
 
 
 class CachedTeacher:
-    """A teacher with its dense maps cached as files; those of cheap teachers, and coded ones, are made each time.
+    """A teacher with its maps cached as files; those of cheap teachers, and codes into a table that all its maps share,
+    are made each time.
 
     Attributes:
         space, table, mean, needs_images, cheap: as the teacher has them.
@@ -108,10 +121,10 @@ class CachedTeacher:
         path = self._folder / f"map_{view:05d}.safetensors"
         if not path.is_file():
             made = self.teacher.feature_map(views, view)
-            if made.codes is not None:
+            if made.codes is not None and self.table is not None:
                 return made
             self._before_write()
-            write_map(path, made)
+            write_map(path, made, with_table=made.table is not None and self.table is None)
         with advised(self._advice or f"remove {path}, and it is made again"):
             return read_map(path, self.space, self.table)
 

@@ -11,7 +11,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.lift import map_rows
+from gsencoder.fusion.lift import distinct_rows
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import Scene, Views
@@ -47,8 +47,8 @@ def dataset_space(
 ) -> DatasetSpace:
     """Computes the output space of a dataset.
 
-    For a coded teacher the moments are those of the distinct vectors of all its tables. For a dense teacher they are
-    those of `views` maps, evenly distributed over the scenes and their views.
+    For a teacher whose maps share a table the moments are those of the distinct vectors of all its tables. For others
+    they are those of `views` maps, evenly distributed over the scenes and their views.
 
     Args:
         scenes: all scenes to train on.
@@ -117,8 +117,7 @@ def views_of_scenes(scenes: int, views: int) -> list[int]:
 def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:
     """Adds cells of the maps of `count` evenly spaced views to the moments."""
     for view in even_indices(len(views), count):
-        rows = map_rows(teacher.feature_map(views, int(view)))
-        rows = rows[np.isfinite(rows[:, 0])]
+        rows = distinct_rows(teacher.feature_map(views, int(view)))
         moments.add(rows[:: max(1, len(rows) // MAX_CELLS_PER_MAP)])
 
 

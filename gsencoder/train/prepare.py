@@ -358,4 +358,4 @@ def _standardize(vectors: np.ndarray, outputs: OutputSpace) -> np.ndarray:
     """Projects vectors [..., D] to the basis, if there is one, and converts them to standard units."""
     flat = vectors.reshape(-1, vectors.shape[-1])
     coordinates = to_coordinates(outputs.basis, flat) if outputs.basis is not None else flat
-    return outputs.standardize(coordinates).reshape(*vectors.shape[:-1], -1)
+    return outputs.standardize(coordinates).reshape(*vectors.shape[:-1], outputs.channels)

@@ -23,6 +23,7 @@ from gsencoder.fusion.store.folder import TEACHER_NAME
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
 from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together
@@ -257,9 +258,9 @@ class _SceneReader:
         self._shared: dict[str, Teacher] = {}
 
     def teacher(self, name: str, scene: Scene) -> Teacher:
-        """The teacher of a scene. The labels teacher depends on the scene; any other is built once for all."""
+        """The teacher of a scene. Objects and masks belong to a scene; any other teacher is built once for all."""
         config = self.config.teachers_by_name[name]
-        if isinstance(config, LabelsConfig):
+        if isinstance(config, (LabelsConfig, RegionsConfig)):
             return build_teacher(config, scene, self.words.get(name))
         if name not in self._shared:
             self._shared[name] = build_teacher(config, scene, self.words.get(name))

@@ -56,23 +56,28 @@ class Views:
     def select(self, views: Sequence[int] | np.ndarray) -> "Views":
         """The views of these rows, in that order; files are still read on access."""
         rows = [int(view) for view in views]
-        lazy = {name: None if (items := getattr(self, name)) is None else _Selected(items, rows) for name in LAZY}
+        lazy = {name: None if (items := getattr(self, name)) is None else Selected(items, rows) for name in LAZY}
         return Views(cameras=self.cameras.select(rows), names=tuple(self.names[row] for row in rows), **lazy)
 
 
-class _Selected(Sequence[Any]):
-    """Selected entries of a sequence, each read on access."""
+class Selected(Sequence[Any]):
+    """Selected entries of a sequence, each read on access.
+
+    Attributes:
+        items: the whole sequence.
+        rows: which of them, in this order.
+    """
 
     def __init__(self, items: Sequence[Any], rows: list[int]) -> None:
-        self._items, self._rows = items, rows
+        self.items, self.rows = items, rows
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.rows)
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
-            return _Selected(self._items, self._rows[index])
-        return self._items[self._rows[index]]
+            return Selected(self.items, self.rows[index])
+        return self.items[self.rows[index]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -38,7 +38,8 @@ DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")
 Array = TypeVar("Array", bound=np.ndarray)
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
+def check_picture_size(path: Path, width: int, height: int) -> None:
+    """Raises InputError where a picture has no pixels, or more than `PIXEL_LIMIT`."""
     if width < 1 or height < 1 or width * height > PIXEL_LIMIT:
         raise InputError(f"{path}: {width}×{height} pixels, expected 1 to {PIXEL_LIMIT:,}; make the picture smaller")
 
@@ -54,7 +55,7 @@ def _open(path: Path) -> "Image":
     except Exception as error:
         raise InputError(f"{path}: not a readable picture ({_brief(error)}); expected {', '.join(FORMATS)}") from error
     try:
-        _check_size(path, *picture.size)
+        check_picture_size(path, *picture.size)
     except InputError:
         picture.close()
         raise
@@ -83,7 +84,7 @@ def check_picture(path: Path) -> None:
         _decode(path, picture)
 
 
-def _load_npy(path: Path) -> np.ndarray:
+def load_npy(path: Path) -> np.ndarray:
     """Maps a .npy file, so that its header is checked before its values are read."""
     try:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -95,7 +96,7 @@ def _load_npy(path: Path) -> np.ndarray:
         values = values[..., 0]
     if values.ndim != 2:
         raise InputError(f"{path}: expected an array [H, W], got {list(values.shape)}")
-    _check_size(path, values.shape[1], values.shape[0])
+    check_picture_size(path, values.shape[1], values.shape[0])
     return values
 
 
@@ -106,7 +107,7 @@ def picture_size(path: Path) -> tuple[int, int]:
         InputError: unreadable, or more than `PIXEL_LIMIT` pixels.
     """
     if path.suffix.lower() == ".npy":
-        height, width = _load_npy(path).shape
+        height, width = load_npy(path).shape
         return width, height
     with _open(path) as picture:
         return picture.size
@@ -244,6 +245,16 @@ class PictureFiles(Sequence[Array]):
     def _slice(self, rows: slice) -> "PictureFiles[Array]":
         return type(self)(self._paths[rows], self._grids[rows], self._remaps)
 
+    @property
+    def grids(self) -> tuple[PixelGrid, ...]:
+        """How the pixels of each file become those of its view."""
+        return self._grids
+
+    @property
+    def remaps(self) -> RemapCache:
+        """The shared maps of undistortion."""
+        return self._remaps
+
     @abstractmethod
     def _load(self, view: int) -> Array: ...
 
@@ -339,7 +350,7 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
         if path is None:
             return np.zeros((grid.height, grid.width), np.float32)
         if path.suffix.lower() == ".npy":
-            mapped = _load_npy(path)
+            mapped = load_npy(path)
             with np.errstate(over="ignore"):
                 values = np.where(np.isfinite(mapped), mapped, 0).astype(np.float64)
             if values.size and values.min() < 0:

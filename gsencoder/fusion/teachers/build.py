@@ -11,6 +11,9 @@ from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig, PaletteTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.fusion.teachers.regions.build import build_regions
+from gsencoder.fusion.teachers.regions.captioned import CaptionedRegions
+from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
@@ -18,7 +21,9 @@ from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable, load_text_table, make_text_table
 from gsencoder.types import Scene
 
-TeacherConfig = LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig | SegmenterConfig | TransformersConfig
+TeacherConfig = (
+    LabelsConfig | PaletteConfig | OnnxConfig | RadioConfig | SegmenterConfig | TransformersConfig | RegionsConfig
+)
 
 
 def text_table_of(config: TeacherConfig) -> TextTable | None:
@@ -64,7 +69,12 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
             "text=: no words lead into hidden states (teacher.dense=tokens, teacher.layer=); give teacher.dense=values "
             "or summary with a text-aligned model, or leave out text="
         )
-    if isinstance(config, (OnnxConfig, SegmenterConfig, TransformersConfig)) and config.words:
+    if isinstance(config, RegionsConfig) and config.vector == "map" and not config.joint:
+        raise InputError(
+            "text=: means over regions are taken for vectors of the text tower if teacher.joint=true says that "
+            "teacher.model= and text= belong to one joint model, such as CLIP; other backbones have no words"
+        )
+    if isinstance(config, (OnnxConfig, SegmenterConfig, TransformersConfig, RegionsConfig)) and config.words:
         raise InputError("text= and teacher.words= both say what words are; leave out one of them")
     return vocabulary_of(text)
 
@@ -73,6 +83,8 @@ def takes_text(config: TeacherConfig) -> bool:
     """Whether the words of a teacher may be those of a text tower."""
     if isinstance(config, TransformersConfig):
         return config.dense in ("values", "summary")
+    if isinstance(config, RegionsConfig):
+        return config.vector != "map" or config.joint
     return isinstance(config, (LabelsConfig, SegmenterConfig)) or (isinstance(config, OnnxConfig) and config.joint)
 
 
@@ -94,7 +106,7 @@ def words_by_teacher(teachers: Mapping[str, TeacherConfig], text: TextConfig = T
 
 def words_beside(teacher: Teacher, words: Words | None) -> TextTable | None:
     """The table that is stored with a teacher's features: of a tower, with the names that the teacher knows."""
-    if isinstance(words, OpenVocabulary) and isinstance(teacher, (LabelsTeacher, SegmenterTeacher)):
+    if isinstance(words, OpenVocabulary) and isinstance(teacher, (LabelsTeacher, SegmenterTeacher, CaptionedRegions)):
         words = words.including(teacher.kinds)
     return closed_table(words) if words is not None else None
 
@@ -134,6 +146,8 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
                 "table that has their names (teacher.words=)"
             )
         return SegmenterTeacher(config, words)
+    if isinstance(config, RegionsConfig):
+        return build_regions(config, scene, words)
     assert words is not None
     if isinstance(words, OpenVocabulary):
         words = words.including(sorted({o.name for o in scene.objects if o.name is not None}))

@@ -1,0 +1,131 @@
+"""`teacher=regions` on the command line: fused, found, prepared for training, and refused in one line."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from region_scenes import save_colors
+
+from gsencoder.app import cli
+from gsencoder.app.commands.fuse import FuseCommandConfig
+from gsencoder.app.settings.compose import compose
+from gsencoder.core.files.archive import open_archive
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.teachers.regions.config import RegionsConfig
+from gsencoder.text.table import load_text_table, make_text_table, save_text_table
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A room, the words of what is in it, a folder of its instance maps as label images, and their captions."""
+    folder = tmp_path_factory.mktemp("rooms") / "room"
+    made = make_room(0, objects=4, views=4, width=120, height=90)
+    write_room(made, folder)
+    names = sorted({thing.name for thing in made.objects if thing.name})
+    save_text_table(folder / "words.safetensors", make_text_table(names, np.eye(len(names), dtype=np.float32), "words"))
+    views = load_scene(folder).views
+    assert views is not None
+    assert views.instances is not None
+    for name, labels in zip(views.names, views.instances, strict=True):
+        (folder / "masks").mkdir(exist_ok=True)
+        np.save(folder / "masks" / Path(name).with_suffix(".npy").name, labels)
+    shown = {int(label) for labels in views.instances for label in np.unique(labels)}
+    captions = {str(thing.id): thing.name for thing in made.objects if thing.name and thing.id in shown}
+    (folder / "masks/captions.json").write_text(json.dumps(captions))
+    return folder
+
+
+def boxes(room: Path, out: Path, *options: str) -> list[dict[str, Any]]:
+    words = room / "words.safetensors"
+    assert cli.main(["fuse", str(room), f"teacher.words={words}", *options, f"out={out}", "quiet=true"]) == 0
+    query = ",".join(load_text_table(words).names)
+    assert cli.main(["localize", str(out), f"query={query}", f"out={out}/boxes", "quiet=true"]) == 0
+    found: list[dict[str, Any]] = json.loads((out / "boxes/boxes.json").read_text())
+    return found
+
+
+def test_regions_are_found_where_labels_are(room: Path, tmp_path: Path) -> None:
+    labels = boxes(room, tmp_path / "labels", "teacher=labels")
+    assert labels
+    for name, options in (
+        ("instances", ["teacher.masks=instances"]),
+        ("files", ["teacher.folder=masks"]),
+    ):
+        regions = boxes(room, tmp_path / name, "teacher=regions", *options)
+        assert [box["query"] for box in regions] == [box["query"] for box in labels]
+        for ours, theirs in zip(regions, labels, strict=True):
+            for key in ("aabb_min", "aabb_max", "score", "count"):
+                np.testing.assert_allclose(ours[key], theirs[key], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("vector", ["captions", "map"])
+def test_scenes_are_prepared_for_training_from_regions(room: Path, tmp_path: Path, vector: str) -> None:
+    save_colors(tmp_path / "colors.onnx")
+    options = {
+        "captions": [f"teacher.words={room / 'words.safetensors'}"],
+        "map": [f"teacher.model={tmp_path / 'colors.onnx'}", "teacher.onnx.layout=grid", "teacher.onnx.patch=4"],
+    }[vector]
+    prepared = tmp_path / "prepared"
+    given = ["teacher=regions", "teacher.masks=instances", f"teacher.vector={vector}", *options]
+    done = cli.main(
+        ["train", str(room), *given, "prepare_only=true", f"prepared={prepared}", f"out={tmp_path / 'o'}", "quiet=true"]
+    )
+    assert done == 0
+    with open_archive(prepared / "scenes/room.safetensors") as file:
+        weights = file.array("weights", "float32", ("N",))
+    assert (weights > 0).any()
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["teacher.masks=instances"], "captions need words: give a text tower"),
+        (["teacher.folder=nowhere", "teacher.words=words.safetensors"], "teacher.folder: nothing at"),
+        (["teacher.masks=instances", "teacher.folder=masks"], "teacher.folder: holds label images of masks=files"),
+        (["teacher.onnx.size=-3"], "teacher.onnx.size: expected a whole number from 0"),
+        (["teacher.vector=map", "teacher.folder=masks"], "teacher.model= is missing: the image tower of vector=map"),
+    ],
+)
+def test_what_is_wrong_is_one_line(
+    room: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    options: list[str],
+    problem: str,
+) -> None:
+    monkeypatch.setenv("GSENCODER_MODELS", str(room))
+    assert cli.main(["fuse", str(room), "teacher=regions", *options, f"out={tmp_path / 'o'}", "quiet=true"]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1
+    assert problem in lines[0]
+    assert not (tmp_path / "o").exists()
+
+
+def test_the_preset_of_dinov2_means_over_regions() -> None:
+    config = compose("fuse", FuseCommandConfig, ["scene", "teacher=dinov2_regions", "teacher.folder=masks"])
+    assert isinstance(config.teacher, RegionsConfig)
+    assert (config.teacher.vector, config.teacher.onnx.skip_tokens, config.teacher.onnx.patch) == ("map", 1, 14)
+
+
+def test_names_of_objects_through_minilm_are_those_of_labels(shared: Path, tmp_path: Path) -> None:
+    scene, fields = shared / "scenes/house/train_040", []
+    for teacher in (["teacher=labels"], ["teacher=regions", "teacher.masks=instances"]):
+        out = tmp_path / teacher[0].partition("=")[2]
+        tower = ["text=minilm", f"text.model={shared / 'models/minilm_l6'}"]
+        given = [*teacher, *tower, "data.max_views=3", "data.image_scale=0.5", f"out={out}", "quiet=true"]
+        assert cli.main(["fuse", str(scene), *given]) == 0
+        (features,) = load_features(out).features.values()
+        fields.append(features)
+        words = load_text_table(out / "words.safetensors")
+        assert words.tower is not None
+        assert words.find("dining table") is not None
+    labels, regions = fields
+    assert labels.seen.any()
+    np.testing.assert_array_equal(regions.seen, labels.seen)
+    np.testing.assert_allclose(regions.decode(), labels.decode(), atol=1e-4)

@@ -1,0 +1,111 @@
+"""Label images: what is read of which kind of file, and how their pixels become those of the view."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from region_scenes import HEIGHT, WIDTH, region_scene
+from safetensors.numpy import save_file
+from scene_files import photograph, save, write_colmap, write_transforms
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.readers.label_images import label_files, read_labels
+from gsencoder.data.scenes import SceneConfig, load_scene
+
+LABELS = np.array([[0, 1, 2], [300, 0, 7]])
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_png_holds_labels_of_8_or_16_bits(tmp_path: Path, dtype: type) -> None:
+    values = (LABELS % 256).astype(dtype)
+    read = read_labels(save(tmp_path / "m.png", values))
+    assert read.dtype == np.int32
+    np.testing.assert_array_equal(read, values)
+
+
+def test_a_png_with_a_palette_holds_its_indices(tmp_path: Path) -> None:
+    picture = Image.fromarray((LABELS % 256).astype(np.uint8), mode="P")
+    picture.putpalette(list(range(255, -1, -1)) * 3)
+    picture.save(tmp_path / "m.png")
+    np.testing.assert_array_equal(read_labels(tmp_path / "m.png"), LABELS % 256)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.int64, np.uint64])
+def test_arrays_hold_labels_of_any_integers(tmp_path: Path, dtype: type) -> None:
+    values = (LABELS % 256).astype(dtype)
+    np.save(tmp_path / "m.npy", values)
+    save_file({"anything": values}, tmp_path / "m.safetensors")
+    for name in ("m.npy", "m.safetensors"):
+        np.testing.assert_array_equal(read_labels(tmp_path / name), values)
+
+
+def pickled(path: Path) -> None:
+    np.save(path, np.array([{"a": 1}], object), allow_pickle=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "problem"),
+    [
+        ("m.png", lambda p: save(p, photograph(0)), "must be a 8- or 16-bit picture with one channel, got mode RGB"),
+        ("m.png", lambda p: p.write_bytes(b"no"), "not a readable picture"),
+        ("m.jpg", lambda p: save(p, LABELS.astype(np.uint8)), "expected a label image as .png, .npy, .safetensors"),
+        (
+            "m.npy",
+            lambda p: np.save(p, LABELS / 2),
+            "expected labels as integers, one a pixel and 0 = none, got float64",
+        ),
+        ("m.npy", lambda p: np.save(p, LABELS - 1), "expected labels from 0"),
+        ("m.npy", lambda p: np.save(p, LABELS.astype(np.int64) << 40), "expected labels from 0"),
+        ("m.npy", lambda p: np.save(p, photograph(0)), r"expected an array \[H, W\], got \[24, 32, 3\]"),
+        ("m.npy", lambda p: np.save(p, LABELS > 0), "expected a .npy array of numbers"),
+        ("m.npy", pickled, "not a readable .npy array"),
+        ("m.safetensors", lambda p: p.write_bytes(b"no"), "cannot be read as .safetensors"),
+        ("m.safetensors", lambda p: save_file({"a": LABELS / 2}, p), "got float64"),
+        ("m.safetensors", lambda p: save_file({"a": LABELS, "b": LABELS}, p), "expected one array .*, got 2 arrays"),
+        ("m.safetensors", lambda p: save_file({"a": LABELS[0]}, p), r"got the shape \[3\]"),
+    ],
+)
+def test_other_files_are_refused_in_one_line(tmp_path: Path, name: str, write: object, problem: str) -> None:
+    write(tmp_path / name)  # type: ignore[operator]
+    with pytest.raises(InputError, match=problem) as caught:
+        read_labels(tmp_path / name)
+    assert str(tmp_path / name) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_labels_have_the_size_of_the_photograph(tmp_path: Path) -> None:
+    path = save(tmp_path / "m.png", np.ones((HEIGHT, WIDTH + 1), np.uint8))
+    views = region_scene().views
+    assert views is not None
+    with pytest.raises(InputError, match="33×24 pixels, expected 32×24, as the file of the photograph has"):
+        label_files([path] * 2, views)[0]
+
+
+def test_labels_are_scaled_with_the_photographs_and_follow_selected_views(tmp_path: Path) -> None:
+    write_transforms(tmp_path, count=3)
+    paths = [save(tmp_path / f"masks/{view}.png", np.full((24, 32), view + 1, np.uint8)) for view in range(3)]
+    scene = load_scene(tmp_path, options=SceneConfig(image_scale=0.5))
+    assert scene.views is not None
+    files = label_files([paths[2], paths[0]], scene.views.select([2, 0]).select([0, 1]))
+    for labels, value in zip(files, (3, 1), strict=True):
+        np.testing.assert_array_equal(labels, np.full((12, 16), value))
+
+
+def test_labels_are_undistorted_with_the_photographs(tmp_path: Path) -> None:
+    write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 16.0, 12.0, 0.3))
+    scene = load_scene(tmp_path)
+    assert scene.views is not None
+    assert scene.views.images is not None
+    paths = []
+    for view in range(len(scene.views)):
+        dots = np.zeros((24, 32), np.uint8)
+        dots[::4, ::4] = 255
+        save(tmp_path / "images" / scene.views.names[view], np.repeat(dots[..., None], 3, axis=2))
+        paths.append(save(tmp_path / f"{view}.png", dots))
+    labels = label_files(paths, scene.views)[0]
+    photo = scene.views.images[0][..., 0]
+    assert 10 < (labels > 0).sum() < 24 * 32 / 8
+    # A pixel that took a dot as its nearest one has at least a quarter of it in its bilinear mean.
+    assert (photo[labels > 0] >= 255 / 4 - 2).all()
+    assert (photo[labels == 0] <= 255 * 3 / 4 + 2).all()

@@ -1,0 +1,81 @@
+"""A small scene with label images in a folder, that tests of `teacher=regions` stand on."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper
+from scene_files import save
+from splats import front_camera, random_gaussians
+
+from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.towers import unit
+from gsencoder.types import Cameras, Scene, SceneObject, Views
+
+HEIGHT, WIDTH = 24, 32
+NAMES = ("images/a.jpg", "images/b.jpg")
+
+
+def labels_of(view: int) -> np.ndarray:
+    """Label 1 on the left, 7 on the right, 9 in a corner of the first view, 0 between them."""
+    labels = np.zeros((HEIGHT, WIDTH), np.uint16)
+    labels[:, : 12 + view] = 1
+    labels[4:, 16:] = 7
+    if view == 0:
+        labels[:3, -4:] = 9
+    return labels
+
+
+def write_masks(folder: Path, names: Sequence[str] = ("a", "b")) -> Path:
+    for view, name in enumerate(names):
+        save(folder / f"{name}.png", labels_of(view))
+    return folder
+
+
+def region_scene(folder: Path | None = None, *, names: Sequence[str] = NAMES, **views: Any) -> Scene:
+    """Two views of a ball of Gaussians, with random photographs."""
+    one, rng = front_camera(WIDTH, HEIGHT, 30.0), np.random.default_rng(0)
+    cameras = Cameras(
+        cam_from_world=np.repeat(one.cam_from_world, 2, axis=0),
+        Ks=np.repeat(one.Ks, 2, axis=0),
+        widths=np.repeat(one.widths, 2),
+        heights=np.repeat(one.heights, 2),
+    )
+    images = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(2)]
+    given = {"images": images, **views}
+    return Scene(
+        name="s",
+        gaussians=random_gaussians(150),
+        views=Views(cameras=cameras, names=tuple(names), **given),
+        folder=folder,
+    )
+
+
+def scene_object(label: int, name: str | None) -> SceneObject:
+    return SceneObject(id=label, name=name, aabb_min=np.zeros(3), aabb_max=np.ones(3))
+
+
+def toy_words(*names: str, channels: int = 8) -> TextTable:
+    rows = [np.random.default_rng(list(name.encode())).normal(size=channels) for name in names]
+    return make_text_table(names, unit(np.stack(rows)), "toy")
+
+
+def save_net(path: Path, *nodes: Any) -> Path:
+    """A graph from `image` [1, 3, h, w] to `out`."""
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "h", "w"])
+    output = helper.make_tensor_value_info("out", TensorProto.FLOAT, None)
+    graph = helper.make_graph(list(nodes), "net", [image], [output])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), path)
+    return path
+
+
+def save_colors(path: Path) -> Path:
+    """Cells of 4×4 pixels with their mean color."""
+    return save_net(path, helper.make_node("AveragePool", ["image"], ["out"], kernel_shape=[4, 4], strides=[4, 4]))
+
+
+def save_pool(path: Path) -> Path:
+    """The mean color of a picture."""
+    return save_net(path, helper.make_node("GlobalAveragePool", ["image"], ["out"]))
