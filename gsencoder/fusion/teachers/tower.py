@@ -7,6 +7,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import find_file
+from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.tower_kinds import WHAT, tower_in
 from gsencoder.fusion.teachers.tower_preprocessing import read_preprocessing
 from gsencoder.types import FeatureMap, FeatureSpace, Views
@@ -123,14 +124,15 @@ class TransformersTeacher:
         """The tower's vectors of the patches of one picture.
 
         Raises:
-            InputError: no pictures, or features that are not finite.
+            MissingInput: no pictures.
+            InputError: features that are not finite.
         """
         import torch
 
         from gsencoder.fusion.teachers.windows import map_in_windows
 
         if views.images is None:
-            raise InputError(f"{WHAT}: the scene has no pictures")
+            raise MissingInput(f"{WHAT}: the scene has no pictures")
         network = self._network
         fitted, grid_from_image = self._preprocessing.fit(views.images[view], self._size, network.patch)
         pixels = torch.from_numpy(np.ascontiguousarray(fitted)).to(self._device)
