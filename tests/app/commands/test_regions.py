@@ -49,6 +49,7 @@ def boxes(room: Path, out: Path, *options: str) -> list[dict[str, Any]]:
     return found
 
 
+@pytest.mark.slow
 def test_regions_are_found_where_labels_are(room: Path, tmp_path: Path) -> None:
     labels = boxes(room, tmp_path / "labels", "teacher=labels")
     assert labels
@@ -63,6 +64,7 @@ def test_regions_are_found_where_labels_are(room: Path, tmp_path: Path) -> None:
                 np.testing.assert_allclose(ours[key], theirs[key], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vector", ["captions", "map"])
 def test_scenes_are_prepared_for_training_from_regions(room: Path, tmp_path: Path, vector: str) -> None:
     save_colors(tmp_path / "colors.onnx")
@@ -113,6 +115,7 @@ def test_the_preset_of_dinov2_means_over_regions() -> None:
     assert (config.teacher.vector, config.teacher.onnx.skip_tokens, config.teacher.onnx.patch) == ("map", 1, 14)
 
 
+@pytest.mark.slow
 def test_names_of_objects_through_minilm_are_those_of_labels(shared: Path, tmp_path: Path) -> None:
     scene, fields = shared / "scenes/house/train_040", []
     for teacher in (["teacher=labels"], ["teacher=regions", "teacher.masks=instances"]):
