@@ -58,8 +58,6 @@ class PackConfig(CommonConfig):
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
-        if not self.head and not isinstance(self.text, TableTextConfig):
-            raise InputError("text=: is for the outputs of an adapter head; give head= as well, or leave it out")
         if not 0 < self.error < 1:
             raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
         if self.decoded and self.form == "compact":
@@ -68,6 +66,8 @@ class PackConfig(CommonConfig):
 
 def run(config: PackConfig, summary: Summary) -> None:
     """Reads features and writes them with their splat into out=."""
+    if not config.head and not isinstance(config.text, TableTextConfig):
+        raise InputError("text=: is for the outputs of an adapter head; give head= as well, or leave it out")
     source = Path(config.paths[0])
     with summary.step("load"):
         scene = load_features(source)
