@@ -21,6 +21,7 @@ from region_scenes import (
     write_masks,
 )
 from scene_files import save
+from vision_towers import save_preprocessing, save_vision_tower
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
@@ -222,13 +223,17 @@ def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_librar
         build(masks, tmp_path / "model", "crop", toy_words("mug", channels=5), joint=True, device="cpu")
 
 
-def test_a_folder_of_radio_gives_dense_maps_and_others_are_refused(tmp_path: Path) -> None:
+def test_folders_of_radio_and_of_vision_towers_give_dense_maps_and_others_are_refused(tmp_path: Path) -> None:
     small = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 8, "image_size": 32}
     transformers.RadioModel(transformers.RadioConfig(**small, max_img_size=64)).save_pretrained(tmp_path / "radio")
     config = RegionsConfig(vector="map", model=str(tmp_path / "radio"), device="cpu")
     assert isinstance(dense_teacher(config, ""), RadioTeacher)
+    save_vision_tower("dinov2", tmp_path / "dino")
+    save_preprocessing("dinov2", tmp_path / "dino")
+    config = RegionsConfig(vector="map", model=str(tmp_path / "dino"), device="cpu")
+    assert dense_teacher(config, "").space.teacher == "transformers"
     transformers.ViTModel(transformers.ViTConfig(**VISION)).save_pretrained(tmp_path / "vit")
-    with pytest.raises(InputError, match="holds a vit model, expected radio"):
+    with pytest.raises(InputError, match="vit"):
         dense_teacher(RegionsConfig(vector="map", model=str(tmp_path / "vit"), device="cpu"), "")
 
 

@@ -2,6 +2,7 @@
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.model_files import find_file
+from gsencoder.core.pretrained import read_config
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
@@ -12,6 +13,7 @@ from gsencoder.fusion.teachers.regions.crops import CropVectors, ImageTower, Onn
 from gsencoder.fusion.teachers.regions.masks import FileMasks, InstanceMasks, RegionMasks, scene_path
 from gsencoder.fusion.teachers.regions.sam import SamMasks
 from gsencoder.fusion.teachers.regions.vectors import MapVectors, PicturedRegions, RegionVectors
+from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
 from gsencoder.text.build import Words
 from gsencoder.types import Scene
 
@@ -106,6 +108,11 @@ def dense_teacher(config: RegionsConfig, text_encoder: str) -> Teacher:
         InputError: it cannot be used.
     """
     if not config.model.lower().endswith(".onnx"):
+        folder = find_file(config.model, "teacher.model", folder=True)
+        if read_config(folder, "teacher regions").model_type != "radio":
+            return TransformersTeacher(
+                TransformersConfig(model=config.model, device=config.device), text_encoder=text_encoder
+            )
         return RadioTeacher(RadioConfig(model=config.model, device=config.device), text_encoder=text_encoder)
     options = config.onnx
     return OnnxTeacher(
