@@ -64,7 +64,7 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def trained(rooms: Path) -> Path:
     """An encoder of names and colors."""
-    out = rooms.parent / "encoder"
+    out = rooms.parent / "several_encoder"
     scenes = [str(rooms / f"room_{number}") for number in range(3)]
     words = ["teacher=[labels,palette]", f"teachers.labels.words={rooms / 'words.safetensors'}", "holdout=room_2"]
     assert cli.main(["train", *scenes, *words, f"out={out}", *QUICK]) == 0
@@ -73,7 +73,7 @@ def trained(rooms: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def encoded(rooms: Path, trained: Path) -> Path:
-    out = rooms.parent / "features"
+    out = rooms.parent / "several_features"
     assert cli.main(["encode", str(rooms / "room_2"), f"weights={trained}", f"out={out}", "quiet=true"]) == 0
     return out
 
@@ -98,7 +98,7 @@ def test_training_leaves_one_encoder_with_the_spaces_words_and_scores_of_both_te
     )
     columns = (trained / "log.csv").read_text().splitlines()[0].split(",")
     assert {"labels/field", "labels/render", "palette/field", "palette/render"} <= set(columns)
-    prepared = trained.with_name("encoder.prepared")
+    prepared = trained.with_name("several_encoder.prepared")
     assert sorted(path.name for path in prepared.iterdir()) == ["labels", "palette"]
     assert len(list((prepared / "labels" / "scenes").iterdir())) == 2
     assert len(list((prepared / "palette" / "scenes").iterdir())) == 3
