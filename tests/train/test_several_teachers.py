@@ -189,6 +189,13 @@ def test_training_lowers_the_losses_of_both_teachers(datasets: Datasets, tmp_pat
         assert after[name] < 0.8 * loss, name
 
 
+def test_the_weight_of_a_teacher_multiplies_that_of_each_of_its_terms(datasets: Datasets) -> None:
+    lambdas = Distillation(small_encoder(8), LOSSES, joint(datasets, {"heights": 0.25}).recipe.teachers).lambdas
+    for term, weight in (("field", 1.0), ("render", LOSSES.render_weight), ("contrast", LOSSES.contrast_weight)):
+        assert lambdas[f"sides/{term}"] == weight
+        assert lambdas[f"heights/{term}"] == 0.25 * weight
+
+
 def test_a_teacher_of_weight_zero_changes_nothing_but_its_own_columns(datasets: Datasets, tmp_path: Path) -> None:
     weightless = joint(datasets, {"heights": 0.0})
     names = Distillation(small_encoder(8), LOSSES, weightless.recipe.teachers).lambdas
