@@ -119,7 +119,11 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named
     (only,) = load_features(tmp_path / "one").features.values()
     np.testing.assert_array_equal(only.features, scene.features["palette"].features)
     assert {path.name for path in (tmp_path / "one").iterdir()} >= {"features.safetensors", "words.safetensors"}
-    assert "got 'depth'" in refusal(capsys, *words[:3], "spaces=depth", f"out={tmp_path / 'none'}")
+    assert "got 'depth'" in refusal(capsys, *words[:3], "spaces=[depth,labels]", f"out={tmp_path / 'none'}")
+    (encoded / "words.labels.safetensors").rename(tmp_path / "lost")
+    lost = refusal(capsys, "localize", str(encoded), "space=labels", "query=cat", f"out={tmp_path / 'none'}")
+    (tmp_path / "lost").rename(encoded / "words.labels.safetensors")
+    assert "holds words of room-words, which lead into these features" in lost
 
 
 def test_words_are_asked_of_the_space_that_is_named(
@@ -179,7 +183,10 @@ def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pyt
         (["teacher=[palette,p/2:palette]"], "expected names of letters, digits and _, got 'p/2'"),
         (["teacher=[palette,labels]", "teachers.radio.size=3"], "teachers.radio.size: there is no radio among"),
         (["teacher=[palette,labels]", words, "loss.teacher_weights=[1.0]"], "loss.teacher_weights: expected 2 numbers"),
-        (["teacher=[palette,other:palette]"], "two of them have features called"),
+        (["teacher=[palette,other:palette]"], "teachers: palette and other have the same features"),
+        (["teacher=[palette,labels]", "teacher.words=x"], "teacher.words: is for a single teacher, and teachers="),
+        (["teachers=palette,labels", "teacher=radio"], "leave out teacher= or teachers="),
+        (["teacher=[]"], "teachers: expected one or more of"),
         (["teacher=[palette,x:onnx]"], "teacher.model= is missing"),
     ):
         assert message in refusal(capsys, *train, *more), more

@@ -125,13 +125,7 @@ class OutputSpaces:
     def __post_init__(self) -> None:
         if not self.by_teacher:
             raise InputError("OutputSpaces: expected one output space or more, got none")
-        names = [outputs.space.name for outputs in self.by_teacher.values()]
-        repeated = sorted({name for name in names if names.count(name) > 1})
-        if repeated:
-            raise InputError(
-                f"teachers: two of them have features called {repeated[0]!r}; expected feature spaces with distinct "
-                "names (teacher.NAME.space= gives one to a teacher=onnx)"
-            )
+        check_distinct({name: outputs.space for name, outputs in self.by_teacher.items()})
 
     @property
     def channels(self) -> int:
@@ -180,7 +174,10 @@ class OutputSpaces:
         Raises:
             InputError: there is no such space, or there are several and none is named.
         """
-        known = {each.space.name: teacher for teacher, each in self.by_teacher.items()} | {each: each for each in self}
+        spaces = [each.space.name for each in self.by_teacher.values()]
+        known = {
+            each.space.name: teacher for teacher, each in self.by_teacher.items() if spaces.count(each.space.name) == 1
+        } | {each: each for each in self}
         if name is None and len(self) == 1:
             return next(iter(self))
         if name not in known:
@@ -196,6 +193,20 @@ class OutputSpaces:
         """
         teacher = self.resolve(name)
         return self[teacher].features(np.ascontiguousarray(restored[:, self.columns[teacher]]))
+
+
+def check_distinct(spaces: Mapping[str, FeatureSpace]) -> None:
+    """Checks that no two teachers have the same feature space.
+
+    Raises:
+        InputError: two have; both are named.
+    """
+    for number, (name, space) in enumerate(spaces.items()):
+        for other in list(spaces)[:number]:
+            if spaces[other] == space:
+                raise InputError(
+                    f"teachers: {other} and {name} have the same features ({space.describe()}); leave out one of them"
+                )
 
 
 def output_spaces_parts(outputs: OutputSpaces) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -231,9 +231,11 @@ class PreparedDataset:
                 shutil.rmtree(path, ignore_errors=True)
 
     def count_classes(self, names: Sequence[str], track: Track) -> None:
-        """Counts the target classes of the training scenes and stores the counts, unless they are stored already;
-        scenes that are not prepared are left out."""
-        if (self.folder / CLASS_BALANCE_FILE).is_file():
+        """Counts the target classes of the training scenes and stores the counts, unless those of these scenes are
+        stored already; scenes that are not prepared are left out."""
+        prepared = [scene.name for scene in self.scenes(names)]
+        counted = self._counted_scenes()
+        if counted is None or (counted and set(prepared) <= set(counted)):
             return
         _, codebook = self.load_space()
         scenes = self.scenes(names)
@@ -248,7 +250,16 @@ class PreparedDataset:
             scene_share = max(1, CLUSTERED_TARGETS // len(scenes))
             codebook = cluster_targets(np.concatenate([seen_targets(scene, scene_share) for scene in scenes]))
         balance = count_targets((seen_targets(scene) for scene in track(scenes, "counting targets")), codebook)
-        write_archive(self.folder / CLASS_BALANCE_FILE, {"codebook": balance.codebook, "counts": balance.counts}, {})
+        arrays = {"codebook": balance.codebook, "counts": balance.counts}
+        write_archive(self.folder / CLASS_BALANCE_FILE, arrays, {"scenes": prepared})
+
+    def _counted_scenes(self) -> list[str] | None:
+        """The scenes whose targets were counted, none at first; None for a file of earlier versions."""
+        path = self.folder / CLASS_BALANCE_FILE
+        if not path.is_file():
+            return []
+        with advised("remove the file to count targets again"), open_archive(path) as file:
+            return [str(name) for name in file.value("scenes", list)] if "scenes" in file else None
 
     def load_class_balance(self) -> ClassBalance:
         """Loads the target classes and their frequencies, as stored by `count_classes`.

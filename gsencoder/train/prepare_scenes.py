@@ -24,6 +24,7 @@ from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
+from gsencoder.models.output_space import check_distinct
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
 from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together
@@ -150,6 +151,8 @@ def prepare_scenes(
                 with about(f"teacher {name}") if several else nullcontext():
                     dataset.fit_space(training, open_scene, config.prepare, optional=several)
                     measure_dataset_heads(dataset, unmeasured, training, open_scene, views, optional=several)
+            # Before hours of preparation, since the encoder could not have such columns.
+            check_distinct({name: PreparedDataset(path).load_space()[0].space for name, path in folders.items()})
     datasets = {name: PreparedDataset(path, made_with[name]) for name, path in folders.items()}
     missing = {
         path: [name for name, dataset in datasets.items() if not dataset.has_scene(path)]

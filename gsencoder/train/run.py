@@ -252,7 +252,8 @@ def resume_settings(
         (space,), (made_with,) = spaces.values(), prepared.values()
         of_teachers: dict[str, Any] = {"space": space, "prepared": made_with}
     else:
-        of_teachers = {"spaces": spaces, "prepared": prepared}
+        # The order, which a mapping does not state when it is compared, is that of the columns.
+        of_teachers = {"teachers": list(datasets), "spaces": spaces, "prepared": prepared}
     return {
         **shared,
         **of_teachers,

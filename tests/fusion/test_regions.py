@@ -9,18 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from region_scenes import HEIGHT, WIDTH, labels_of, region_scene, scene_object, toy_words, write_masks
 from scene_files import save
 from text_towers import save_graph, save_tokenizer
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.images import read_integers
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import build_teacher, text_table_of, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.regions.captions import read_captions
-from gsencoder.fusion.teachers.regions.config import RegionsConfig
+from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
 from gsencoder.fusion.teachers.regions.masks import label_paths
 from gsencoder.text.onnx_tower import OnnxTextConfig
 from gsencoder.text.open_vocabulary import OpenVocabulary
@@ -204,7 +206,7 @@ def test_missing_label_images_are_counted_and_the_first_is_named(tmp_path: Path)
         ({"c": {"1": "mug"}}, "none of its 1 views is one of the scene, first 'c'; the scene's are 'images/a.jpg', …"),
         ({"a": {"1": "mug"}, "a.png": {}}, "a view is listed twice"),
         ({"2": "mug"}, "none of its captions belongs to one of the 5 regions, whose labels are 1, 7, 9"),
-        ({"a": {"1": "mug", "2": "lamp"}}, "view 'images/a.jpg': 1 of 2 labels are in no pixel of its mask, first 2"),
+        ({"a": {"2": "lamp"}}, "view 'images/a.jpg': none of its 1 labels is in its mask, first 2"),
     ],
 )
 def test_captions_that_do_not_fit_are_refused_in_one_line(tmp_path: Path, captions: Any, problem: str) -> None:
@@ -281,3 +283,36 @@ def test_settings_follow_masks_and_captions(tmp_path: Path) -> None:
     assert build(scene, masks, rest="none").settings() != first
     save(masks / "b.png", labels_of(0))
     assert build(scene, masks).settings() != first
+
+
+def test_a_label_that_its_view_does_not_show_is_reported(tmp_path: Path) -> None:
+    with pytest.warns(SceneWarning) as caught:
+        build(region_scene(), write_masks(tmp_path), {"a": {"1": "mug", "2": "lamp"}})
+    said = [str(each.message) for each in caught]
+    assert any("1 labels are in no pixel of the masks of their views: images/a.jpg: 2" in line for line in said)
+
+
+def test_a_label_with_two_captions_is_refused(tmp_path: Path) -> None:
+    folder = write_masks(tmp_path)
+    (folder / "captions.json").write_text('{"1": "mug", "1": "cup"}')
+    with pytest.raises(InputError, match=r"captions.json: the key '1' is there twice; expected each once"):
+        read_captions(folder / "captions.json", ["images/a.jpg"])
+
+
+def test_label_images_that_were_saved_with_loss_are_refused(tmp_path: Path) -> None:
+    Image.fromarray(np.zeros((8, 8), np.uint8)).save(tmp_path / "a.png", format="JPEG")
+    with pytest.raises(InputError, match="label image was saved as JPEG, which changes values; expected PNG"):
+        read_integers(tmp_path / "a.png", "label image", wide=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"onnx": OnnxRegionOptions(patch=7)}, "onnx: says how an image tower is run"),
+        ({"around": "nothing"}, "around: says what crops show"),
+        ({"vector": "map", "rest": "none"}, "rest: is what has no caption"),
+    ],
+)
+def test_options_that_would_change_nothing_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        RegionsConfig(**options)

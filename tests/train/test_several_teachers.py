@@ -22,13 +22,18 @@ from training_scenes import (
 )
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files.archive import first_difference
 from gsencoder.core.files.step_log import LOG_FILE, read_log
+from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.teachers import MissingInput
+from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.distill import Distillation
+from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
+from gsencoder.train.run import TrainConfig, resume_settings
 from gsencoder.train.samples import Batch, SampleDataset, SampleRecipe, TeacherRecipe, join_samples
 from gsencoder.train.trainer import Trainer
 from gsencoder.train.training_scene import TrainingScene
@@ -100,6 +105,8 @@ def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alo
         for term, value in expected.items():
             torch.testing.assert_close(terms[f"{name}/{term}"], value)
             assert divisors[f"{name}/{term}"] == alone.divisors(own)[term]
+        assert divisors[f"{name}/render"] == pytest.approx(own.teachers[0].rows.row_weights.sum().item(), rel=1e-6)
+        assert divisors[f"{name}/field"] == pytest.approx(own.teachers[0].loss_weights.sum().item(), rel=1e-6)
         torch.testing.assert_close(predicted.grad.split(widths, dim=1)[number], part.grad)
         del dataset, names
 
@@ -207,6 +214,25 @@ def test_a_teacher_of_weight_zero_changes_nothing_but_its_own_columns(datasets: 
     assert torch.equal(encoder.head.weight[4:], before)
 
 
+def test_a_run_goes_on_only_with_its_teachers_in_their_order(datasets: Datasets) -> None:
+    config = TrainConfig(teachers={"sides": PaletteConfig(), "heights": PaletteConfig()})
+    opened = {name: dataset for name, (dataset, _) in datasets.items()}
+    turned = {name: opened[name] for name in reversed(opened)}
+    first, second = (resume_settings(config, ProcessRank(), each) for each in (opened, turned))
+    assert first != second
+    assert first_difference(first, second).startswith("teachers=['sides', 'heights'], and this run asks teachers=['hei")
+
+
+def test_classes_are_counted_again_when_a_scene_gains_the_teacher(tmp_path: Path) -> None:
+    dataset, names = prepared(tmp_path, count=2)
+    before = dataset.load_class_balance().counts.sum()
+    dataset.count_classes(names, untracked)
+    assert dataset.load_class_balance().counts.sum() == before
+    dataset.prepare(scene(2), SideTeacher(), PREPARE, source=Path("wall_2"))
+    dataset.count_classes([*names, "wall_2"], untracked)
+    assert dataset.load_class_balance().counts.sum() > 1.3 * before
+
+
 def test_files_of_other_gaussians_are_refused(datasets: Datasets, tmp_path: Path) -> None:
     other, _ = prepared(tmp_path / "other", count=1, teacher=HeightTeacher())
     moved = scene(0)
@@ -260,8 +286,14 @@ def test_scenes_prepared_for_one_teacher_are_not_taken_for_those_of_several(data
 
 def test_two_teachers_of_one_feature_space_are_refused(datasets: Datasets) -> None:
     outputs, _ = datasets["sides"][0].load_space()
-    with pytest.raises(InputError, match=r"two of them have features called 'sides'"):
+    with pytest.raises(InputError, match=r"teachers: a and b have the same features \(sides · 4 channels\)"):
         OutputSpaces(by_teacher={"a": outputs, "b": outputs})
+    # The same model at two sizes has two spaces of one name, which are named by their teachers.
+    other = replace(outputs, space=replace(outputs.space, preprocessing="half size"))
+    both = OutputSpaces(by_teacher={"a": outputs, "b": other})
+    assert both.resolve("b") == "b"
+    with pytest.raises(InputError, match="gives features of a, b; got 'sides'"):
+        both.resolve("sides")
 
 
 def _stop_at(step: int) -> object:

@@ -1,5 +1,6 @@
 """`gsencoder encode SPLAT weights=FILE`: features of every Gaussian in one pass, without photographs or a teacher."""
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings, typed
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -38,7 +39,10 @@ class EncodeCommandConfig(CommonConfig):
     )
     spaces: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "teachers whose features are written, of an encoder with several; empty = all of them"},
+        metadata={
+            "names": True,
+            "help": "teachers whose features are written, of an encoder with several; empty = all of them",
+        },
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
     basis_views: int = field(
@@ -68,6 +72,15 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     with summary.step("weights"):
         encoder = load_encoder(config.weights, config.encode.device)
         heads = heads_beside(file_of_encoder(config.weights))
+        trained_with = encoder.made_by.get("settings", {}).get("heads") or ()
+        if heads is None and trained_with:
+            warnings.warn(
+                f"weights: the adapter heads {', '.join(trained_with)} that the encoder was trained with do not lie "
+                f"beside {config.weights}; head= will not work with its features",
+                SceneWarning,
+                stacklevel=2,
+            )
+        requested_teachers(encoder, config.spaces)
     screen = console(config.quiet)
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
@@ -115,7 +128,7 @@ def _encode_into(
         by_teacher = encoder.encode_spaces(
             scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
         )
-    by_teacher = _requested(by_teacher, config.spaces)
+    by_teacher = {name: by_teacher[name] for name in requested_teachers(encoder, config.spaces)}
     single = len(by_teacher) == 1
     figures = {}
     for name, features in by_teacher.items():
@@ -141,17 +154,17 @@ def _encode_into(
     return [features.space for features in by_teacher.values()]
 
 
-def _requested(by_teacher: dict[str, GaussianFeatures], names: tuple[str, ...]) -> dict[str, GaussianFeatures]:
-    """The features of the teachers that are named, or of all.
+def requested_teachers(encoder: Encoder, names: tuple[str, ...]) -> list[str]:
+    """The teachers of an encoder that are named, by themselves or by their feature spaces, or all of them.
 
     Raises:
         InputError: the encoder has no such teacher.
     """
-    known = {features.space.name: name for name, features in by_teacher.items()} | {name: name for name in by_teacher}
+    known = {space.name: name for name, space in encoder.spaces.items()} | {name: name for name in encoder.spaces}
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise InputError(f"spaces: the encoder gives features of {', '.join(by_teacher)}; got {unknown[0]!r}")
-    return {known[name]: by_teacher[known[name]] for name in names} if names else by_teacher
+        raise InputError(f"spaces: the encoder gives features of {', '.join(encoder.spaces)}; got {unknown[0]!r}")
+    return [known[name] for name in names] or list(encoder.spaces)
 
 
 def _basis_figures(

@@ -198,6 +198,7 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
 
     parser = OverridesParser.create()
     hydra_overrides = []
+    _check_options_of_one(given, choices)
     for key, value in given.items():
         option = choices.options.get(key) or _option_of_several(key, choices)
         if option is not None and option.several:
@@ -232,6 +233,23 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
             raise InputError(f"{wrong_value(option, value)}; several values, one run each, need -m")
         hydra_overrides.append(f"{key}={written}")
     return hydra_overrides
+
+
+def _check_options_of_one(given: Mapping[str, str], choices: Choices) -> None:
+    """Checks that with several members of a choice no options are given for the only one.
+
+    Raises:
+        InputError: there are such options, or no members.
+    """
+    for key, value in given.items():
+        several = choices.options[key].several if key in choices.options else ""
+        unused = [name for name in given if name == several or name.startswith(f"{several}.")] if several else []
+        if unused:
+            option = unused[0].partition(".")[2]
+            hint = f"{key}.NAME.{option}=… is that of one of them" if option else f"leave out {several}= or {key}="
+            raise InputError(f"{unused[0]}: is for a single {several}, and {key}={value} gives several; {hint}")
+        if several and not value.strip("[] "):
+            raise InputError(f"{key}: expected one or more of {', '.join(choices.groups[several])}, got {value!r}")
 
 
 def _members_of(key: str, value: str, group: str, members: Sequence[str]) -> list[str]:

@@ -194,6 +194,8 @@ def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
 def read_integers(path: Path, what: str, *, wide: bool) -> np.ndarray:
     """A single-channel integer PNG [H, W], int32; `wide` asks for more than 8 bits, as depth in millimetres has."""
     with _open(path) as opened:
+        if opened.format == "JPEG":
+            raise InputError(f"{path}: {what} was saved as JPEG, which changes values; expected PNG")
         allowed = DEEP_GREY + (() if wide else ("L", "P", "1"))
         if opened.mode not in allowed:
             kind = "16-bit" if wide else "8- or 16-bit"

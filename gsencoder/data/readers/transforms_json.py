@@ -42,14 +42,27 @@ TRANSFORMS = ("transforms.json", "transforms_train.json")
 """The names that such files have."""
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, *, unique_keys: bool = False) -> Any:
     """The content of a JSON file.
 
+    Args:
+        path: of the file.
+        unique_keys: refuse objects that have a key twice, of which JSON's readers take the last.
+
     Raises:
-        InputError: unreadable, not UTF-8, or not JSON.
+        InputError: unreadable, not UTF-8, not JSON, or a key is there twice.
     """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        keys = [key for key, _ in pairs]
+        repeated = next((key for key in keys if keys.count(key) > 1), None) if len(set(keys)) < len(keys) else None
+        if repeated is not None:
+            raise InputError(f"{path}: the key {repeated[:40]!r} is there twice; expected each once")
+        return dict(pairs)
+
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        return json.loads(text, object_pairs_hook=unique if unique_keys else None)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, ValueError, RecursionError) as error:

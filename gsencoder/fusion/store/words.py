@@ -62,7 +62,8 @@ def table_path(folder: Path, text_encoder: str) -> Path | None:
     fitting = [path for path, encoder in encoders.items() if encoder == text_encoder]
     if paths and not fitting:
         raise InputError(
-            f"{folder}: its words are of {', '.join(sorted(set(encoders.values())))}, and these features of "
-            f"{text_encoder}; name other features with space="
+            f"{folder}: no {file_of_teacher(WORDS_FILE, 'TEACHER')} holds words of {text_encoder}, which lead into "
+            f"these features (there are words of {', '.join(sorted(set(encoders.values())))}): the file was lost; give "
+            "words= or text=, or name other features with space="
         )
     return fitting[0] if fitting else None

@@ -71,6 +71,7 @@ class CaptionedRegions:
         bare: list[int] = []
         everywhere: set[int] = set()
         regions = 0
+        lost: list[str] = []
         for view, name in enumerate(views.names):
             labels = np.unique(self._masks.labels(views, view))
             labels = labels[labels > 0]
@@ -79,11 +80,13 @@ class CaptionedRegions:
             everywhere.update(labels.tolist())
             used |= {captions[label] for label in labels.tolist() if label in captions}
             bare += [label for label in labels.tolist() if label not in captions]
-            if self._captions.by_view is not None and (absent := sorted(set(captions) - set(labels.tolist()))):
+            absent = sorted(set(captions) - set(labels.tolist())) if self._captions.by_view is not None else []
+            if absent and len(absent) == len(captions):
                 raise InputError(
-                    f"teacher regions: {self._captions.source}: view {name!r}: {len(absent)} of {len(captions)} labels "
-                    f"are in no pixel of its mask, first {absent[0]}; captions and masks must belong together"
+                    f"teacher regions: {self._captions.source}: view {name!r}: none of its {len(captions)} labels is "
+                    f"in its mask, first {absent[0]}; captions and masks must belong together"
                 )
+            lost += [f"{name}: {label}" for label in absent]
         if not regions:
             raise InputError(
                 f"teacher regions: the masks of all {len(views)} views are empty: they have no label above 0"
@@ -98,6 +101,14 @@ class CaptionedRegions:
             warnings.warn(
                 f"teacher regions: {len(bare):,} of {regions:,} regions in {len(views)} views have no caption and "
                 f"{'count as something else' if self._rest else 'no feature'}; their labels are {listed(kinds)}",
+                SceneWarning,
+                stacklevel=4,
+            )
+        if lost:
+            # Small regions may be lost where pictures are made smaller.
+            warnings.warn(
+                f"teacher regions: {self._captions.source}: {len(lost)} labels are in no pixel of the masks of their "
+                f"views: {listed(lost, 5)}",
                 SceneWarning,
                 stacklevel=4,
             )

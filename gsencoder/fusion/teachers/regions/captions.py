@@ -64,7 +64,7 @@ def read_captions(path: Path, view_names: Sequence[str]) -> Captions:
         InputError: another form, labels that are no numbers from 1, captions that are not text, or other views than
             those of the scene.
     """
-    data = read_json(path)
+    data = read_json(path, unique_keys=True)
     if not isinstance(data, dict) or not data:
         got = "an empty object" if isinstance(data, dict) else type(data).__name__
         raise InputError(f"{path}: expected captions of regions, {FORMS}; got {got}")

@@ -96,7 +96,8 @@ class RegionsConfig:
         default="",
         metadata={
             "help": "image tower of vector=map and vector=crop: an .onnx file, or a folder of a model for transformers "
-            "(map: RADIO; crop: CLIP, SigLIP or another with a pooled output); also looked for in GSENCODER_MODELS"
+            "(map: a vision tower or RADIO; crop: CLIP, SigLIP or another with a pooled output); also looked for in "
+            "GSENCODER_MODELS"
         },
     )
     joint: bool = field(
@@ -144,6 +145,12 @@ class RegionsConfig:
             raise InputError("model, joint: belong to vector=map and vector=crop, and vector is captions")
         if self.vector != "captions" and self.captions:
             raise InputError(f"captions: are the vectors of vector=captions, and vector is {self.vector}")
+        if self.vector == "captions" and self.onnx != OnnxRegionOptions():
+            raise InputError("onnx: says how an image tower is run (vector=map or crop), and vector is captions")
+        if self.around != "picture" and self.vector != "crop":
+            raise InputError(f"around: says what crops show (vector=crop), and vector is {self.vector}")
+        if self.rest != "mean" and self.vector != "captions":
+            raise InputError(f"rest: is what has no caption (vector=captions), and vector is {self.vector}")
         if not 1 <= self.min_pixels <= 1 << 31:
             raise InputError(f"min_pixels: expected a number from 1, got {self.min_pixels}")
         if not 1 <= self.points <= 256:

@@ -208,7 +208,13 @@ class TransformersImageTower:
         loader, self._output = JOINT_IMAGE.get(kind, ("AutoModel", "pooler_output"))
         self.joint = kind in JOINT_IMAGE and kind in JOINT
         other = "ignore" if kind in JOINT_IMAGE else "warn"
-        model = load_pretrained(getattr(transformers, loader), folder, WHAT, other_parts=other)
+        if kind == "clip" and hasattr(stated, "vision_config"):
+            # Releases state the width of the joint space at the top alone, where the image side does not look.
+            stated.vision_config.projection_dim = stated.projection_dim
+            options = {"config": stated.vision_config}
+        else:
+            options = {}
+        model = load_pretrained(getattr(transformers, loader), folder, WHAT, other_parts=other, **options)
         with quiet_transformers():
             self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
         self._device = choose_device(device)
@@ -228,8 +234,15 @@ class TransformersImageTower:
 
         with quiet_transformers():
             inputs = self._processor(images=Image.fromarray(picture), return_tensors="pt")
-        with torch.inference_mode():
-            outputs = self._model(**{name: value.to(self._device) for name, value in inputs.items()})
+        try:
+            with torch.inference_mode():
+                outputs = self._model(**{name: value.to(self._device) for name, value in inputs.items()})
+        except (RuntimeError, ValueError) as error:
+            message = " ".join(str(error).split())[:160]
+            raise InputError(
+                f"{WHAT}: {self.name} does not run on what its preprocessing makes of a picture: {message}; expected "
+                "config.json and preprocessor_config.json of one model"
+            ) from error
         pooled = getattr(outputs, self._output, None)
         if pooled is None:
             raise InputError(

@@ -113,8 +113,10 @@ class SamMasks:
         image = views.images[view]
         try:
             proposals = self.proposals(image)
-        except InputError as error:
-            raise InputError(f"{WHAT}: view {views.names[view]!r}: {error}") from error
+        except (InputError, RuntimeError) as error:
+            message = " ".join(str(error).split())[:200]
+            advice = "" if isinstance(error, InputError) else "; expected a configuration and weights of one SAM model"
+            raise InputError(f"{WHAT}: view {views.names[view]!r}: {message}{advice}") from error
         return paint(suppress(proposals, self.config.max_overlap), image.shape[:2])
 
     def proposals(self, image: UInt8[np.ndarray, "H W 3"]) -> list[Proposal]:
