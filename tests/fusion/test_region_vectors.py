@@ -1,5 +1,6 @@
 """Vectors of regions from pictures: means of dense maps, and crops through image towers."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from region_scenes import (
     write_masks,
 )
 from scene_files import save
-from vision_towers import save_preprocessing, save_vision_tower
+from vision_towers import JOINT_CHANNELS, save_preprocessing, save_vision_tower
+from vision_towers import VISION as TOWER_VISION
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
@@ -31,7 +33,7 @@ from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.radio import RadioTeacher
 from gsencoder.fusion.teachers.regions.build import dense_teacher
 from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
-from gsencoder.fusion.teachers.regions.crops import square_crop
+from gsencoder.fusion.teachers.regions.crops import TransformersImageTower, square_crop
 from gsencoder.fusion.teachers.regions.vectors import MapVectors, region_means
 from gsencoder.text.onnx_tower import OnnxTextConfig
 from gsencoder.text.table import TextTable
@@ -286,3 +288,35 @@ def test_settings_follow_what_changes_the_vectors(tmp_path: Path) -> None:
 def test_options_of_onnx_files_out_of_range_are_refused(options: dict[str, Any], problem: str) -> None:
     with pytest.raises(InputError, match=problem):
         OnnxRegionOptions(**options)
+
+
+def clip_folder(folder: Path, **preprocessing: Any) -> Path:
+    """A CLIP folder that states the width of its joint space at the top alone, as releases do."""
+    torch.manual_seed(0)
+    text = {key: value for key, value in TEXT.items() if key != "projection_dim"}
+    config = transformers.CLIPConfig(text_config=text, vision_config=TOWER_VISION, projection_dim=JOINT_CHANNELS)
+    transformers.CLIPModel(config).save_pretrained(folder)
+    save_preprocessing("clip", folder)
+    if preprocessing:
+        path = folder / "preprocessor_config.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), **preprocessing}))
+    return folder
+
+
+def test_a_clip_folder_may_state_its_joint_space_at_the_top_alone(tmp_path: Path) -> None:
+    tower = TransformersImageTower(clip_folder(tmp_path / "clip"), "cpu")
+    assert tower.channels == JOINT_CHANNELS
+    picture = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
+    model = transformers.CLIPModel.from_pretrained(tmp_path / "clip").eval()
+    processor = transformers.CLIPImageProcessorPil.from_pretrained(tmp_path / "clip")
+    with torch.inference_mode():
+        inputs = processor(images=Image.fromarray(picture), return_tensors="pt")
+        vision = model.vision_model(**inputs).pooler_output
+        expected = model.visual_projection(vision)[0].numpy()
+    np.testing.assert_allclose(tower.embed(picture), expected, atol=1e-5)
+
+
+def test_a_preprocessing_of_another_size_than_the_model_is_one_line(tmp_path: Path) -> None:
+    folder = clip_folder(tmp_path / "clip", crop_size={"height": 64, "width": 64}, size={"shortest_edge": 64})
+    with pytest.raises(InputError, match="clip does not run on what its preprocessing makes of a picture"):
+        TransformersImageTower(folder, "cpu")
