@@ -135,6 +135,7 @@ def test_a_scene_that_lacks_a_teacher_has_no_weight_in_its_terms(datasets: Datas
     distillation = Distillation(small_encoder(), LOSSES, data.recipe.teachers)
     divisors = distillation.divisors(batch)
     assert divisors["heights/field"] == divisors["heights/render"] == divisors["heights/contrast"] == 0
+    assert (batch.teachers[1].codes == -1).all()
     predicted = torch.randn(len(batch.attributes), 8, requires_grad=True)
     terms = distillation.terms(predicted, batch)
     sum(terms.values()).backward()
