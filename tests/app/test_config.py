@@ -276,6 +276,21 @@ def test_a_short_name_of_two_options_must_be_written_out(conf: Path) -> None:
         compose("toy", Twice, ["voxel=1"], conf)
 
 
+def test_of_two_options_of_one_name_the_less_deep_one_is_meant(conf: Path) -> None:
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Deeper:
+        fusion: FusionConfig = field(default_factory=FusionConfig)
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Twice(CommonConfig):
+        one: Deeper = field(default_factory=Deeper)
+        two: FusionConfig = field(default_factory=FusionConfig)
+
+    config = compose("toy", Twice, ["voxel=1"], conf)
+    assert config.two.voxel == 1
+    assert config.one.fusion.voxel == FusionConfig().voxel
+
+
 def test_a_choice_selects_the_dataclass_and_a_yaml_file_its_preset(conf: Path) -> None:
     assert toy(conf, "teacher=labels").teacher == LabelsConfig()
     assert toy(conf, "teacher=onnx", "teacher.top_k=3").teacher == OnnxConfig(top_k=3)

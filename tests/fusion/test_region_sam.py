@@ -93,7 +93,7 @@ def saved(tmp_path: Path) -> Callable[[Callable[[], Any]], tuple[Path, Any]]:
 
 
 def config_of(folder: Path, **options: Any) -> RegionsConfig:
-    given = {"min_iou": 0.0, "min_stability": 0.0, "max_overlap": 1.0, "min_pixels": 1, "points": 3, "device": "cpu"}
+    given = {"min_iou": 0.0, "min_stability": 0.0, "max_overlap": 1.0, "min_area": 1, "points": 3, "device": "cpu"}
     return RegionsConfig(masks="sam", vector="map", model="x.onnx", sam=str(folder), **{**given, **options})
 
 
@@ -169,7 +169,7 @@ def test_thresholds_leave_the_proposals_that_reach_them(saved: Any, make: Any) -
     middle = scores[len(scores) // 2] - 1e-6
     fewer = SamMasks(config_of(folder, min_iou=middle)).proposals(photograph())
     assert len(fewer) == sum(score >= middle for score in scores) < len(every)
-    large = SamMasks(config_of(folder, min_pixels=areas[-1])).proposals(photograph())
+    large = SamMasks(config_of(folder, min_area=areas[-1])).proposals(photograph())
     assert [each.area for each in large] == [areas[-1]] * areas.count(areas[-1])
     steady = SamMasks(config_of(folder, min_stability=1.0)).proposals(photograph())
     assert len(steady) < len(every)

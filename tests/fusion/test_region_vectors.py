@@ -79,7 +79,7 @@ def test_pixels_beyond_the_grid_take_the_nearest_cell() -> None:
 
 def test_each_region_has_the_mean_of_the_dense_teachers_map(tmp_path: Path) -> None:
     model = save_colors(tmp_path / "net.onnx")
-    teacher = build(write_masks(tmp_path / "m"), model, "map", min_pixels=1)
+    teacher = build(write_masks(tmp_path / "m"), model, "map", min_area=1)
     scene = region_scene()
     assert scene.views is not None
     dense = OnnxTeacher(OnnxConfig(model=str(model), layout="grid", patch=4, size=WIDTH, **PLAIN))
@@ -99,14 +99,14 @@ def test_each_region_has_the_mean_of_the_dense_teachers_map(tmp_path: Path) -> N
 def test_small_regions_have_no_vector_and_are_counted(tmp_path: Path) -> None:
     model, masks = save_colors(tmp_path / "net.onnx"), write_masks(tmp_path / "m")
     with pytest.warns(SceneWarning, match="1 of 5 regions in 2 views have less than 20 pixels and no feature"):
-        teacher = build(masks, model, "map", min_pixels=20)
+        teacher = build(masks, model, "map", min_area=20)
     one = made(teacher, 0)
     assert one.codes is not None
     assert one.table is not None
     assert (one.codes[labels_of(0) == 9] == -1).all()
     assert len(one.table) == 2
     with pytest.raises(InputError, match="all 5 regions in 2 views have less than 5000 pixels"):
-        build(masks, model, "map", min_pixels=5000)
+        build(masks, model, "map", min_area=5000)
     for name in "ab":
         save(masks / f"{name}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     with pytest.raises(InputError, match="the masks of all 2 views are empty"):
@@ -120,7 +120,7 @@ def test_vectors_that_are_not_finite_are_refused_with_view_and_label(tmp_path: P
         helper.make_node("Div", ["zero", "zero"], ["nan"]),
         helper.make_node("GlobalAveragePool", ["nan"], ["out"]),
     )
-    teacher = build(write_masks(tmp_path / "m"), broken, "crop", min_pixels=1)
+    teacher = build(write_masks(tmp_path / "m"), broken, "crop", min_area=1)
     with pytest.raises(InputError, match="view 'images/a.jpg', label 1: the vector of net is not finite"):
         made(teacher, 0)
 
@@ -158,7 +158,7 @@ def test_crops_through_an_onnx_tower_are_its_pooled_output(tmp_path: Path, aroun
         write_masks(tmp_path / "m"),
         save_pool(tmp_path / "net.onnx"),
         "crop",
-        min_pixels=1,
+        min_area=1,
         around=around,
         onnx=OnnxRegionOptions(size=16, **PLAIN),
     )
@@ -207,7 +207,7 @@ def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_librar
     if not joint:
         with pytest.raises(InputError, match="if teacher.joint=true says that both belong to one joint model"):
             build(masks, tmp_path / "model", "crop", words)
-    teacher = build(masks, tmp_path / "model", "crop", words, min_pixels=1, joint=not joint, device="cpu")
+    teacher = build(masks, tmp_path / "model", "crop", words, min_area=1, joint=not joint, device="cpu")
     assert teacher.space.text_encoder == "toy"
     scene = region_scene()
     assert scene.views is not None
@@ -259,18 +259,18 @@ def test_a_text_tower_needs_a_joint_model(tmp_path: Path) -> None:
         InputError, match="the vectors of net are taken for those of the text tower if teacher.joint=true"
     ):
         build(masks, model, "crop", toy_words("mug", channels=3))
-    joint = build(masks, model, "crop", toy_words("mug", channels=3), joint=True, min_pixels=1)
+    joint = build(masks, model, "crop", toy_words("mug", channels=3), joint=True, min_area=1)
     assert joint.space.text_encoder == "toy"
 
 
 def test_settings_follow_what_changes_the_vectors(tmp_path: Path) -> None:
     model, masks = save_pool(tmp_path / "net.onnx"), write_masks(tmp_path / "m")
     variants = [
-        build(masks, model, "crop", min_pixels=1).settings(),
-        build(masks, model, "crop", min_pixels=2).settings(),
-        build(masks, model, "crop", min_pixels=1, around="nothing").settings(),
-        build(masks, save_colors(tmp_path / "c.onnx"), "map", min_pixels=1).settings(),
-        build(masks, model, "crop", min_pixels=1, onnx=OnnxRegionOptions(size=17, **PLAIN)).settings(),
+        build(masks, model, "crop", min_area=1).settings(),
+        build(masks, model, "crop", min_area=2).settings(),
+        build(masks, model, "crop", min_area=1, around="nothing").settings(),
+        build(masks, save_colors(tmp_path / "c.onnx"), "map", min_area=1).settings(),
+        build(masks, model, "crop", min_area=1, onnx=OnnxRegionOptions(size=17, **PLAIN)).settings(),
     ]
     assert all(first != second for index, first in enumerate(variants) for second in variants[:index])
 

@@ -263,7 +263,7 @@ def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
         ({"sam": "x"}, "makes the masks of masks=sam"),
         ({"model": "x.onnx"}, "belong to vector=map and vector=crop"),
         ({"vector": "map", "captions": "x"}, "captions: are the vectors of vector=captions"),
-        ({"min_pixels": 0}, "min_pixels"),
+        ({"min_area": 0}, "min_area"),
         ({"points": 0}, "points"),
         ({"min_iou": 1.5}, "min_iou"),
         ({"min_stability": -0.1}, "min_stability"),

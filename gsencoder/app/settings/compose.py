@@ -7,7 +7,8 @@ those therefore bypass it: their characters are encoded as hexadecimal digits in
 
 Rules for words: one of the form `KEY=VALUE` sets an option if KEY is one; otherwise it is a path if a file of that
 name exists, and an error if not. Every other word is a path. After `--` all words are paths. KEY may leave out the
-sections before the last dot where that is unambiguous (`voxel=` for `fusion.voxel=`).
+sections before the last dot where that is unambiguous (`voxel=` for `fusion.voxel=`); of several options with one last
+part, the one with the fewest sections before it.
 """
 
 import os
@@ -120,6 +121,9 @@ def _full_key(key: str, choices: Choices) -> str | None:
     if key in known or _option_of_several(key, choices) is not None:
         return key
     ends = [name for name in known if re.split(r"[./]", name)[-1] == key]
+    # An option of a section within a section gives way to one that is less deep.
+    depths = [len(re.split(r"[./]", name)) for name in ends]
+    ends = [name for name, depth in zip(ends, depths, strict=True) if depth == min(depths)]
     if len(ends) > 1:
         raise InputError(f"{key}: stands for more than one option; write {' or '.join(f'{end}=' for end in ends)}")
     return ends[0] if ends else None

@@ -11,9 +11,9 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.app.settings.options import Option, describe, join_list, options_of
 
 RULES = (
-    "A word KEY=VALUE is a setting if KEY is one of those above (the part after the last dot is enough where only one "
-    "has it), else a path if such a file exists; every other word is a path, and so is every word after --. "
-    "In lists of text commas separate and \\, is a comma."
+    "A word KEY=VALUE is a setting if KEY is one of those above (the part after the last dot is enough where only one, "
+    "or one with fewer dots than the others, has it), else a path if such a file exists; every other word is a path, "
+    "and so is every word after --. In lists of text commas separate and \\, is a comma."
 )
 
 

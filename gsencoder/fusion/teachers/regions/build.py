@@ -50,7 +50,7 @@ def build_regions(config: RegionsConfig, scene: Scene, words: Words | None) -> R
             f"teacher regions: its vectors have {vectors.space.channels} channels and its words "
             f"{words.space.channels} ({words.space.text_encoder}); expected both of one joint model"
         )
-    return PicturedRegions(scene.views, masks, vectors, min_pixels=config.min_pixels)
+    return PicturedRegions(scene.views, masks, vectors, min_area=config.min_area)
 
 
 def _masks(config: RegionsConfig, scene: Scene) -> RegionMasks:

@@ -111,7 +111,7 @@ class RegionsConfig:
         default="picture",
         metadata={"help": "vector=crop: what of the box is not in the region: the photograph as it is, or plain gray"},
     )
-    min_pixels: int = field(
+    min_area: int = field(
         default=64,
         metadata={"help": "vector=map and crop, and masks=sam: smallest number of pixels of a region in a view"},
     )
@@ -151,8 +151,8 @@ class RegionsConfig:
             raise InputError(f"around: says what crops show (vector=crop), and vector is {self.vector}")
         if self.rest != "mean" and self.vector != "captions":
             raise InputError(f"rest: is what has no caption (vector=captions), and vector is {self.vector}")
-        if not 1 <= self.min_pixels <= 1 << 31:
-            raise InputError(f"min_pixels: expected a number from 1, got {self.min_pixels}")
+        if not 1 <= self.min_area <= 1 << 31:
+            raise InputError(f"min_area: expected a number from 1, got {self.min_area}")
         if not 1 <= self.points <= 256:
             raise InputError(f"points: expected 1 to 256 points a side, got {self.points}")
         for name in ("min_iou", "min_stability", "max_overlap"):

@@ -176,7 +176,7 @@ class SamMasks:
     def _proposal(self, logits: Float32[np.ndarray, "H W"], score: float) -> Proposal | None:
         mask = logits > 0
         area = int(mask.sum())
-        if area < self.config.min_pixels or stability(logits) < self.config.min_stability:
+        if area < self.config.min_area or stability(logits) < self.config.min_stability:
             return None
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         top, left = int(rows[0]), int(columns[0])

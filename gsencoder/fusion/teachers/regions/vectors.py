@@ -45,14 +45,14 @@ class PicturedRegions:
     needs_images = True
     cheap = False
 
-    def __init__(self, views: Views, masks: RegionMasks, vectors: RegionVectors, *, min_pixels: int) -> None:
+    def __init__(self, views: Views, masks: RegionMasks, vectors: RegionVectors, *, min_area: int) -> None:
         """Looks at the masks of all views once, where they are at hand.
 
         Args:
             views: of the scene.
             masks: of regions.
             vectors: of regions.
-            min_pixels: smallest number of pixels of a region in a view.
+            min_area: smallest number of pixels of a region in a view.
 
         Raises:
             InputError: the scene has no pictures, or no view has a region that is large enough.
@@ -62,27 +62,27 @@ class PicturedRegions:
         """
         if views.images is None:
             raise MissingInput("teacher regions: the scene has no pictures to make vectors of regions from")
-        self._masks, self._vectors, self._min_pixels = masks, vectors, min_pixels
+        self._masks, self._vectors, self._min_area = masks, vectors, min_area
         self.space = vectors.space
         if masks.cheap:
             self._check_sizes(views)
 
     def _check_sizes(self, views: Views) -> None:
         sizes = np.concatenate([_regions_of(self._masks.labels(views, view))[1] for view in range(len(views))])
-        small = int((sizes < self._min_pixels).sum())
+        small = int((sizes < self._min_area).sum())
         if not len(sizes):
             raise InputError(
                 f"teacher regions: the masks of all {len(views)} views are empty: they have no label above 0"
             )
         if small == len(sizes):
             raise InputError(
-                f"teacher regions: all {small:,} regions in {len(views)} views have less than {self._min_pixels} "
-                "pixels (teacher.min_pixels)"
+                f"teacher regions: all {small:,} regions in {len(views)} views have less than {self._min_area} "
+                "pixels (teacher.min_area)"
             )
         if small:
             warnings.warn(
                 f"teacher regions: {small:,} of {len(sizes):,} regions in {len(views)} views have less than "
-                f"{self._min_pixels} pixels and no feature (teacher.min_pixels)",
+                f"{self._min_area} pixels and no feature (teacher.min_area)",
                 SceneWarning,
                 stacklevel=4,
             )
@@ -95,7 +95,7 @@ class PicturedRegions:
         """
         labels = self._masks.labels(views, view)
         values, sizes = _regions_of(labels)
-        regions = [int(value) for value in values[sizes >= self._min_pixels]]
+        regions = [int(value) for value in values[sizes >= self._min_area]]
         table = np.zeros((0, self.space.channels), np.float32)
         if regions:
             table = self._vectors.vectors(views, view, labels, regions)
@@ -105,7 +105,7 @@ class PicturedRegions:
     def settings(self) -> dict[str, Any]:
         return {
             "name": "regions",
-            "min_pixels": self._min_pixels,
+            "min_area": self._min_area,
             **self._masks.settings(),
             "vectors": self._vectors.settings(),
         }
