@@ -12,6 +12,8 @@ ADDED_OPTIONS: Mapping[str, Any] = {
     "model.transformer.shuffle_orders": "once",
     "loss.confidence": True,
     "loss.divide_by_alpha": True,
+    "loss.contrast_clusters": True,
+    "loss.teacher_weights": [],
     "prepare.center": True,
     "prepare.scale": True,
 }

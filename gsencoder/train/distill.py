@@ -55,7 +55,7 @@ class Distillation:
             self._term(teacher, name): weight * teacher.weight
             for teacher in self._teachers
             for name, weight in terms.items()
-            if weight * teacher.weight
+            if weight * teacher.weight and (teacher.contrast or name != "contrast")
         }
 
     def _term(self, teacher: TeacherRecipe, name: str) -> str:
@@ -92,13 +92,14 @@ class Distillation:
     ) -> dict[str, Tensor]:
         """The terms of one teacher; the render loss without rows is 0."""
         config, terms = self.config, dict[str, Tensor]()
+        teacher = self._teachers[number]
         if config.field_weight:
             terms["field"] = field_loss(predicted, targets.targets, targets.loss_weights, config)
         if config.render_weight:
-            rows, heads = targets.rows, self._heads.get(self._teachers[number].name, ())
+            rows, heads = targets.rows, self._heads.get(teacher.name, ())
             b = rows.blend(len(predicted))
             terms["render"] = render_loss(predicted, b, rows.targets, rows.row_weights, config, heads)
-        if config.contrast_weight:
+        if config.contrast_weight and teacher.contrast:
             codebook = self._codebooks[number]
             terms["contrast"] = contrast_loss(predicted, targets.codes, targets.loss_weights, codebook, config)
         return terms

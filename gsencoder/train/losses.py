@@ -38,6 +38,10 @@ class LossConfig:
     contrast_weight: float = field(
         default=0.0, metadata={"help": "λ of the cross-entropy among target classes (L_contrast); 0 = off"}
     )
+    contrast_clusters: bool = field(
+        default=False,
+        metadata={"help": "L_contrast also among clusters of the targets of dense teachers, which have no names"},
+    )
     temperature: float = field(
         default=0.1, metadata={"help": "temperature of the softmax in L_contrast, in squared typical distances"}
     )

@@ -191,7 +191,12 @@ def fit(
         augmentation=config.augment,
         losses=config.loss,
         teachers=tuple(
-            TeacherRecipe(name=name, class_balance=dataset.load_class_balance(), weight=weight)
+            TeacherRecipe(
+                name=name,
+                class_balance=dataset.load_class_balance(),
+                weight=weight,
+                contrast=config.loss.contrast_clusters or dataset.load_space()[1] is not None,
+            )
             for (name, dataset), weight in zip(datasets.items(), weights, strict=True)
         ),
         seed=config.train.seed,

@@ -106,11 +106,13 @@ class TeacherRecipe:
         class_balance: classes of its targets in the dataset and their frequencies; the columns of the codebook are the
             teacher's columns of the encoder's outputs.
         weight: of its losses.
+        contrast: whether its losses include L_contrast.
     """
 
     name: str
     class_balance: ClassBalance
     weight: float = 1.0
+    contrast: bool = True
 
     @property
     def channels(self) -> int:
