@@ -2,10 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from command_runs import refusal, results_of
 
 from gsencoder.app import cli
 from gsencoder.data.synthetic.room import make_room
@@ -30,20 +30,6 @@ QUICK = (
     "model.transformer.encoder_channels=[32,32,32,32,32]",
     "model.transformer.decoder_channels=[32,32,32,32]",
 )
-
-
-def results_of(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
-    return found
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line that a refused command prints."""
-    capsys.readouterr()
-    assert cli.main([*arguments, "quiet=true"]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import vision_towers
+from command_runs import refusal
 from text_towers import save_tokenizer
 from vision_towers import save_vision_tower
 
@@ -141,15 +142,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def features_of(folder: Path) -> GaussianFeatures:
     (features,) = load_features(folder).features.values()
     return features
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line that a refused command prints."""
-    capsys.readouterr()
-    assert cli.main([*arguments, "quiet=true"]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 @pytest.mark.slow

@@ -1,11 +1,10 @@
 """`train`, `encode` and `fuse basis=` state what the encoder's basis keeps, of its own scenes and of others."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from command_runs import results_of
 
 from gsencoder.app import cli
 from gsencoder.app.commands.basis_figures import describe_basis
@@ -35,11 +34,6 @@ TRAIN = (
     "sampling.gaussians=500",
     "tensorboard=false",
 )
-
-
-def results_of(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
-    return found
 
 
 @pytest.fixture(scope="module")

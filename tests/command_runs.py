@@ -1,0 +1,24 @@
+"""What tests of commands share: the results of a run, and the line that a refused command prints."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsencoder.app import cli
+
+
+def results_of(folder: Path) -> dict[str, Any]:
+    """The results in the summary of a run."""
+    results: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
+    return results
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line that a refused command prints."""
+    capsys.readouterr()
+    assert cli.main([*arguments, "quiet=true"]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1
+    return lines[0]
