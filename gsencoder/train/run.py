@@ -173,7 +173,8 @@ def fit(
     Raises:
         InputError: see `train`.
     """
-    outputs = OutputSpaces(by_teacher={name: dataset.load_space()[0] for name, dataset in datasets.items()})
+    spaces = {name: dataset.load_space() for name, dataset in datasets.items()}
+    outputs = OutputSpaces(by_teacher={name: space for name, (space, _) in spaces.items()})
     with_heads = teacher_of_heads(config.teachers_by_name, config.heads)
     heads = dataset_heads(datasets[with_heads], config.heads)
     if len(heads.heads) < len(config.heads):
@@ -195,7 +196,7 @@ def fit(
                 name=name,
                 class_balance=dataset.load_class_balance(),
                 weight=weight,
-                contrast=config.loss.contrast_clusters or dataset.load_space()[1] is not None,
+                contrast=config.loss.contrast_clusters or spaces[name][1] is not None,
             )
             for (name, dataset), weight in zip(datasets.items(), weights, strict=True)
         ),
