@@ -37,8 +37,8 @@ def superpixels(image: np.ndarray, count: int) -> np.ndarray:
     spacing = np.sqrt(height * width / count)
     rows, columns = max(1, round(height / spacing)), max(1, round(width / spacing))
     y, x = np.mgrid[:height, :width].astype(np.float32)
-    place = np.stack([y, x], axis=-1) * np.float32(COMPACTNESS / spacing)
-    points = np.concatenate([lab_from_rgb(small), place], axis=-1).reshape(-1, 5)
+    position = np.stack([y, x], axis=-1) * np.float32(COMPACTNESS / spacing)
+    points = np.concatenate([lab_from_rgb(small), position], axis=-1).reshape(-1, 5)
     at = np.add.outer(
         ((np.arange(rows) + 0.5) * height / rows).astype(int) * width,
         ((np.arange(columns) + 0.5) * width / columns).astype(int),
