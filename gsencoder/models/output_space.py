@@ -166,24 +166,8 @@ class OutputSpaces:
         return self[self.resolve(name)]
 
     def resolve(self, name: str | None = None) -> str:
-        """The teacher that `name` stands for: the teacher itself, or the name of its feature space.
-
-        Args:
-            name: of a teacher or a feature space; None = the only one.
-
-        Raises:
-            InputError: there is no such space, or there are several and none is named.
-        """
-        spaces = [each.space.name for each in self.by_teacher.values()]
-        known = {
-            each.space.name: teacher for teacher, each in self.by_teacher.items() if spaces.count(each.space.name) == 1
-        } | {each: each for each in self}
-        if name is None and len(self) == 1:
-            return next(iter(self))
-        if name not in known:
-            wanted = "name one of them" if name is None else f"got {name!r}"
-            raise InputError(f"space: the encoder gives features of {', '.join(self)}; {wanted}")
-        return known[name]
+        """The teacher that `name` stands for; see `teacher_of_space`."""
+        return teacher_of_space({teacher: each.space for teacher, each in self.by_teacher.items()}, name)
 
     def features(self, restored: Float32[np.ndarray, "N channels"], name: str | None = None) -> GaussianFeatures:
         """Wraps the columns of one space, restored, as features; see `OutputSpace.features`.
@@ -193,6 +177,28 @@ class OutputSpaces:
         """
         teacher = self.resolve(name)
         return self[teacher].features(np.ascontiguousarray(restored[:, self.columns[teacher]]))
+
+
+def teacher_of_space(spaces: Mapping[str, FeatureSpace], name: str | None = None, *, option: str = "space") -> str:
+    """The teacher that a name stands for: the teacher itself, or the name of its feature space.
+
+    Args:
+        spaces: the feature spaces of an encoder, by the names of their teachers.
+        name: of a teacher or a feature space; None = the only one.
+        option: where the name comes from, for the message.
+
+    Raises:
+        InputError: there is no such space, or there are several and none is named.
+    """
+    names = [each.name for each in spaces.values()]
+    known = {each.name: teacher for teacher, each in spaces.items() if names.count(each.name) == 1}
+    known |= {teacher: teacher for teacher in spaces}
+    if name is None and len(spaces) == 1:
+        return next(iter(spaces))
+    if name not in known:
+        wanted = "name one of them" if name is None else f"got {name!r}"
+        raise InputError(f"{option}: the encoder gives features of {', '.join(spaces)}; {wanted}")
+    return known[name]
 
 
 def check_distinct(spaces: Mapping[str, FeatureSpace]) -> None:

@@ -22,6 +22,7 @@ from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads, heads_besi
 from gsencoder.fusion.store.words import save_tables
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder, file_of_encoder, load_encoder
+from gsencoder.models.output_space import teacher_of_space
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
 
@@ -160,11 +161,8 @@ def requested_teachers(encoder: Encoder, names: tuple[str, ...]) -> list[str]:
     Raises:
         InputError: the encoder has no such teacher.
     """
-    known = {space.name: name for name, space in encoder.spaces.items()} | {name: name for name in encoder.spaces}
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise InputError(f"spaces: the encoder gives features of {', '.join(encoder.spaces)}; got {unknown[0]!r}")
-    return [known[name] for name in names] or list(encoder.spaces)
+    requested = [teacher_of_space(encoder.spaces, name, option="spaces") for name in names]
+    return requested or list(encoder.spaces)
 
 
 def _basis_figures(
@@ -190,7 +188,7 @@ def _figures_of_scene(
     """
     # Teachers need torch, which encoding with an exported graph does without.
     from gsencoder.fusion.basis_fit import basis_fit
-    from gsencoder.fusion.teachers.build import build_teacher, text_table_of
+    from gsencoder.fusion.teachers.build import build_teacher, words_by_teacher
     from gsencoder.train.prepare_scenes import SourceConfig
 
     if features.basis is None:
@@ -198,9 +196,11 @@ def _figures_of_scene(
     if scene.views is None:
         raise InputError("basis_views: the scene has no views in which the teacher could be run; leave it out")
     made_with = encoder.made_by.get("settings", {})
-    stored = (made_with.get("teachers") or {}).get(name) or made_with.get("teacher")
-    if stored is None:
+    if not (made_with.get("teachers") or made_with.get("teacher")):
         raise InputError("basis_views: the weights do not say which teacher they were made with; leave it out")
-    config = typed(SourceConfig, {"teacher": stored}).teacher
-    teacher = build_teacher(config, scene, text_table_of(config))
+    stored = {key: made_with[key] for key in ("teacher", "teachers", "text") if made_with.get(key)}
+    source = typed(SourceConfig, stored)
+    teachers = source.teachers_by_name
+    only = next(iter(teachers)) if len(teachers) == 1 else name
+    teacher = build_teacher(teachers[only], scene, words_by_teacher(teachers, source.text).get(only))
     return basis_fit(features.basis, teacher, scene.views, count).figures()
