@@ -50,6 +50,7 @@ LETTER: dict[str, list[str]] = {
     "all weights of B": ["prepare.render_min_weight=0"],
     # The network.
     "stem of 5³": ["model.stem=5"],
+    "one linear layer": ["model.projector=0"],
     "shuffled at each pooling": ["model.transformer.shuffle_orders=pooling"],
     "never shuffled": ["model.transformer.shuffle_orders=never"],
     # Losses.

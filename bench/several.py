@@ -47,9 +47,9 @@ class Training:
         )
         scenes = [TrainingScene([dataset.find_scene(name) for dataset in datasets[:last]]) for name in names]
         self.dataset = SampleDataset(scenes, self.recipe)
-        channels = sum(teacher.channels for teacher in self.recipe.teachers)
+        widths = [teacher.channels for teacher in self.recipe.teachers]
         torch.manual_seed(0)
-        self.encoder = GaussianEncoder(config.model, channels).train()
+        self.encoder = GaussianEncoder(config.model, widths).train()
         self.optimizer = torch.optim.AdamW(self.encoder.parameters(), lr=1e-3, fused=True)
         self.distillation = Distillation(self.encoder, config.loss, self.recipe.teachers)
         self.dtype = autocast_dtype(config.train.precision, torch.device("cpu"))

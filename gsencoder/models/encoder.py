@@ -1,6 +1,7 @@
 """The Gaussian encoder: a network from raw Gaussian attributes to one feature per Gaussian (SplatDistill sec. 3.3)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,12 +35,21 @@ class EncoderConfig:
         default=3, metadata={"help": "edge of the first convolution's neighborhood in cells: 3, or 5 as in PTv3"}
     )
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
+    projector: int = field(
+        default=128,
+        metadata={
+            "help": "hidden channels of the layers that lead from the transformer to the outputs of each teacher; 0 = "
+            "one linear layer for all"
+        },
+    )
 
     def __post_init__(self) -> None:
         if not 0 < self.voxel < math.inf:
             raise InputError(f"voxel: expected a positive length in metres, got {self.voxel}")
         if self.stem not in (3, 5):
             raise InputError(f"stem: expected 3 or 5 cells, got {self.stem}")
+        if self.projector < 0:
+            raise InputError(f"projector: expected 0 or more channels, got {self.projector}")
         unknown = [name for name in self.inputs if name not in ATTRIBUTE_CHANNELS]
         if not self.inputs or unknown or len(set(self.inputs)) < len(self.inputs):
             raise InputError(
@@ -51,19 +61,20 @@ class EncoderConfig:
 class GaussianEncoder(nn.Module):
     """Merges Gaussians into tokens, runs the point transformer, and gives each Gaussian the feature of its token."""
 
-    def __init__(self, config: EncoderConfig, channels: int) -> None:
+    def __init__(self, config: EncoderConfig, channels: int | Sequence[int]) -> None:
         """Args:
         config: inputs, token grid and network.
-        channels: columns of the output: rank R of a basis, or all D channels of the space.
+        channels: columns of the output, of each teacher: rank R of a basis, or all D channels of the space.
         """
         super().__init__()
-        self.config, self.channels = config, channels
+        widths = [channels] if isinstance(channels, int) else list(channels)
+        self.config, self.channels = config, sum(widths)
         width, out = config.transformer.encoder_channels[0], config.transformer.channels_out
         self.stem = NeighborConv(input_channels(config.inputs), width, config.stem)
         self.stem_norm = nn.LayerNorm(width)
         self.transformer = PointTransformer(config.transformer)
         self.head_norm = nn.LayerNorm(out)
-        self.head = nn.Linear(out, channels)
+        self.head = _head(out, widths, config.projector)
 
     def join(self, clouds: list[CloudPlan]) -> Plan:
         """Joins plans of clouds to that of a batch; see `plan.join_plans`."""
@@ -84,7 +95,7 @@ class GaussianEncoder(nn.Module):
             # Levels may end in unused tokens.
             tokens = functional.pad(tokens, (0, 0, 0, len(plan.levels[0].neighbors) - len(tokens)))
         # Tokens are merged in float32, also for an encoder in half precision.
-        tokens = tokens.to(self.head.weight.dtype)
+        tokens = tokens.to(self.head_norm.weight.dtype)
         neighbors = plan.levels[0].neighbors if plan.stem_neighbors is None else plan.stem_neighbors
         x = functional.gelu(self.stem_norm(self.stem(tokens, neighbors)))
         x = self.transformer(x, plan)
@@ -96,10 +107,30 @@ class GaussianEncoder(nn.Module):
         bits."""
         if torch.is_autocast_enabled(x.device.type):
             with torch.autocast(x.device.type, enabled=False):
-                features: Tensor = self.head(self.head_norm(x.to(self.head.weight.dtype)))
+                features: Tensor = self.head(self.head_norm(x.to(self.head_norm.weight.dtype)))
         else:
             features = self.head(self.head_norm(x))
         return features.to(torch.promote_types(features.dtype, torch.float32))
+
+
+class Projectors(nn.Module):
+    """A projector for each teacher: two layers from the transformer's channels to the teacher's columns.
+
+    One linear layer from C channels gives outputs of rank C, which several teachers would have to share.
+    """
+
+    def __init__(self, channels: int, widths: Sequence[int], hidden: int) -> None:
+        super().__init__()
+        self.of_teacher = nn.ModuleList(
+            nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, width)) for width in widths
+        )
+
+    def forward(self, x: Float[Tensor, "T C"]) -> Float[Tensor, "T channels"]:
+        return torch.cat([projector(x) for projector in self.of_teacher], dim=1)
+
+
+def _head(channels: int, widths: Sequence[int], hidden: int) -> nn.Module:
+    return Projectors(channels, widths, hidden) if hidden else nn.Linear(channels, sum(widths))
 
 
 def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan) -> Float[Tensor, "T A"]:

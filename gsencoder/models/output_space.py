@@ -133,6 +133,11 @@ class OutputSpaces:
         return sum(outputs.channels for outputs in self.by_teacher.values())
 
     @property
+    def widths(self) -> list[int]:
+        """Columns of the outputs of each space."""
+        return [outputs.channels for outputs in self.by_teacher.values()]
+
+    @property
     def columns(self) -> dict[str, slice]:
         """The columns of each space, by the name of its teacher."""
         ends = np.cumsum([outputs.channels for outputs in self.by_teacher.values()]).tolist()

@@ -97,7 +97,7 @@ def load_weights(source: str | Path) -> tuple[GaussianEncoder, OutputSpaces, dic
         if dtype not in ("float32", "float16"):
             raise InputError(f"expected parameters of float32 or float16, got {dtype[:20]!r}")
         with torch.device("meta"):
-            encoder = GaussianEncoder(config, outputs.channels)
+            encoder = GaussianEncoder(config, outputs.widths)
         state = {
             name: torch.from_numpy(file.array(f"encoder.{name}", dtype, tuple(value.shape)).astype(np.float32))
             for name, value in encoder.state_dict().items()
@@ -110,6 +110,8 @@ def load_weights(source: str | Path) -> tuple[GaussianEncoder, OutputSpaces, dic
 def _read_config(values: dict[str, Any]) -> EncoderConfig:
     import dacite
 
+    # Files of versions without projectors do not state it, and have one linear layer.
+    values = {"projector": 0, **values}
     try:
         return dacite.from_dict(EncoderConfig, values, dacite.Config(strict=True, cast=[tuple]))
     except (dacite.DaciteError, TypeError) as error:

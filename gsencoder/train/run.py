@@ -212,7 +212,7 @@ def fit(
     ]
     torch.manual_seed(config.train.seed)
     trainer = Trainer(
-        GaussianEncoder(config.model, outputs.channels),
+        GaussianEncoder(config.model, outputs.widths),
         SampleDataset(scenes_to_train_on, recipe),
         config.loss,
         config.train,

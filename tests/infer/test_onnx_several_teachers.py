@@ -37,7 +37,7 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights
     second = OutputSpace(space=FeatureSpace(name="three", channels=3), mean=np.arange(3, dtype=np.float32), scale=5.0)
     outputs = OutputSpaces(by_teacher={"labels": first, "colors": second})
     torch.manual_seed(1)
-    network = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), outputs.channels)
+    network = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), outputs.widths)
     save_weights(tmp_path / "encoder.safetensors", network, outputs, {"steps": 1})
     save_text_table(tmp_path / "words.labels.safetensors", load_text_table(weights / "words.safetensors"))
     encoder = TorchEncoder(str(tmp_path))

@@ -218,29 +218,32 @@ def test_in_bfloat16_features_stay_close_and_come_as_float32() -> None:
     assert torch.cosine_similarity(rough, exact, dim=1).mean() > 0.99
 
 
-def test_in_bfloat16_the_last_linear_layer_computes_in_float32() -> None:
-    network, one = encoder(), splat(300)
+@pytest.mark.parametrize("projector", [0, 64])
+def test_in_bfloat16_the_layers_after_the_transformer_compute_in_float32(projector: int) -> None:
+    network, one = encoder(replace(CONFIG, projector=projector)), splat(300)
     inputs: list[torch.Tensor] = []
     network.head_norm.register_forward_hook(lambda module, given, out: inputs.append(out))
     with torch.autocast("cpu", torch.bfloat16):
         features = run(network, one)
     _, _, cloud = encoder_inputs(one, network.config, 0.1)
-    expected = torch.nn.functional.linear(inputs[0], network.head.weight, network.head.bias)
+    with torch.no_grad():
+        expected = network.head(inputs[0])
     assert inputs[0].dtype == torch.float32
     assert torch.equal(features, expected.index_select(0, network.join([cloud]).token_of))
     # Values of bfloat16 have 8 significant bits.
     assert (features != features.bfloat16().float()).float().mean() > 0.9
 
 
-def test_the_last_linear_layer_has_gradients_of_float32_under_autocast() -> None:
-    network = encoder().train()
+@pytest.mark.parametrize("projector", [0, 64])
+def test_the_layers_after_the_transformer_have_gradients_of_float32_under_autocast(projector: int) -> None:
+    network = encoder(replace(CONFIG, projector=projector)).train()
     attributes, opacities, cloud = encoder_inputs(splat(100), CONFIG, 0.1)
     with torch.autocast("cpu", torch.bfloat16):
         loss = network(attributes, opacities, network.join([cloud])).square().mean()
     loss.backward()
-    gradient = network.head.weight.grad
-    assert gradient is not None
-    assert (gradient != gradient.bfloat16().float()).float().mean() > 0.9
+    for parameter in network.head.parameters():
+        assert parameter.grad is not None
+        assert (parameter.grad != parameter.grad.bfloat16().float()).float().mean() > 0.9
 
 
 # torch's own compiler instantiates an autograd function, and warns that one should not.
@@ -339,3 +342,25 @@ def test_a_shape_that_cannot_be_is_refused(change: dict, message: str, no_jaxtyp
 def test_an_encoder_of_nothing_is_refused(change: dict, no_jaxtyping: None) -> None:
     with pytest.raises(InputError):
         replace(CONFIG, **change)
+
+
+def test_each_teacher_has_a_projector_of_its_own() -> None:
+    torch.manual_seed(0)
+    network = GaussianEncoder(CONFIG, [4, 3]).eval()
+    before = run(network, splat(50, 1))
+    with torch.no_grad():
+        network.head.of_teacher[1][0].weight.zero_()  # type: ignore[index, union-attr]
+    after = run(network, splat(50, 1))
+    assert before.shape == (50, 7)
+    assert torch.equal(before[:, :4], after[:, :4])
+    assert not torch.allclose(before[:, 4:], after[:, 4:])
+
+
+@pytest.mark.parametrize("projector", [0, 64])
+def test_one_linear_layer_has_outputs_of_the_rank_of_its_inputs_and_projectors_have_more(projector: int) -> None:
+    torch.manual_seed(0)
+    config = replace(CONFIG, projector=projector)
+    width = config.transformer.channels_out
+    found = run(GaussianEncoder(config, 2 * width).eval(), splat(400, 1)).double()
+    rank = int(torch.linalg.matrix_rank(found - found.mean(dim=0), rtol=1e-5))
+    assert rank <= width if projector == 0 else rank > width

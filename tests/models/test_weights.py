@@ -1,5 +1,6 @@
 """Weights on disk: what is read is what was written, and anything else is refused with a reason."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def outputs(basis: bool) -> OutputSpaces:
 
 def encoder(space: OutputSpaces) -> GaussianEncoder:
     torch.manual_seed(1)
-    return GaussianEncoder(SMALL, space.channels)
+    return GaussianEncoder(SMALL, space.widths)
 
 
 @pytest.mark.parametrize("basis", [False, True])
@@ -54,8 +55,8 @@ def test_what_is_read_is_what_was_written(basis: bool, dtype: str, tmp_path: Pat
 def test_parameters_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
     broken = encoder(outputs(False))
     with torch.no_grad():
-        broken.head.bias[0] = float("nan")
-    with pytest.raises(InputError, match="parameter head.bias is not finite"):
+        broken.head_norm.bias[0] = float("nan")
+    with pytest.raises(InputError, match="parameter head_norm.bias is not finite"):
         save_weights(tmp_path / "e.safetensors", broken, outputs(False), {})
     assert list(tmp_path.iterdir()) == []
 
@@ -107,3 +108,15 @@ def test_a_truncated_file_is_refused(cut: int, tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(InputError, match="damaged"):
         load_weights(path)
+
+
+def test_a_file_that_does_not_state_projectors_has_one_linear_layer(tmp_path: Path) -> None:
+    space, path = outputs(True), tmp_path / "e.safetensors"
+    written = GaussianEncoder(replace(SMALL, projector=0), space.widths)
+    save_weights(path, written, space, {}, dtype="float32")
+    config = header_of(path)["encoder"]
+    del config["projector"]
+    with_header(path, {"encoder": config})
+    read, _, _ = load_weights(path)
+    assert read.config.projector == 0
+    torch.testing.assert_close(read.state_dict()["head.weight"], written.state_dict()["head.weight"])
