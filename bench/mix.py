@@ -1,14 +1,16 @@
 """Labeled rooms twice: with Gaussians from their depth images, and with the same ones fitted to the photographs.
 
-    python bench/mix.py HOUSE OUT [--names 'train_0*'] [--steps 600] [--options raster.eps2d=0.1 …]
+    python bench/mix.py HOUSE OUT [--names 'train_0*'] [--fitted '*'] [--steps 600] [--options raster.eps2d=0.1 …]
     torchrun --nproc_per_node=2 -m gsencoder train OUT experiment=house_cpu splat=splat.ply holdout=train_04*
     gsencoder evaluate OUT/train_04*_fitted splat=splat.ply weights=…
 
-OUT/NAME holds the scene and its seeds, OUT/NAME_fitted the scene and its reconstruction, each as splat.ply. What is in
-OUT already is not made again, so that several calls may share the work.
+OUT/NAME holds the scene and its seeds, OUT/NAME_fitted the scene and its reconstruction, each as splat.ply; of scenes
+that do not match --fitted there are seeds alone. What is in OUT already is not made again, so that several calls, also at
+the same time, may share the work.
 """
 
 import argparse
+import fnmatch
 import os
 import shutil
 import subprocess
@@ -29,7 +31,12 @@ def add(scene: Path, target: Path, options: list[str]) -> None:
         copy = Path(made) / "scene"
         shutil.copytree(scene, copy)
         shutil.copy(Path(made) / "out" / "splat.ply", copy)
-        os.rename(copy, target)
+        try:
+            os.rename(copy, target)
+        except OSError:
+            # Another call has made it in the meantime.
+            if not target.exists():
+                raise
 
 
 def main() -> None:
@@ -37,13 +44,16 @@ def main() -> None:
     parser.add_argument("house", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--names", default="train_0*")
+    parser.add_argument("--fitted", default="*", help="names of the scenes that are reconstructed")
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--options", nargs="*", default=["raster.eps2d=0.1"])
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for scene in sorted(arguments.house.glob(arguments.names)):
         add(scene, arguments.out / scene.name, SEEDS_ALONE)
-        add(scene, arguments.out / f"{scene.name}_fitted", [f"optimize.steps={arguments.steps}", *arguments.options])
+        if fnmatch.fnmatch(scene.name, arguments.fitted):
+            options = [f"optimize.steps={arguments.steps}", *arguments.options]
+            add(scene, arguments.out / f"{scene.name}_fitted", options)
         print(scene.name, flush=True)
 
 
