@@ -5,8 +5,8 @@
     gsencoder evaluate OUT/train_04*_fitted splat=splat.ply weights=…
 
 OUT/NAME holds the scene and its seeds, OUT/NAME_fitted the scene and its reconstruction, each as splat.ply; of scenes
-that do not match --fitted there are seeds alone. What is in OUT already is not made again, so that several calls, also at
-the same time, may share the work.
+that do not match --fitted there are seeds alone. What is in OUT already is not made again, so that several calls, also
+at the same time, may share the work.
 """
 
 import argparse

@@ -109,8 +109,8 @@ def change_weights(folder: Path, change: Any) -> None:
     save_file(weights, folder / "model.safetensors", {"format": "pt"})
 
 
-def small_siglip2_text(folder: Path, channels: int = OUTPUTS["siglip"], *, kind: str = "siglip2") -> Path:
-    """A random SigLIP2 (or CLIP) model with a tokenizer of letters, whose text side gives vectors of `channels`."""
+def small_joint_model(folder: Path, channels: int = OUTPUTS["siglip"], *, kind: str = "siglip") -> Path:
+    """A random SigLIP, SigLIP2 or CLIP model with a tokenizer of letters, whose vectors have `channels` channels."""
     import torch
     import transformers
 
@@ -125,8 +125,11 @@ def small_siglip2_text(folder: Path, channels: int = OUTPUTS["siglip"], *, kind:
         model: Any = transformers.CLIPModel(config)
     else:
         text["projection_size"] = channels
-        vision["num_patches"] = 4
-        model = transformers.Siglip2Model(transformers.Siglip2Config(text_config=text, vision_config=vision))
+        if kind == "siglip2":
+            vision["num_patches"] = 4
+            model = transformers.Siglip2Model(transformers.Siglip2Config(text_config=text, vision_config=vision))
+        else:
+            model = transformers.SiglipModel(transformers.SiglipConfig(text_config=text, vision_config=vision))
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(torch.randn_like(parameter) * 0.3)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from radios import change_weights, small_radio, small_siglip2_text
+from radios import change_weights, small_joint_model, small_radio
 from symbolic import symbolic_sizes
 
 from gsencoder.app import cli
@@ -60,7 +60,7 @@ class World:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.radio = small_radio(folder / "radio")
-        self.siglip2 = small_siglip2_text(folder / "siglip2")
+        self.siglip = small_joint_model(folder / "siglip")
         for number in range(2):
             write_room(make_room(number, objects=3, views=3, width=96, height=72), folder / f"room_{number}")
 
@@ -70,7 +70,7 @@ class World:
 
     @property
     def text(self) -> tuple[str, ...]:
-        return ("text=transformers", f"text.model={self.siglip2}")
+        return ("text=transformers", f"text.model={self.siglip}")
 
     def room(self, number: int) -> str:
         return str(self.folder / f"room_{number}")
@@ -169,11 +169,11 @@ def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(
     # By hand: cosines about both means, of the words' vectors and of the head's outputs for the decoded features.
     scene, features = load_features(fused), features_of(fused)
     head = find_head(load_heads(fused / "heads.safetensors"), "siglip")
-    words = vocabulary_of(TransformersTextConfig(model=str(world.siglip2)))
+    words = vocabulary_of(TransformersTextConfig(model=str(world.siglip)))
     vectors = words.encode(["mug"])[0] - words.mean
     outputs = head_outputs(head.head, features.decode()) - head.mean
     cosines = outputs @ vectors / (np.linalg.norm(outputs, axis=1) * np.linalg.norm(vectors))
-    config = TransformersTextConfig(model=str(world.siglip2))
+    config = TransformersTextConfig(model=str(world.siglip))
     asked, table = asked_scene(scene, fused, head="siglip", text=config)
     made = localize(
         asked,
@@ -372,15 +372,18 @@ def test_words_of_another_model_are_refused_and_both_are_named(
         "no words lead into its space; give text=transformers text.model=FOLDER, the text side of ViT-SO400M-14-Sig"
         in (refusal(capsys, *asked))
     )
-    wide = small_siglip2_text(tmp_path / "wide", channels=12)
+    wide = small_joint_model(tmp_path / "wide", channels=12)
     line = refusal(capsys, *asked, "text=transformers", f"text.model={wide}")
     assert (
         "head siglip.summary (ViT-SO400M-14-SigLIP-384) gives vectors of 16 channels, and the words of 'wide' have 12"
         in line
     )
-    clip = small_siglip2_text(tmp_path / "clip", kind="clip")
+    clip = small_joint_model(tmp_path / "clip", kind="clip")
     line = refusal(capsys, *asked, "text=transformers", f"text.model={clip}")
     assert "leads to a siglip model, and the words of 'clip' are those of a clip model" in line
+    later = small_joint_model(tmp_path / "later", kind="siglip2")
+    line = refusal(capsys, *asked, "text=transformers", f"text.model={later}")
+    assert "leads to a siglip model, and the words of 'later' are those of a siglip2 model" in line
 
 
 def test_features_without_heads_and_heads_without_features_are_refused(
@@ -440,10 +443,11 @@ def test_maps_that_are_not_finite_are_refused_before_heads_see_them(
     assert "are not finite; check the weights" in line
 
 
-def test_a_siglip2_head_with_a_tower_that_keeps_capital_letters_warns(world: World, fused: Path) -> None:
+def test_a_siglip2_head_with_a_tower_that_keeps_capital_letters_warns(fused: Path, tmp_path: Path) -> None:
+    folder = str(small_joint_model(tmp_path / "siglip2", kind="siglip2"))
     head = replace(find_head(load_heads(fused / "heads.safetensors"), "siglip").head, text="siglip2")
     with pytest.warns(SceneWarning, match="give text.lower=yes"):
-        words_of_head(head, "", TransformersTextConfig(model=str(world.siglip2), lower="no"))
+        words_of_head(head, "", TransformersTextConfig(model=folder, lower="no"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        words_of_head(head, "", TransformersTextConfig(model=str(world.siglip2)))
+        words_of_head(head, "", TransformersTextConfig(model=folder))

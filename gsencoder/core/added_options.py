@@ -10,6 +10,7 @@ from typing import Any
 ADDED_OPTIONS: Mapping[str, Any] = {
     "model.stem": 3,
     "model.transformer.shuffle_orders": "once",
+    "model.projector": 0,
     "loss.confidence": True,
     "loss.divide_by_alpha": True,
     "loss.contrast_clusters": True,
@@ -24,12 +25,14 @@ def with_added_options(stored: Mapping[str, Any]) -> dict[str, Any]:
 
     Args:
         stored: settings by section, as JSON values; in those of a training the section `prepared` holds those of its
-            prepared scenes.
+            prepared scenes, or of those of each of several teachers.
     """
     settings = _copy(stored)
+    prepared = settings.get("prepared")
+    roots = [settings, prepared, *(prepared.values() if isinstance(prepared, dict) else ())]
     for key, value in ADDED_OPTIONS.items():
         *sections, name = key.split(".")
-        for root in (settings, settings.get("prepared")):
+        for root in roots:
             section: Any = root
             for part in sections:
                 section = section.get(part) if isinstance(section, dict) else None

@@ -22,7 +22,7 @@ def load_pretrained(
     known_parts: Sequence[str] = (),
     **options: Any,
 ) -> Any:
-    """A model with exactly the weights of a folder, in evaluation mode.
+    """A model with exactly the weights of a folder, in evaluation mode and in float32.
 
     Args:
         loader: a class of transformers with `from_pretrained`.
@@ -42,7 +42,10 @@ def load_pretrained(
     """
     weight_files(folder, what)
     with _readable(folder, what):
-        model, report = _from_pretrained(loader, str(folder), use_safetensors=True, **options)
+        import torch
+
+        # transformers would take the type of the files, in which pictures of float32 do not fit every layer.
+        model, report = _from_pretrained(loader, str(folder), use_safetensors=True, dtype=torch.float32, **options)
     report["unexpected_keys"] = [key for key in report["unexpected_keys"] if not key.startswith(tuple(known_parts))]
     _check_keys(folder, model, report, what, other_parts)
     return model.eval()

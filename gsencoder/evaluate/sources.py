@@ -68,7 +68,12 @@ def space_of_words(encoder: Encoder, words: Words) -> str | None:
         return None
     text_encoder = words.space.text_encoder
     fitting = [name for name, space in encoder.spaces.items() if space.text_encoder == text_encoder]
-    if len(fitting) != 1:
+    if not fitting:
+        raise InputError(
+            f"no teacher of the encoder has the text encoder {text_encoder} ({', '.join(encoder.spaces)}); give the "
+            "words of one (teacher.words= or text=), or name it with space="
+        )
+    if len(fitting) > 1:
         listing = "; ".join(f"{name}: {space.describe()}" for name, space in encoder.spaces.items())
         raise InputError(
             f"the words of {text_encoder} are those of {len(fitting)} of the encoder's teachers ({listing}); expected "

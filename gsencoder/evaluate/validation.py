@@ -131,13 +131,15 @@ def validate_names(
     outputs: OutputSpaces,
     teacher: str,
     codebook: Float32[np.ndarray, "C channels"],
-    config: EncodeConfig = EncodeConfig(),
+    config: EncodeConfig | None = None,
 ) -> ValidationResult:
-    """Runs `validate_encoder` in the form that `gsencoder.train.train` expects.
+    """Runs `validate_encoder` in the form that `gsencoder.train.train` expects, by default on the encoder's device.
 
     Its scores are "names", the accuracy averaged over classes, and "cosine_named", the mean cosine over named
     Gaussians; its picture "features" is the sheet of the first scenes.
     """
+    if config is None:
+        config = EncodeConfig(device="cuda" if next(encoder.parameters()).is_cuda else "cpu")
     accuracy = validate_encoder(scenes, encoder, outputs, teacher, codebook, config, pictured=PICTURED_SCENES)
     pictures = {} if accuracy.sheet is None else {"features": accuracy.sheet}
     return ValidationResult({"names": accuracy.score, "cosine_named": accuracy.cosine_named}, pictures)

@@ -38,8 +38,8 @@ class EncoderConfig:
     projector: int = field(
         default=128,
         metadata={
-            "help": "hidden channels of the layers that lead from the transformer to the outputs of each teacher; 0 = "
-            "one linear layer for all"
+            "help": "hidden channels of the MLP (linear, GELU, linear) that gives the outputs of each teacher; 0 = one "
+            "linear layer for all"
         },
     )
 
@@ -103,8 +103,8 @@ class GaussianEncoder(nn.Module):
         return features.index_select(0, plan.token_of)
 
     def _output_features(self, x: Float[Tensor, "T C"]) -> Float[Tensor, "T channels"]:
-        """The last norm and linear layer, in float32 under autocast: in bfloat16 the outputs would be rounded to 8
-        bits."""
+        """The last norm and the projectors (or the linear layer), in float32 under autocast: in bfloat16 the outputs
+        would be rounded to 8 bits."""
         if torch.is_autocast_enabled(x.device.type):
             with torch.autocast(x.device.type, enabled=False):
                 features: Tensor = self.head(self.head_norm(x.to(self.head_norm.weight.dtype)))

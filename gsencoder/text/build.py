@@ -70,7 +70,7 @@ def words_of_table(table: TextTable, config: TextConfig = TableTextConfig()) -> 
         made_by = table.tower.describe() if table.tower is not None else repr(table.space.text_encoder)
         raise InputError(
             f"text.model={config.model}: the words were made by {made_by}, and this is {tower.name!r} "
-            f"({tower.identity}); give that one: its model, tokenizer and text.pooling= must be the same"
+            f"({tower.identity}); give that one: its model, tokenizer, text.pooling= and text.lower= must be the same"
         )
     return OpenVocabulary(table, lambda: tower)
 
@@ -101,5 +101,5 @@ def find_tower(record: TowerRecord) -> TextTower:
 def _open_as(record: TowerRecord, folder: Path) -> TextTower:
     options: dict[str, Any] = {"model": str(folder), "pooling": record.pooling}
     if record.kind == "transformers":
-        return TransformersTower(TransformersTextConfig(**options))
+        return TransformersTower(TransformersTextConfig(**options, lower="yes" if record.lower else "no"))
     return OnnxTower(OnnxTextConfig(**options))

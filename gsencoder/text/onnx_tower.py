@@ -61,7 +61,10 @@ class OnnxTower:
         identity: "onnx:" and a digest of graph, tokenizer and pooling.
         channels: of its vectors.
         pooling: of token vectors.
+        lower: never; its tokenizer does what its model needs.
     """
+
+    lower = False
 
     def __init__(self, config: OnnxTextConfig) -> None:
         """Reads the folder, and runs the tokenizer's last token through the graph.

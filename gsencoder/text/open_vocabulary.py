@@ -129,7 +129,12 @@ def make_vocabulary(
         InputError: a name cannot be embedded.
     """
     record = TowerRecord(
-        kind=kind, name=tower.name, identity=tower.identity, pooling=tower.pooling, templates=tuple(templates)
+        kind=kind,
+        name=tower.name,
+        identity=tower.identity,
+        pooling=tower.pooling,
+        templates=tuple(templates),
+        lower=tower.lower,
     )
     space = FeatureSpace(name=tower.identity, channels=tower.channels, text_encoder=tower.identity)
     with about(f"text tower {tower.name} cannot embed everyday words, so its tokenizer may be that of another model"):

@@ -217,10 +217,14 @@ def tower_from_json(values: Any) -> TowerRecord:
     Raises:
         InputError: they hold none.
     """
-    if not isinstance(values, dict) or set(values) != {item.name for item in fields(TowerRecord)}:
+    if not isinstance(values, dict) or {"lower", *values} != {item.name for item in fields(TowerRecord)}:
         raise InputError(f"expected the record of a text tower, got {str(values)[:60]!r}")
     if not isinstance(values["templates"], list):
         raise InputError("expected a list of templates in the record of a text tower")
+    # Records of earlier versions do not state it.
+    values = {"lower": False, **values}
+    if not isinstance(values["lower"], bool):
+        raise InputError("expected true or false as lower in the record of a text tower")
     return TowerRecord(**{**values, "templates": tuple(values["templates"])})
 
 

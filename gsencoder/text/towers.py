@@ -27,6 +27,7 @@ class TextTower(Protocol):
         name: for people; the name of the folder that it was read from.
         identity: kind and digest of all files and settings that its vectors depend on, and never where they lie.
         pooling: how it makes one vector of those of the tokens.
+        lower: whether it lower-cases phrases and removes their punctuation before they are tokenized.
         channels: D.
     """
 
@@ -38,6 +39,9 @@ class TextTower(Protocol):
 
     @property
     def pooling(self) -> str: ...
+
+    @property
+    def lower(self) -> bool: ...
 
     @property
     def channels(self) -> int: ...
@@ -56,6 +60,7 @@ class TowerRecord:
         name: of the folder that it was read from then.
         identity, pooling: see `TextTower`.
         templates: the sentences that each name was put into; their vectors were averaged.
+        lower: whether phrases are lower-cased and lose their punctuation before they are tokenized.
     """
 
     kind: str
@@ -63,6 +68,7 @@ class TowerRecord:
     identity: str
     pooling: str
     templates: tuple[str, ...] = NO_TEMPLATES
+    lower: bool = False
 
     def __post_init__(self) -> None:
         texts = (self.kind, self.name, self.identity, self.pooling)

@@ -14,18 +14,17 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.cell_sample import CellSample
 from gsencoder.fusion.heads.measure import HeadSet, measure_heads
 from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import choose_heads, has_head, load_heads, save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE, check_heads_space
-from gsencoder.fusion.teachers import MissingInput, Teacher
+from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.dataset_space import views_of_scenes
+from gsencoder.train.dataset_space import sampled_maps
 from gsencoder.train.losses import AdapterHead
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.types import Scene
@@ -125,17 +124,9 @@ def measure_dataset_heads(
     stored = load_heads(path) if path.is_file() else HeadSet(space=outputs.space)
     check_heads_space(stored.space, outputs.space)
     sample = CellSample(views)
-    for scene_path, count in zip(scenes, views_of_scenes(len(scenes), views), strict=True):
-        try:
-            if count:
-                scene, of_scene = open_scene(scene_path)
-                check_heads_space(of_scene.space, outputs.space)
-                assert scene.views is not None
-                for view in even_indices(len(scene.views), count):
-                    sample.add(of_scene.feature_map(scene.views, int(view)))
-        except MissingInput:
-            if not optional:
-                raise
+    for _, of_scene, feature_map in sampled_maps(scenes, open_scene, views, optional=optional):
+        check_heads_space(of_scene.space, outputs.space)
+        sample.add(feature_map)
     measured = measure_heads(heads, sample, outputs.space, outputs.basis)
     save_heads(path, HeadSet(space=outputs.space, heads=(*stored.heads, *measured.heads)))
 

@@ -75,10 +75,7 @@ def load_checkpoint(
     with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
         stored_settings = with_added_options(file.value("settings", dict))
         if stored_settings != settings:
-            raise InputError(
-                f"{path}: was made with {first_difference(stored_settings, settings)}; "
-                "give the same settings or another out="
-            )
+            raise InputError(f"{path}: {_describe_difference(stored_settings, settings)}")
         parameters = {
             name: torch.from_numpy(file.array(f"model.{name}", "float32", tuple(value.shape)))
             for name, value in model.state_dict().items()
@@ -99,6 +96,19 @@ def load_checkpoint(
     for parameter, values in moments.items():
         optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in values.items()}
     return state
+
+
+def _describe_difference(stored: dict[str, Any], settings: dict[str, Any]) -> str:
+    """The first difference between the settings of a checkpoint and of this run, and what to do about it."""
+    if any(stored.get(name) != settings.get(name) for name in ("space", "spaces", "scenes")):
+        return "the prepared scenes have changed since; give the former prepared=, or another out="
+    before, now = stored.get("samples_per_step"), settings.get("samples_per_step")
+    if before != now:
+        return (
+            f"a step had {before} samples, and this run has {now} (train.batch × train.accumulate × processes); change "
+            "train.accumulate= or the number of processes, or give another out="
+        )
+    return f"was made with {first_difference(stored, settings)}; give the same settings or another out="
 
 
 def _read_state(file: Archive) -> TrainingState:

@@ -1,6 +1,6 @@
 """The output space of a dataset: mean, scale and basis that all its scenes share."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import distinct_rows
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.types import Scene, Views
+from gsencoder.types import FeatureMap, Scene
 
 MAX_CELLS_PER_MAP = 4096
 """Approximate limit of the cells of one teacher map that enter the moments."""
@@ -67,34 +67,21 @@ def dataset_space(
     """
     if not scenes:
         raise InputError("training: no scenes to train on")
-    tables: list[np.ndarray] = []
-    kinds: dict[str, None] = {}
+    teacher, tables, kinds = None, list[np.ndarray](), dict[str, None]()
     missing: MissingInput | None = None
-    moments: Moments | None = None
-    teacher: Teacher | None = None
-    for path, count in zip(scenes, views_of_scenes(len(scenes), views), strict=True):
-        if teacher is not None and teacher.table is None and not count:
-            continue
+    for path in scenes:
         try:
-            scene, scene_teacher = open_scene(path)
-            if teacher is not None and scene_teacher.space != teacher.space:
-                raise InputError(
-                    f"training: expected one feature space for all scenes, got several feature spaces: "
-                    f"({teacher.space.describe()}), and in {path} ({scene_teacher.space.describe()})"
-                )
-            if scene_teacher.table is None:
-                assert scene.views is not None
-                moments = moments or Moments(scene_teacher.space.channels)
-                _add_maps(moments, scene_teacher, scene.views, max(1, count))
+            _, of_scene = open_scene(path)
         except MissingInput as error:
             if not optional:
                 raise
             missing = missing or error
             continue
-        teacher = scene_teacher
-        kinds |= dict.fromkeys(getattr(teacher, "kinds", ()))
-        if teacher.table is not None:
-            tables.append(teacher.table)
+        teacher = _same_space(teacher, of_scene, path)
+        kinds |= dict.fromkeys(getattr(of_scene, "kinds", ()))
+        if of_scene.table is None:
+            break
+        tables.append(of_scene.table)
     if teacher is None:
         assert missing is not None
         raise missing
@@ -103,22 +90,81 @@ def dataset_space(
         space = replace(_coded_space(table, teacher, config), centered=center, scaled=scale)
         coordinates = to_coordinates(space.basis, table) if space.basis is not None else table
         return DatasetSpace(outputs=space, codebook=space.standardize(coordinates), kinds=tuple(kinds))
-    assert moments is not None
+    moments = Moments(teacher.space.channels)
+    for path, of_scene, feature_map in sampled_maps(scenes, open_scene, views, optional=optional):
+        teacher = _same_space(teacher, of_scene, path)
+        rows = distinct_rows(feature_map)
+        moments.add(rows[:: max(1, len(rows) // MAX_CELLS_PER_MAP)])
     outputs = replace(_dense_space(moments, teacher, config), centered=center, scaled=scale)
     return DatasetSpace(outputs=outputs, kinds=tuple(kinds))
+
+
+def _same_space(teacher: Teacher | None, other: Teacher, path: Path) -> Teacher:
+    if teacher is not None and other.space != teacher.space:
+        raise InputError(
+            f"training: expected one feature space for all scenes, got several feature spaces: "
+            f"({teacher.space.describe()}), and in {path} ({other.space.describe()})"
+        )
+    return other
+
+
+def sampled_maps(
+    scenes: Sequence[Path],
+    open_scene: Callable[[Path], tuple[Scene, Teacher]],
+    views: int,
+    *,
+    optional: bool = False,
+) -> Iterator[tuple[Path, Teacher, FeatureMap]]:
+    """Maps of a dense teacher, evenly distributed over the scenes and their views.
+
+    Args:
+        scenes: all scenes to train on.
+        open_scene: reads a scene without making Gaussians, and builds its teacher.
+        views: number of maps, fewer where the scenes have fewer views.
+        optional: leave out scenes that lack what the teacher needs; the others have their shares of the maps.
+
+    Yields:
+        The path of a scene, its teacher, and a map.
+
+    Raises:
+        MissingInput: a scene lacks what the teacher needs, or with `optional` all do.
+    """
+    used: dict[Path, list[int]] = {}
+    lacking: dict[Path, MissingInput] = {}
+    exhausted: set[Path] = set()
+    left, candidates = views, list(scenes)
+    while left > 0 and candidates:
+        for path, count in zip(candidates, views_of_scenes(len(candidates), left), strict=True):
+            if not count:
+                continue
+            try:
+                scene, teacher = open_scene(path)
+                assert scene.views is not None
+                before = used.get(path, [])
+                even = [int(view) for view in even_indices(len(scene.views), len(before) + count)]
+                new = [view for view in even if view not in before][:count]
+                for view in new:
+                    yield path, teacher, teacher.feature_map(scene.views, view)
+                    used.setdefault(path, []).append(view)
+                left -= len(new)
+                if len(new) < count:
+                    exhausted.add(path)
+            except MissingInput as error:
+                if not optional:
+                    raise
+                lacking[path] = error
+        if not lacking:
+            return
+        untried = [path for path in scenes if path not in used and path not in lacking]
+        candidates = untried or [path for path in used if path not in exhausted]
+    if not used:
+        raise next(iter(lacking.values()))
 
 
 def views_of_scenes(scenes: int, views: int) -> list[int]:
     """How many of `views` maps are those of each scene, evenly distributed; the first scene has one at least."""
     counts = [int(count) for count in np.diff(np.linspace(0, views, scenes + 1).round())]
     return [max(1, counts[0]), *counts[1:]]
-
-
-def _add_maps(moments: Moments, teacher: Teacher, views: Views, count: int) -> None:
-    """Adds cells of the maps of `count` evenly spaced views to the moments."""
-    for view in even_indices(len(views), count):
-        rows = distinct_rows(teacher.feature_map(views, int(view)))
-        moments.add(rows[:: max(1, len(rows) // MAX_CELLS_PER_MAP)])
 
 
 def _coded_space(table: Float32[np.ndarray, "C D"], teacher: Teacher, config: FuseConfig) -> OutputSpace:

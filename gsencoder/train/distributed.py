@@ -180,7 +180,8 @@ def check_agreement(what: str, value: str) -> None:
     for rank, each in known:
         if each != known[0][1]:
             raise InputError(
-                f"training: {what} of process {known[0][0]} are {known[0][1]}, those of process {rank} are {each}; "
+                f"training: {what} differ: their digest is {known[0][1]} in process {known[0][0]} and {each} in "
+                f"process {rank}; "
                 "give all processes the same files"
             )
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from gsencoder.core.added_options import with_added_options
-from gsencoder.core.errors import InputError, advised
+from gsencoder.core.errors import InputError, advised, listed
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.runtime.tracking import Track
@@ -223,6 +223,21 @@ class PreparedDataset:
         path.parent.mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self.folder, prefix=MAPS_PREFIX) as maps:
             prepare_scene(path, scene, CachedTeacher(teacher, Path(maps)), outputs, config, source=source)
+
+    def check_kinds(self, teacher: Teacher) -> None:
+        """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
+        were added since.
+
+        Raises:
+            InputError: it has.
+        """
+        known = self.load_kinds()
+        new = [kind for kind in getattr(teacher, "kinds", ()) if kind not in known]
+        if known and new:
+            raise InputError(
+                f"{self.folder}: the classes of this dataset lack {listed(new, 3)}, since the scene has changed; give "
+                "another folder as prepared="
+            )
 
     def remove_stale_maps(self) -> None:
         """Removes caches of teacher maps that killed runs left."""

@@ -168,7 +168,8 @@ def prepare_scenes(
     with fail_together():
         assigned: Iterable[Path] = track(share, "preparing scenes")
         for path in assigned:
-            _prepare_scene(path, missing[path], datasets, reader, config.prepare, optional=several)
+            trained = path in training
+            _prepare_scene(path, missing[path], datasets, reader, config.prepare, trained=trained, optional=several)
     with fail_together():
         if process.is_first:
             _check_teachers(datasets, training, held_out)
@@ -186,7 +187,10 @@ def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     if len(names) == 1:
         return {names[0]: folder}
     if (folder / DATASET_SETTINGS_FILE).is_file():
-        raise InputError(f"{folder}: was prepared for one teacher, and this run has several; give another prepared=")
+        raise InputError(
+            f"{folder}: was prepared for one teacher, and this run has several; give another prepared=, or move it to "
+            f"the teacher's folder in one (FOLDER/{names[0]})"
+        )
     return {name: folder / name for name in names}
 
 
@@ -213,14 +217,21 @@ def _prepare_scene(
     reader: "_SceneReader",
     config: PrepareConfig,
     *,
+    trained: bool,
     optional: bool,
 ) -> None:
-    """Prepares a scene for some teachers; with `optional` those are left out for which it lacks something."""
+    """Prepares a scene, which is trained on or held out, for some teachers.
+
+    With `optional` those are left out for which it lacks something.
+    """
     scene = reader.with_gaussians(path)
     for name in names:
         with about(path):
             try:
-                datasets[name].prepare(scene, reader.teacher(name, scene), config, source=path)
+                teacher = reader.teacher(name, scene)
+                if trained:
+                    datasets[name].check_kinds(teacher)
+                datasets[name].prepare(scene, teacher, config, source=path)
             except MissingInput:
                 if not optional:
                     raise

@@ -1,5 +1,6 @@
 """Training of an encoder from scenes on disk (SplatDistill sec. 3.3): preparation, distillation, validation."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
@@ -69,6 +70,14 @@ class TrainConfig(SourceConfig):
                 "loss.confidence: weights by distances from the mean in typical ones; give loss.confidence=false with "
                 "prepare.center=false or prepare.scale=false"
             )
+        teachers, weights = self.teachers_by_name, self.loss.teacher_weights
+        if weights and len(weights) != len(teachers):
+            raise InputError(
+                f"loss.teacher_weights: expected {len(teachers)} numbers, one for each of {', '.join(teachers)}, got "
+                f"{list(weights)}"
+            )
+        if len(set(self.heads)) < len(self.heads):
+            raise InputError(f"heads: {', '.join(self.heads)} names a head twice; its loss would count twice")
         if self.loss.contrast_weight and not self.prepare.scale:
             raise InputError(
                 "loss.contrast_weight: compares distances with typical ones; expected 0 with prepare.scale=false"
@@ -173,6 +182,8 @@ def fit(
     Raises:
         InputError: see `train`.
     """
+    # Samples are numbered by scene, so that the order in which scenes are given must not matter to a resumed run.
+    training = sorted(training)
     spaces = {name: dataset.load_space() for name, dataset in datasets.items()}
     outputs = OutputSpaces(by_teacher={name: space for name, (space, _) in spaces.items()})
     with_heads = teacher_of_heads(config.teachers_by_name, config.heads)
@@ -181,11 +192,16 @@ def fit(
         raise InputError(f"heads: {', '.join(config.heads)} names a head twice; its loss would count twice")
     check_agreement("the heads of L_render", heads_digest(heads))
     weights = config.loss.teacher_weights or (1.0,) * len(datasets)
-    if len(weights) != len(datasets):
-        raise InputError(
-            f"loss.teacher_weights: expected {len(datasets)} numbers, one for each of {', '.join(datasets)}, got "
-            f"{list(weights)}"
+    with_contrast = {name: config.loss.contrast_clusters or space[1] is not None for name, space in spaces.items()}
+    if config.loss.contrast_weight and not any(with_contrast.values()):
+        nothing_else = not config.loss.field_weight + config.loss.render_weight > 0
+        message = (
+            "loss.contrast_weight: the maps of no teacher are codes of a table of names, so L_contrast has no classes; "
+            "loss.contrast_clusters=true takes clusters of targets as classes"
         )
+        if nothing_else:
+            raise InputError(message)
+        warnings.warn(message, SceneWarning, stacklevel=2)
     recipe = SampleRecipe(
         encoder=config.model,
         sampling=config.sampling,
@@ -196,7 +212,7 @@ def fit(
                 name=name,
                 class_balance=dataset.load_class_balance(),
                 weight=weight,
-                contrast=config.loss.contrast_clusters or spaces[name][1] is not None,
+                contrast=with_contrast[name],
             )
             for (name, dataset), weight in zip(datasets.items(), weights, strict=True)
         ),
@@ -217,7 +233,7 @@ def fit(
         config.loss,
         config.train,
         folder=work,
-        settings=resume_settings(config, process, datasets),
+        settings=resume_settings(config, process, datasets, training),
         heads={with_heads: render_heads(heads, outputs[with_heads])},
         process=process,
         device=device,
@@ -239,7 +255,7 @@ def _table_of(words: Words, dataset: PreparedDataset) -> TextTable:
 
 
 def resume_settings(
-    config: TrainConfig, process: ProcessRank, datasets: Mapping[str, PreparedDataset]
+    config: TrainConfig, process: ProcessRank, datasets: Mapping[str, PreparedDataset], training: Sequence[str]
 ) -> dict[str, Any]:
     """The settings that a run must share with the one that it resumes, as JSON values.
 
@@ -259,7 +275,8 @@ def resume_settings(
         of_teachers: dict[str, Any] = {"space": space, "prepared": made_with}
     else:
         # The order, which a mapping does not state when it is compared, is that of the columns.
-        of_teachers = {"teachers": list(datasets), "spaces": spaces, "prepared": prepared}
+        scenes = {name: [each.name for each in dataset.scenes(training)] for name, dataset in datasets.items()}
+        of_teachers = {"teachers": list(datasets), "spaces": spaces, "prepared": prepared, "scenes": scenes}
     return {
         **shared,
         **of_teachers,

@@ -27,8 +27,9 @@ from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.render_rows import RenderRows, empty_rows, join_rows, make_render_rows, restrict_rows
 from gsencoder.train.training_scene import TrainingScene
 
-MAX_OPEN_SCENES = 256
-"""Largest number of scenes that a process keeps open; the least recently used is closed first."""
+MAX_OPEN_FILES = 256
+"""Largest number of files of prepared scenes, one for each teacher, that a process keeps open; those of the scene that
+was used least recently are closed first."""
 
 
 class TeacherTargets(NamedTuple):
@@ -196,7 +197,7 @@ class SampleDataset(Dataset[Sample]):
         if scene_index not in self._codes:
             self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe.teachers)
         self._codes.move_to_end(scene_index)
-        if len(self._codes) > MAX_OPEN_SCENES:
+        if len(self._codes) > max(1, MAX_OPEN_FILES // len(self.recipe.teachers)):
             oldest, _ = self._codes.popitem(last=False)
             self.scenes[oldest].close()
         return self._codes[scene_index]

@@ -6,7 +6,7 @@ from gsencoder.core.added_options import ADDED_OPTIONS, with_added_options
 def test_sections_get_the_options_that_they_lack_and_keep_those_that_they_have() -> None:
     stored = {"model": {"transformer": {"patch": 8}}, "loss": {"confidence": False}}
     completed = with_added_options(stored)
-    assert completed["model"] == {"stem": 3, "transformer": {"patch": 8, "shuffle_orders": "once"}}
+    assert completed["model"] == {"stem": 3, "projector": 0, "transformer": {"patch": 8, "shuffle_orders": "once"}}
     assert completed["loss"] == {
         "confidence": False,
         "divide_by_alpha": True,
@@ -25,7 +25,7 @@ def test_sections_that_are_missing_are_not_made_up() -> None:
     assert with_added_options({"run": 1, "model": None}) == {"run": 1, "model": None}
 
 
-CHANGED = {"loss.contrast_clusters"}
+CHANGED = {"loss.contrast_clusters", "model.projector"}
 """Options whose default differs from what was done before, so that unfinished runs must state the former."""
 
 
@@ -39,3 +39,11 @@ def test_each_added_option_exists_and_its_default_is_what_was_done_before_unless
         for part in key.split("."):
             section = section[part]
         assert (section != value) == (key in CHANGED)
+
+
+def test_settings_of_scenes_that_were_prepared_for_several_teachers_are_completed() -> None:
+    completed = with_added_options({"prepared": {"labels": {"prepare": {"center": False}}, "dino": {"prepare": {}}}})
+    assert completed["prepared"] == {
+        "labels": {"prepare": {"center": False, "scale": True}},
+        "dino": {"prepare": {"center": True, "scale": True}},
+    }

@@ -1,5 +1,6 @@
 """Adapter heads: on disk, measured over maps, and applied to features and tokens."""
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,13 @@ def test_heads_that_are_read_are_those_that_were_written(tmp_path: Path) -> None
     assert heads_digest(read) == heads_digest(heads)
     moved = replace(heads, heads=(replace(heads.heads[0], scale=3.0), *heads.heads[1:]))
     assert heads_digest(moved) != heads_digest(heads)
+    of_other_mean = replace(heads.heads[0], mean=heads.heads[0].mean + 1)
+    assert heads_digest(replace(heads, heads=(of_other_mean, *heads.heads[1:]))) != heads_digest(heads)
+    body = copy.deepcopy(heads.heads[0].head.body)
+    with torch.no_grad():
+        next(body.parameters()).add_(1)
+    of_other_weights = replace(heads.heads[0], head=replace(heads.heads[0].head, body=body))
+    assert heads_digest(replace(heads, heads=(of_other_weights, *heads.heads[1:]))) != heads_digest(heads)
     assert heads_digest(replace(heads, space=replace(SPACE, weights="other"))) != heads_digest(heads)
 
 

@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from region_scenes import toy_words
 from splats import front_camera
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Views
 
@@ -78,6 +81,27 @@ def test_its_space_tells_weights_apart(folder: Path, tmp_path: Path) -> None:
     assert one.space.name == other.space.name
     assert one.space != other.space
     assert one.settings() != other.settings()
+    assert RadioTeacher(RadioConfig(model=str(folder), size=64)).settings() != one.settings()
+
+
+def test_weights_in_half_precision_compute_in_float32(folder: Path, tmp_path: Path) -> None:
+    half = tmp_path / "half"
+    transformers.RadioModel.from_pretrained(folder).bfloat16().save_pretrained(half)
+    rounded = tmp_path / "rounded"
+    transformers.RadioModel.from_pretrained(half, dtype="float32").save_pretrained(rounded)
+    views = make_room(1, views=1, width=96, height=72).views
+    assert views is not None
+    maps = [
+        RadioTeacher(RadioConfig(model=str(path), size=48, device="cpu")).feature_map(views, 0)
+        for path in (half, rounded)
+    ]
+    np.testing.assert_allclose(maps[0].features, maps[1].features, atol=1e-5)
+
+
+def test_words_of_another_width_are_refused_before_anything_is_fused(folder: Path) -> None:
+    scene = make_room(1, views=1, width=96, height=72)
+    with pytest.raises(InputError, match="24"):
+        build_teacher(RadioConfig(model=str(folder), size=48), scene, toy_words("mug", channels=8))
 
 
 def test_it_is_found_by_name_among_the_models(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,14 +123,15 @@ def masks_of_library(folder: Path, model: Any, points: np.ndarray) -> tuple[np.n
     return logits.numpy(), outputs.iou_scores[0].numpy()
 
 
-def test_proposals_are_the_masks_that_the_library_gives_for_the_points(saved: Any) -> None:
+@pytest.mark.parametrize("side", [3, 6])
+def test_proposals_are_the_masks_that_the_library_gives_for_the_points(saved: Any, side: int) -> None:
     folder, model = saved(sam)
-    made = SamMasks(config_of(folder)).proposals(photograph())
-    points = grid_points(3) * (WIDTH, HEIGHT)
+    made = SamMasks(config_of(folder, points=side)).proposals(photograph())
+    points = grid_points(side) * (WIDTH, HEIGHT)
     logits, scores = masks_of_library(folder, model, points)
     expected = [
         (logits[point, one] > 0, scores[point, one])
-        for point in range(9)
+        for point in range(side**2)
         for one in range(3)
         if scores[point, one] >= 0 and (logits[point, one] > 0).any()
     ]
@@ -285,15 +286,23 @@ def test_folders_of_other_models_are_refused(saved: Any, tmp_path: Path) -> None
         SamMasks(config_of(tmp_path / "vit"))
     folder, model = saved(sam2)
     (folder / "preprocessor_config.json").write_text(json.dumps({"image_mean": [0.5]}))
-    with pytest.raises(InputError, match=r"holds no preprocessing that can be read \(preprocessor_config.json"):
+    with pytest.raises(InputError, match="does not state resample, image_std"):
         SamMasks(config_of(folder))
     (folder / "preprocessor_config.json").unlink()
-    with pytest.raises(InputError, match="holds no preprocessing that can be read"):
+    with pytest.raises(InputError, match="has no preprocessor_config.json"):
         SamMasks(config_of(folder))
     model.mask_decoder.iou_prediction_head.proj_out.bias.data[:] = torch.nan
     model.save_pretrained(folder)
-    (folder / "preprocessor_config.json").write_text(json.dumps({"image_mean": [0.5] * 3, "image_std": [0.5] * 3}))
+    (folder / "preprocessor_config.json").write_text(
+        json.dumps({"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "resample": 2})
+    )
     views = region_scene().views
     assert views is not None
     with pytest.raises(InputError, match="view 'images/a.jpg': masks or scores of SAM are not finite"):
         SamMasks(config_of(folder)).labels(views, 0)
+
+
+@pytest.mark.parametrize("change", [{"points": 4}, {"min_iou": 0.1}, {"min_stability": 0.1}, {"max_overlap": 0.5}])
+def test_settings_that_change_masks_change_the_settings(saved: Any, change: dict[str, Any]) -> None:
+    folder, _ = saved(sam)
+    assert SamMasks(config_of(folder, **change)).settings() != SamMasks(config_of(folder)).settings()

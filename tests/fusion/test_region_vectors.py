@@ -1,6 +1,7 @@
 """Vectors of regions from pictures: means of dense maps, and crops through image towers."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from vision_towers import VISION as TOWER_VISION
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher, words_of
+from gsencoder.fusion.teachers.build import build_teacher, takes_text, words_of
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.radio import RadioTeacher
 from gsencoder.fusion.teachers.regions.build import dense_teacher
@@ -320,3 +321,29 @@ def test_a_preprocessing_of_another_size_than_the_model_is_one_line(tmp_path: Pa
     folder = clip_folder(tmp_path / "clip", crop_size={"height": 64, "width": 64}, size={"shortest_edge": 64})
     with pytest.raises(InputError, match="clip does not run on what its preprocessing makes of a picture"):
         TransformersImageTower(folder, "cpu")
+
+
+def test_no_end_of_a_square_is_cut_off_by_a_tower_that_crops(tmp_path: Path) -> None:
+    """As released DINOv2 folders do, which resize to 256 pixels and take the middle 224."""
+    masks, vectors = write_masks(tmp_path / "m"), []
+    for edge in (8, 10):
+        torch.manual_seed(0)
+        model, _ = joint_clip()
+        model.eval().save_pretrained(tmp_path / f"model{edge}")
+        processor = transformers.CLIPImageProcessor(
+            size={"shortest_edge": edge}, crop_size={"height": 8, "width": 8}, resample=2
+        )
+        processor.save_pretrained(tmp_path / f"model{edge}")
+        words = toy_words("mug", "table", channels=8)
+        teacher = build(masks, tmp_path / f"model{edge}", "crop", words, min_area=1, device="cpu")
+        vectors.append(made(teacher, 0).table)
+    np.testing.assert_allclose(vectors[0], vectors[1], atol=1e-6)
+
+
+def test_a_crop_teacher_without_a_joint_space_takes_no_words_beside_one_that_has_some(tmp_path: Path) -> None:
+    for name, make in (("clip", joint_clip), ("vit", plain_vit)):
+        make()[0].save_pretrained(tmp_path / name)
+    config = RegionsConfig(masks="instances", vector="crop", model=str(tmp_path / "vit"))
+    assert not takes_text(config)
+    assert takes_text(replace(config, joint=True))
+    assert takes_text(replace(config, model=str(tmp_path / "clip")))

@@ -18,7 +18,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.images import read_integers
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import map_rows
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import build_teacher, text_table_of, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.regions.captions import read_captions
@@ -206,7 +206,7 @@ def test_missing_label_images_are_counted_and_the_first_is_named(tmp_path: Path)
         ({"c": {"1": "mug"}}, "none of its 1 views is one of the scene, first 'c'; the scene's are 'images/a.jpg', …"),
         ({"a": {"1": "mug"}, "a.png": {}}, "a view is listed twice"),
         ({"2": "mug"}, "none of its captions belongs to one of the 5 regions, whose labels are 1, 7, 9"),
-        ({"a": {"2": "lamp"}}, "view 'images/a.jpg': none of its 1 labels is in its mask, first 2"),
+        ({"a": {"2": "lamp"}}, "none of its captions belongs to one of the"),
     ],
 )
 def test_captions_that_do_not_fit_are_refused_in_one_line(tmp_path: Path, captions: Any, problem: str) -> None:
@@ -316,3 +316,43 @@ def test_label_images_that_were_saved_with_loss_are_refused(tmp_path: Path) -> N
 def test_options_that_would_change_nothing_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         RegionsConfig(**options)
+
+
+def test_captions_that_change_their_labels_and_instances_that_change_have_other_settings(tmp_path: Path) -> None:
+    masks = write_masks(tmp_path)
+    first = build(region_scene(), masks).settings()
+    assert build(region_scene(), masks, {"1": "table", "7": "mug", "9": "lamp"}).settings() != first
+    maps = [labels_of(view).astype(np.int32) for view in (0, 1)]
+    (tmp_path / "captions.json").write_text(json.dumps(CAPTIONS))
+    options = RegionsConfig(masks="instances", captions=str(tmp_path / "captions.json"))
+    whole = build_teacher(options, region_scene(instances=maps), WORDS).settings()
+    assert build_teacher(options, region_scene(instances=maps), WORDS).settings() == whole
+    changed = [np.where(maps[0] == 9, 7, maps[0]).astype(np.int32), maps[1]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)
+        assert build_teacher(options, region_scene(instances=changed), WORDS).settings() != whole
+
+
+def test_captions_of_a_view_are_never_those_of_another_that_ends_alike(tmp_path: Path) -> None:
+    path = tmp_path / "captions.json"
+    path.write_text('{"1": {"1": "mug"}}')
+    captions = read_captions(path, ["1.jpg", "x/1.jpg"])
+    assert captions.of_view("1.jpg") == {1: "mug"}
+    assert captions.of_view("x/1.jpg") == {}
+    alone = read_captions(path, ["x/1.jpg", "x/2.jpg"])
+    assert alone.of_view("x/1.jpg") == {1: "mug"}
+    path.write_text('{"1": {"1": "mug"}, "x/1": {"1": "lamp"}}')
+    with pytest.raises(InputError, match="'1' and 'x/1' are one view, which is listed twice"):
+        read_captions(path, ["x/1.jpg", "x/2.jpg"])
+
+
+def test_a_view_whose_only_region_was_lost_is_reported_and_the_others_are_used(tmp_path: Path) -> None:
+    with pytest.warns(SceneWarning) as caught:
+        teacher = build(region_scene(), write_masks(tmp_path), {"a": CAPTIONS, "b": {"5": "mug"}})
+    assert any("labels are in no pixel" in str(each.message) for each in caught)
+    assert set(teacher.kinds) == {"mug", "table", "lamp"}  # type: ignore[attr-defined]
+
+
+def test_a_scene_without_instance_maps_lacks_an_input() -> None:
+    with pytest.raises(MissingInput, match="the scene has no instance maps"):
+        build_teacher(RegionsConfig(masks="instances"), region_scene(), WORDS)

@@ -339,3 +339,30 @@ def test_weights_beside_the_tower_are_reported_and_change_nothing(models: Path, 
     with pytest.warns(SceneWarning, match=r"1 weights that are no part of the backbone are not used: classifier"):
         made = features(folder)
     np.testing.assert_array_equal(made, features(models / "dinov2"))
+
+
+def test_the_section_of_a_processor_goes_before_a_file_of_its_own_as_in_the_library(models: Path, copied: Any) -> None:
+    other = copied("clip")
+    path = other / "preprocessor_config.json"
+    stated = json.loads(path.read_text())
+    (other / "processor_config.json").write_text(json.dumps({"image_processor": stated}))
+    path.write_text(json.dumps({**stated, "image_mean": [0.1, 0.2, 0.3]}))
+    np.testing.assert_array_equal(features(other), features(models / "clip"))
+
+
+def test_pictures_that_are_not_normalized_have_their_values_as_they_are(copied: Any) -> None:
+    plain = copied("clip")
+    rewrite(plain / "preprocessor_config.json", do_normalize=False)
+    first = features(plain)
+    rewrite(plain / "preprocessor_config.json", do_normalize=True, image_mean=[0.0] * 3, image_std=[1.0] * 3)
+    neutral = features(plain)
+    np.testing.assert_array_equal(first, neutral)
+
+
+def test_another_configuration_of_the_same_weights_has_another_space(models: Path, copied: Any) -> None:
+    other = copied("dinov2")
+    path = other / "config.json"
+    stated = json.loads(path.read_text())
+    path.write_text(json.dumps({**stated, "layer_norm_eps": 1e-3}))
+    spaces = [TransformersTeacher(TransformersConfig(model=str(each))).space for each in (models / "dinov2", other)]
+    assert spaces[0].weights != spaces[1].weights

@@ -15,6 +15,7 @@ from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import load_heads, save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE
+from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
@@ -27,7 +28,7 @@ from gsencoder.train.adapter_heads import (
     render_heads,
     teacher_of_heads,
 )
-from gsencoder.train.dataset_space import views_of_scenes
+from gsencoder.train.dataset_space import sampled_maps, views_of_scenes
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
 
@@ -100,6 +101,24 @@ def test_heads_belong_to_the_one_teacher_that_has_some() -> None:
 def test_maps_are_spread_over_scenes_and_the_first_has_one(scenes: int, views: int, expected: list[int]) -> None:
     counts = views_of_scenes(scenes, views)
     assert counts == expected
+
+
+def test_scenes_that_lack_the_teacher_leave_their_maps_to_the_others() -> None:
+    scenes = [Path(str(number)) for number in range(40)]
+
+    def open_scene(path: Path) -> Any:
+        if int(path.name) % 10 != 3:
+            raise MissingInput("no labels")
+        return ThreeViews(), MapTeacher()
+
+    listed = [path.name for path, _, _ in sampled_maps(scenes, open_scene, 8, optional=True)]
+    assert sorted(listed) == sorted(["3", "13", "23", "33"] * 2)
+    # Four scenes have three views each.
+    assert len(list(sampled_maps(scenes, open_scene, 30, optional=True))) == 12
+    with pytest.raises(MissingInput):
+        list(sampled_maps(scenes, open_scene, 8))
+    with pytest.raises(MissingInput, match="no labels"):
+        list(sampled_maps(scenes[:3], open_scene, 8, optional=True))
 
 
 class Dataset(PreparedDataset):

@@ -160,8 +160,8 @@ def test_processes_with_different_weights_all_stop_and_name_both_digests(tmp_pat
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     subprocess.run([*launcher, str(path)], timeout=120, env=environment, capture_output=True, check=True)
     message = (
-        "InputError: training: the teacher's weights of process 0 are 8a1f, those of process 1 are 77b0; give all "
-        "processes the same files"
+        "InputError: training: the teacher's weights differ: their digest is 8a1f in process 0 and 77b0 in process 1; "
+        "give all processes the same files"
     )
     assert [Path(f"{path}.{rank}").read_text() for rank in (0, 1)] == [message, message]
 

@@ -118,7 +118,7 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
 def test_of_many_scenes_the_latest_used_are_kept_open(
     dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    monkeypatch.setattr("gsencoder.train.samples.MAX_OPEN_SCENES", most)
+    monkeypatch.setattr("gsencoder.train.samples.MAX_OPEN_FILES", most)
     data, used = samples(*dataset), list[str]()
     for number in range(9):
         used.append(data.make(number).name.split(" ")[0])

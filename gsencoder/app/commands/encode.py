@@ -1,6 +1,7 @@
 """`gsencoder encode SPLAT weights=FILE`: features of every Gaussian in one pass, without photographs or a teacher."""
 
 import warnings
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from gsencoder.fusion.store.words import save_tables
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder, file_of_encoder, load_encoder
 from gsencoder.models.output_space import teacher_of_space
-from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,6 +131,8 @@ def _encode_into(
             scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
         )
     by_teacher = {name: by_teacher[name] for name in requested_teachers(encoder, config.spaces)}
+    if config.basis_views and all(each.basis is None for each in by_teacher.values()):
+        raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
     single = len(by_teacher) == 1
     figures = {}
     for name, features in by_teacher.items():
@@ -170,29 +173,25 @@ def _basis_figures(
 ) -> dict[str, int | float]:
     """The figures of a basis, of this scene with `basis_views`, else of the scenes held out of the training."""
     figures = basis_figures(features.basis, features.features.shape[1])
-    if config.basis_views:
-        with summary.step("basis"):
-            return figures | _figures_of_scene(scene, name, features, encoder, config.basis_views)
+    if config.basis_views and features.basis is not None:
+        with summary.step("basis"), about(f"teacher {name}") if len(encoder.spaces) > 1 else nullcontext():
+            return figures | _figures_of_scene(scene, name, features.basis, encoder, config.basis_views)
     stored = encoder.made_by.get("basis", {})
     stored = stored.get(name, stored)
     return figures | {key: value for key, value in stored.items() if key.startswith("other_")}
 
 
-def _figures_of_scene(
-    scene: Scene, name: str, features: GaussianFeatures, encoder: Encoder, count: int
-) -> dict[str, float]:
+def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Encoder, count: int) -> dict[str, float]:
     """How well the encoder's basis represents its teacher's maps of some of a scene's views.
 
     Raises:
-        InputError: the encoder has no basis, the scene no views, or the teacher is not known or cannot be loaded.
+        InputError: the scene has no views, or the teacher is not known or cannot be loaded.
     """
     # Teachers need torch, which encoding with an exported graph does without.
     from gsencoder.fusion.basis_fit import basis_fit
     from gsencoder.fusion.teachers.build import build_teacher, words_by_teacher
     from gsencoder.train.prepare_scenes import SourceConfig
 
-    if features.basis is None:
-        raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
     if scene.views is None:
         raise InputError("basis_views: the scene has no views in which the teacher could be run; leave it out")
     made_with = encoder.made_by.get("settings", {})
@@ -203,4 +202,4 @@ def _figures_of_scene(
     teachers = source.teachers_by_name
     only = next(iter(teachers)) if len(teachers) == 1 else name
     teacher = build_teacher(teachers[only], scene, words_by_teacher(teachers, source.text).get(only))
-    return basis_fit(features.basis, teacher, scene.views, count).figures()
+    return basis_fit(basis, teacher, scene.views, count).figures()

@@ -95,10 +95,12 @@ def run(config: ExportConfig, summary: Summary) -> None:
     assert config.out is not None
     if config.out.suffix.lower() != SUFFIX:
         raise InputError(f"out: expected a file that ends in {SUFFIX}, got {config.out.name}")
-    refuse_existing(config.out, config.overwrite)
+    for path in (config.out, Path(f"{config.out}.summary.json"), heads_of_graph(config.out)):
+        refuse_existing(path, config.overwrite)
     track = Progress(quiet=config.quiet)
     with summary.step("load"):
         encoder = TorchEncoder(config.weights)
+        heads = heads_beside(file_of_encoder(config.weights))
         clouds = [Cloud(f"{size} random Gaussians", random_cloud(size, encoder.voxel)) for size in config.sizes]
         scenes = _scenes(config, encoder.voxel)
     screen = console(config.quiet)
@@ -136,7 +138,6 @@ def run(config: ExportConfig, summary: Summary) -> None:
         **space_figures(encoder),
     )
     write_json(f"{config.out}.summary.json", summary.to_dict())
-    heads = heads_beside(file_of_encoder(config.weights))
     if heads is None:
         # Those of a file that was replaced.
         heads_of_graph(config.out).unlink(missing_ok=True)

@@ -155,8 +155,8 @@ def check_head_words(head: Head, words: Words, tower: TextTower | None) -> None:
     if not isinstance(tower, TransformersTower):
         return
     kind = text_kind(tower.model_type)
-    # SigLIP2 models of one resolution are SigLIP models for transformers.
-    if kind.removesuffix("2") != head.text.removesuffix("2"):
+    # SigLIP2 models of one resolution are SigLIP models for transformers, but no SigLIP model is one of SigLIP2.
+    if kind != head.text and (head.text, kind) != ("siglip2", "siglip"):
         raise InputError(
             f"{name} leads to a {head.text} model, and {described} are those of a {tower.model_type} model; give the "
             "text side of the model that the head leads to"

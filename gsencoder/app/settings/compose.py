@@ -262,17 +262,22 @@ def _members_of(key: str, value: str, group: str, members: Sequence[str]) -> lis
     Raises:
         InputError: an unknown member, or a name that is given twice.
     """
-    words = [word.strip() for word in value.removeprefix("[").removesuffix("]").split(",") if word.strip()]
-    pairs = [(word.partition(":")[0], word.partition(":")[2] or word) for word in words]
+    pairs = _named_members(value)
     names = [name for name, _ in pairs]
     for name, member in pairs:
         if member not in members:
             raise InputError(f"{key}: expected some of {', '.join(members)}, got {member!r}{near(member, members)}")
         if names.count(name) > 1:
             raise InputError(f"{key}: {name} is given twice; give other names, such as {name}_2:{member}")
-        if not re.fullmatch(r"\w+", name):
+        if not re.fullmatch(r"\w+", name, re.ASCII):
             raise InputError(f"{key}: expected names of letters, digits and _, got {name!r}")
     return [f"+{group}@{key}.{name}={member}" for name, member in pairs]
+
+
+def _named_members(value: str) -> list[tuple[str, str]]:
+    """The names and members of a list such as [labels,dino:onnx]; a member without a name has its own."""
+    words = [word.strip() for word in value.removeprefix("[").removesuffix("]").split(",") if word.strip()]
+    return [(word.partition(":")[0], word.partition(":")[2] or word) for word in words]
 
 
 def _is_list(option: Option) -> bool:
@@ -295,7 +300,12 @@ def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) ->
             return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
         if key not in choices.options:
             section, _, name = key.rpartition(".")[0].partition(".")
-            return f"{key}: there is no {name} among the {section} of this run; {section}= names them"
+            member = dict(_named_members(given.get(section, ""))).get(name)
+            if member is None:
+                return f"{key}: there is no {name} among the {section} of this run; {section}= names them"
+            owners = choices.members.get(f"{section.removesuffix('s')}.{key.rpartition('.')[2]}")
+            whose = " and ".join(owners) if owners else "none of them"
+            return f"{key}: is an option of {whose}, and {name} is {section.removesuffix('s')}={member}"
         section = key.rpartition(".")[0]
         group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
         now = given.get(group, choices.chosen.get(group))

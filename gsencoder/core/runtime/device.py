@@ -1,4 +1,7 @@
-"""The device and the floating-point type that an encoder computes in."""
+"""The device and the floating-point type that networks compute in."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -40,3 +43,29 @@ def autocast_dtype(precision: Precision, device: torch.device) -> torch.dtype | 
     if device.type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else None
     return torch.bfloat16 if torch.cpu._is_amx_tile_supported() else None
+
+
+def teacher_autocast(device: str) -> torch.autocast:
+    """The context in which a teacher runs: bfloat16 on GPUs that compute in it, float32 elsewhere.
+
+    On a CPU its maps are those of its library.
+    """
+    dtype = autocast_dtype("auto", torch.device(device)) if device == "cuda" else None
+    return torch.autocast(device, dtype or torch.bfloat16, enabled=dtype is not None)
+
+
+@contextmanager
+def enough_memory(what: str, remedy: str) -> Iterator[None]:
+    """Turns a lack of GPU memory into an error that says what needs less.
+
+    Args:
+        what: who computes, for the message.
+        remedy: the option that makes it need less.
+
+    Raises:
+        InputError: the GPU has not enough memory.
+    """
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise InputError(f"{what}: the GPU has not enough memory; lower {remedy} or give teacher.device=cpu") from error

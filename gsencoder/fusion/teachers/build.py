@@ -14,6 +14,7 @@ from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.fusion.teachers.regions.build import build_regions
 from gsencoder.fusion.teachers.regions.captioned import CaptionedRegions
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
+from gsencoder.fusion.teachers.regions.crops import is_joint
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
@@ -84,7 +85,8 @@ def takes_text(config: TeacherConfig) -> bool:
     if isinstance(config, TransformersConfig):
         return config.dense in ("values", "summary")
     if isinstance(config, RegionsConfig):
-        return config.vector != "map" or config.joint
+        crop = config.vector == "crop" and bool(config.model)
+        return config.vector == "captions" or config.joint or (crop and is_joint(config.model))
     return isinstance(config, (LabelsConfig, SegmenterConfig)) or (isinstance(config, OnnxConfig) and config.joint)
 
 
@@ -138,7 +140,9 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
         _check_channels(tower, words)
         return tower
     if isinstance(config, RadioConfig):
-        return RadioTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
+        radio = RadioTeacher(config, text_encoder=words.space.text_encoder if words is not None else "")
+        _check_channels(radio, words)
+        return radio
     if isinstance(config, SegmenterConfig):
         if words is None:
             raise InputError(

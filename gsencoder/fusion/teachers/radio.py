@@ -74,7 +74,7 @@ class RadioTeacher:
         self._model, self._device, self.config = model.to(device), device, config
         self._digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("config.json")]))
         self.space = FeatureSpace(
-            name=f"radio-{folder.name}",
+            name=f"radio-{folder.resolve().name}",
             channels=model.config.hidden_size,
             teacher="radio",
             weights=self._digest,
@@ -92,13 +92,14 @@ class RadioTeacher:
         """
         import torch
 
+        from gsencoder.core.runtime.device import enough_memory, teacher_autocast
+
         if views.images is None:
             raise MissingInput("teacher radio: the scene has no pictures")
         patch = self._model.config.patch_size
         resized, grid_from_image = fit_to_patches(views.images[view], self.config.size, patch)
         pixels = torch.from_numpy(resized.astype(np.float32) / 255).permute(2, 0, 1)[None].to(self._device)
-        bfloat16 = self._device == "cuda"
-        with torch.inference_mode(), torch.autocast(self._device, torch.bfloat16, enabled=bfloat16):
+        with torch.inference_mode(), teacher_autocast(self._device), enough_memory(WHAT, "teacher.size="):
             features = self._model(pixel_values=pixels).features[0].float().cpu().numpy()
         if not np.isfinite(features).all():
             raise InputError(f"teacher radio: features of view {views.names[view]!r} are not finite; check the weights")

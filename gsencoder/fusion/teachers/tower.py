@@ -129,6 +129,7 @@ class TransformersTeacher:
         """
         import torch
 
+        from gsencoder.core.runtime.device import enough_memory, teacher_autocast
         from gsencoder.fusion.teachers.windows import map_in_windows
 
         if views.images is None:
@@ -136,8 +137,7 @@ class TransformersTeacher:
         network = self._network
         fitted, grid_from_image = self._preprocessing.fit(views.images[view], self._size, network.patch)
         pixels = torch.from_numpy(np.ascontiguousarray(fitted)).to(self._device)
-        bfloat16 = self._device == "cuda"
-        with torch.inference_mode(), torch.autocast(self._device, torch.bfloat16, enabled=bfloat16):
+        with torch.inference_mode(), teacher_autocast(self._device), enough_memory(WHAT, "teacher.size="):
             if self.config.large == "windows":
                 cells = map_in_windows(network, pixels, network.patch, network.native, self.config.overlap)
             else:

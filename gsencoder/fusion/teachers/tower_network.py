@@ -72,7 +72,7 @@ class VisionTower(nn.Module):
             projects = "WithProjection" if self._head == "projection" else ""
             loader = getattr(transformers, self._kind.loader + projects)
             others = "warn" if tower.alone else "ignore"
-            self._model = load_pretrained(loader, folder, WHAT, other_parts=others, config=config, dtype=torch.float32)
+            self._model = load_pretrained(loader, folder, WHAT, other_parts=others, config=config)
         self.digest = digest_files(folder / "config.json", *files)
         self.patch = _side(config.patch_size)
         # SigLIP2 with pictures of any shape states a number of patches instead.

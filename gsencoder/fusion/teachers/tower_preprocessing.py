@@ -12,8 +12,8 @@ from PIL import Image
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.teachers.resize import fit_to_patches, normalized, patches_of
 
-FILES = ("preprocessor_config.json", "processor_config.json")
-"""Where it is stated: alone, or in the section `image_processor` of a processor's file."""
+FILES = ("processor_config.json", "preprocessor_config.json")
+"""Where it is stated: in the section `image_processor` of a processor's file, which transformers prefers, or alone."""
 FLOAT_FILTERS = {Image.Resampling.BILINEAR: "bilinear", Image.Resampling.BICUBIC: "bicubic"}
 
 
@@ -115,7 +115,7 @@ def _stated(folder: Path, what: str) -> tuple[Path, dict[str, Any]]:
             continue
         except (OSError, ValueError) as error:
             raise InputError(f"{what}: {path}: cannot be read: {error}") from error
-        section = stated.get("image_processor") if isinstance(stated, dict) and path.name == FILES[1] else stated
+        section = stated.get("image_processor") if isinstance(stated, dict) and path.name == FILES[0] else stated
         if isinstance(section, dict):
             return path, section
     raise InputError(

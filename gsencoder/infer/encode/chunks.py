@@ -45,7 +45,7 @@ class Chunk:
     """A part of a scene.
 
     Attributes:
-        own: rows whose features come from this chunk.
+        core_rows: rows whose features come from this chunk.
         rows: what the network sees, `core_rows` first.
     """
 

@@ -15,6 +15,7 @@ from gsencoder.fusion.teachers.regions.sam import SamMasks
 from gsencoder.fusion.teachers.regions.vectors import MapVectors, PicturedRegions, RegionVectors
 from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
 from gsencoder.text.build import Words
+from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.types import Scene
 
 RegionsTeacher = CaptionedRegions | PicturedRegions
@@ -87,7 +88,13 @@ def _vectors(config: RegionsConfig, words: Words | None) -> RegionVectors:
         )
     text_encoder = words.space.text_encoder if words is not None else ""
     if config.vector == "map":
-        return MapVectors(dense_teacher(config, text_encoder))
+        dense = dense_teacher(config, text_encoder)
+        if isinstance(words, OpenVocabulary) and isinstance(dense, TransformersTeacher) and not dense.joint:
+            raise InputError(
+                f"text=: no words lead into {dense.space.layer} of {dense.space.name}; leave out text=, or give a "
+                "text-aligned model (CLIP, SigLIP, SigLIP2) with its head"
+            )
+        return MapVectors(dense)
     tower: ImageTower
     if config.model.lower().endswith(".onnx"):
         tower = OnnxImageTower(find_file(config.model, "teacher.model"), config.onnx)

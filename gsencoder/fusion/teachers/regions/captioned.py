@@ -81,11 +81,6 @@ class CaptionedRegions:
             used |= {captions[label] for label in labels.tolist() if label in captions}
             bare += [label for label in labels.tolist() if label not in captions]
             absent = sorted(set(captions) - set(labels.tolist())) if self._captions.by_view is not None else []
-            if absent and len(absent) == len(captions):
-                raise InputError(
-                    f"teacher regions: {self._captions.source}: view {name!r}: none of its {len(captions)} labels is "
-                    f"in its mask, first {absent[0]}; captions and masks must belong together"
-                )
             lost += [f"{name}: {label}" for label in absent]
         if not regions:
             raise InputError(

@@ -20,7 +20,7 @@ class Captions:
 
     Attributes:
         shared: for all views; None where each view has its own.
-        by_view: by the view's name without its ending.
+        by_view: by the view's whole name without its ending.
         source: for messages.
     """
 
@@ -33,8 +33,7 @@ class Captions:
         if self.shared is not None:
             return self.shared
         assert self.by_view is not None
-        stem = view_stem(name)
-        return next((self.by_view[key] for key in (str(stem), stem.name) if key in self.by_view), {})
+        return self.by_view.get(str(view_stem(name)), {})
 
 
 def captions_of_objects(objects: Sequence[SceneObject]) -> Captions:
@@ -82,7 +81,12 @@ def read_captions(path: Path, view_names: Sequence[str]) -> Captions:
     double = sorted({end for end in ends if ends.count(end) > 1 and end in by_view} - {str(stem) for stem in stems})
     if double:
         raise InputError(f"{path}: {double[0]!r} stands for {ends.count(double[0])} views; write their whole names")
-    if not any(str(stem) in by_view or stem.name in by_view for stem in stems):
+    unique = {stem.name: str(stem) for stem in stems if ends.count(stem.name) == 1}
+    both = sorted(end for end, whole in unique.items() if end != whole and end in by_view and whole in by_view)
+    if both:
+        raise InputError(f"{path}: {both[0]!r} and {unique[both[0]]!r} are one view, which is listed twice")
+    by_view = {unique.get(view, view): captions for view, captions in by_view.items()}
+    if not any(str(stem) in by_view for stem in stems):
         raise InputError(
             f"{path}: none of its {len(by_view)} views is one of the scene, first {next(iter(data))[:40]!r}; the "
             f"scene's are {view_names[0]!r}, …"

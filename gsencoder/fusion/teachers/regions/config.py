@@ -103,8 +103,8 @@ class RegionsConfig:
     joint: bool = field(
         default=False,
         metadata={
-            "help": "the image tower is the image side of the joint model that text= is the text side of; a folder of "
-            "CLIP or SigLIP says so itself"
+            "help": "the image tower is the image side of the joint model that text= is the text side of; with "
+            "vector=crop a folder of CLIP or SigLIP says so itself"
         },
     )
     around: Literal["picture", "nothing"] = field(

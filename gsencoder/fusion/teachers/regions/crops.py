@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files
+from gsencoder.core.files.model_files import digest_files, find_file
 from gsencoder.core.onnx_session import choose_tensors, open_session, run_on_picture
 from gsencoder.core.pretrained import load_companion, load_pretrained, quiet_transformers, read_config
 from gsencoder.core.runtime.device_names import Device
@@ -217,9 +217,10 @@ class TransformersImageTower:
         model = load_pretrained(getattr(transformers, loader), folder, WHAT, other_parts=other, **options)
         with quiet_transformers():
             self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
+        self._uncut = _without_cropping(self._processor)
         self._device = choose_device(device)
         self._model = model.to(self._device)
-        self.name, self.preprocessing = folder.resolve().name, "the model's own, of a square"
+        self.name, self.preprocessing = folder.resolve().name, "the model's own, of a whole square"
         self.digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("*.json")]))
         self.gray = _gray([255 * value for value in getattr(self._processor, "image_mean", None) or (0.5, 0.5, 0.5)])
         self.channels = len(self.embed(np.zeros((32, 32, 3), np.uint8)))
@@ -232,10 +233,12 @@ class TransformersImageTower:
         """
         import torch
 
+        from gsencoder.core.runtime.device import enough_memory
+
         with quiet_transformers():
-            inputs = self._processor(images=Image.fromarray(picture), return_tensors="pt")
+            inputs = self._processor(images=Image.fromarray(picture), return_tensors="pt", **self._uncut)
         try:
-            with torch.inference_mode():
+            with torch.inference_mode(), enough_memory(WHAT, "the size of the model"):
                 outputs = self._model(**{name: value.to(self._device) for name, value in inputs.items()})
         except (RuntimeError, ValueError) as error:
             message = " ".join(str(error).split())[:160]
@@ -250,6 +253,27 @@ class TransformersImageTower:
                 "or another model with one, or vector=map for a dense one"
             )
         return np.asarray(pooled[0].flatten().float().cpu())
+
+
+def is_joint(model: str) -> bool:
+    """Whether the configuration of a folder says that it is the image side of a joint model.
+
+    Raises:
+        InputError: there is no such folder, or transformers cannot read its configuration.
+    """
+    if model.lower().endswith(".onnx"):
+        return False
+    stated = read_config(find_file(model, "teacher.model", folder=True), WHAT)
+    kind = stated.model_type.removesuffix("_vision_model")
+    return kind in JOINT_IMAGE and kind in JOINT
+
+
+def _without_cropping(processor: Any) -> dict[str, Any]:
+    """Options by which a processor gives the whole of a square the size that it would cut out of a larger one."""
+    crop = getattr(processor, "crop_size", None)
+    if not getattr(processor, "do_center_crop", False) or crop is None or crop["height"] != crop["width"]:
+        return {}
+    return {"do_center_crop": False, "size": {"shortest_edge": crop["height"]}}
 
 
 def _gray(values: Sequence[float]) -> tuple[int, int, int]:

@@ -1,5 +1,6 @@
 """Masks of regions: for each pixel of a view the number of its region, from files or from the scene's instance maps."""
 
+import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -51,13 +52,14 @@ class InstanceMasks:
         """Checks that there are some.
 
         Raises:
-            InputError: there are none.
+            MissingInput: there are none.
         """
         if scene.views is None or scene.views.instances is None:
-            raise InputError(
+            raise MissingInput(
                 "teacher regions: masks=instances: the scene has no instance maps (instance_file_path in "
                 "transforms.json); give label images with masks=files teacher.folder="
             )
+        self._instances = scene.views.instances
 
     def labels(self, views: Views, view: int) -> Int32[np.ndarray, "H W"]:
         """The instance map of a view.
@@ -70,7 +72,10 @@ class InstanceMasks:
         return views.instances[view]
 
     def settings(self) -> dict[str, Any]:
-        return {"masks": "instances"}
+        digest = hashlib.sha256()
+        for labels in self._instances:
+            digest.update(repr(labels.shape).encode() + np.ascontiguousarray(labels).tobytes())
+        return {"masks": "instances", "labels": digest.hexdigest()[:16]}
 
 
 class FileMasks:

@@ -5,10 +5,8 @@ whose stability are large enough; of two that overlap too much the one with the 
 overlaps, as a mug and the table under it, is painted with the smaller mask on top.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,7 @@ from gsencoder.core.pretrained import load_companion, load_pretrained, read_conf
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.fusion.teachers.resize import normalized
+from gsencoder.fusion.teachers.tower_preprocessing import read_preprocessing
 from gsencoder.types import Views
 
 WHAT = "teacher regions"
@@ -97,7 +96,8 @@ class SamMasks:
             self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
         else:
             self._side = int(model.config.prompt_encoder_config.image_size)
-            self._mean, self._std = _colors_of(folder)
+            # The preprocessing of SAM2 in transformers needs torchvision: a squeeze to a square, and these colors.
+            self._colors = read_preprocessing(folder, WHAT)
         self._device = choose_device(config.device)
         self._model = model.to(self._device)
         self._digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("*.json")]))
@@ -127,11 +127,13 @@ class SamMasks:
         """
         import torch
 
+        from gsencoder.core.runtime.device import enough_memory
+
         prepared = self._prepare(image)
         size = image.shape[0], image.shape[1]
         points = grid_points(self.config.points) * np.array([prepared.columns, prepared.rows], np.float32)
         proposals = []
-        with torch.inference_mode():
+        with torch.inference_mode(), enough_memory(WHAT, "teacher.points="):
             embeddings = self._model.get_image_embeddings(prepared.tensor)
             for start in range(0, len(points), POINTS_AT_ONCE):
                 chunk = torch.from_numpy(points[start : start + POINTS_AT_ONCE]).to(self._device)
@@ -160,7 +162,8 @@ class SamMasks:
             return _Input(tensor=inputs["pixel_values"].to(self._device), rows=rows, columns=columns)
         side = self._side
         squeezed = np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR))
-        values = normalized(squeezed, 255.0, self._mean, self._std).transpose(2, 0, 1)[None]
+        colors = self._colors
+        values = normalized(squeezed, 1 / colors.factor, colors.mean, colors.std).transpose(2, 0, 1)[None]
         return _Input(tensor=torch.from_numpy(np.ascontiguousarray(values)).to(self._device), rows=side, columns=side)
 
     def _logits_of_picture(self, logits: Any, prepared: _Input, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
@@ -234,20 +237,3 @@ def paint(proposals: Sequence[Proposal], size: tuple[int, int]) -> Int32[np.ndar
     for label, proposal in enumerate(sorted(proposals, key=lambda each: -each.area), start=1):
         labels[proposal.box][proposal.pixels] = label
     return labels
-
-
-def _colors_of(folder: Path) -> tuple[list[float], list[float]]:
-    """Mean and std of colors in [0, 1] that a folder's preprocessing states; that of SAM2 in transformers needs
-    torchvision, so that it is computed here: a squeeze to a square, and these."""
-    path = folder / "preprocessor_config.json"
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        mean, std = ([float(value) for value in values[name]] for name in ("image_mean", "image_std"))
-        if len(mean) != 3 or len(std) != 3 or not min(std) > 0:
-            raise ValueError(f"image_mean {mean}, image_std {std}")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{WHAT}: {folder} holds no preprocessing that can be read (preprocessor_config.json with image_mean and "
-            f"image_std): {str(error)[:80]}"
-        ) from error
-    return mean, std
