@@ -168,6 +168,8 @@ def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pyt
         (["teacher=[palette,palette]"], "palette is given twice; give other names, such as palette_2:palette"),
         (["teacher=[palette,p/2:palette]"], "expected names of letters, digits and _, got 'p/2'"),
         (["teacher=[palette,labels]", "teachers.radio.size=3"], "teachers.radio.size: there is no radio among"),
+        (["teacher=[palette,labels]", "teachers.labels.size=3"], "and labels is teacher=labels"),
+        (["teacher=palette", "loss.contrast_weight=1", "loss.field_weight=0", "loss.render_weight=0"], "no classes"),
         (["teacher=[palette,labels]", words, "loss.teacher_weights=[1.0]"], "loss.teacher_weights: expected 2 numbers"),
         (["teacher=[palette,other:palette]"], "teachers: palette and other have the same features"),
         (["teacher=[palette,labels]", "teacher.words=x"], "teacher.words: is for a single teacher, and teachers="),

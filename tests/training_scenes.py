@@ -128,7 +128,7 @@ def samples(dataset: PreparedDataset, names: Sequence[str], **changes: Any) -> S
     return SampleDataset(scenes, SampleRecipe(**{**recipe, **changes}))
 
 
-def small_encoder(channels: int = 4) -> GaussianEncoder:
+def small_encoder(channels: int | Sequence[int] = 4) -> GaussianEncoder:
     """The same parameters every time."""
     import torch
 

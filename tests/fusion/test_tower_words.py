@@ -24,8 +24,8 @@ from gsencoder.fusion.store.folder import load_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of, words_of
 from gsencoder.fusion.teachers.tower import TransformersConfig
 from gsencoder.text import open_vocabulary
-from gsencoder.text.build import TextConfig
-from gsencoder.text.table import make_text_table, save_text_table
+from gsencoder.text.build import TextConfig, vocabulary_of, words_of_table
+from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.text.transformers_tower import TransformersTextConfig
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -209,3 +209,15 @@ def test_a_fusion_that_cannot_be_is_refused_in_one_line(
 ) -> None:
     line = refusal(capsys, "fuse", str(room), "teacher=transformers", *words, f"out={tmp_path / 'out'}")
     assert message in line
+
+
+def test_a_tower_that_was_told_to_lower_phrases_is_found_again(
+    save_joint: SaveJoint, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder = save_joint("siglip", "models/joint")
+    monkeypatch.setenv("GSENCODER_MODELS", str(folder.parent))
+    for lower in ("yes", "no"):
+        words = vocabulary_of(TransformersTextConfig(model=str(folder), lower=lower))  # type: ignore[arg-type]
+        save_text_table(tmp_path / f"{lower}.safetensors", words.table)
+        again = words_of_table(load_text_table(tmp_path / f"{lower}.safetensors"))
+        np.testing.assert_array_equal(again.encode(["wooden mug"]), words.encode(["wooden mug"]))

@@ -125,7 +125,7 @@ def test_a_unit_that_is_not_positive_is_refused(unit: float) -> None:
 def test_an_encoder_that_overflows_is_told_of() -> None:
     network = encoder()
     with torch.no_grad():
-        network.head.weight.fill_(3e38)
+        network.head_norm.weight.fill_(3e38)
     with pytest.raises(InputError, match="features are not finite"):
         encode(random_gaussians(20), network, OUTPUTS, WHOLE)
 

@@ -173,7 +173,7 @@ def test_a_resumed_run_has_the_same_bits(datasets: Datasets, tmp_path: Path) -> 
         else:
             with pytest.raises(KeyboardInterrupt):
                 trainer.run(_stop_at(4))
-        return encoder.head.weight.detach().clone()
+        return encoder.head_norm.weight.detach().clone()
 
     straight = run(_made(tmp_path / "straight"))
     run(_made(tmp_path / "killed"), range(4))
@@ -219,20 +219,34 @@ def test_a_teacher_of_weight_zero_changes_nothing_but_its_own_columns(datasets: 
     weightless = joint(datasets, {"heights": 0.0})
     names = Distillation(small_encoder(8), LOSSES, weightless.recipe.teachers).lambdas
     assert all(name.startswith("sides/") for name in names)
-    before = small_encoder(8).head.weight[4:].detach().clone()
-    encoder = small_encoder(8)
+    encoder = small_encoder([4, 4])
+    own = encoder.head.of_teacher[1]  # type: ignore[index, union-attr]
+    before = [parameter.detach().clone() for parameter in own.parameters()]
     config = replace(SHORT, steps=2, weight_decay=0.0)
     Trainer(encoder, weightless, LOSSES, config, folder=tmp_path, settings={}).run()
-    assert torch.equal(encoder.head.weight[4:], before)
+    assert all(torch.equal(old, new) for old, new in zip(before, own.parameters(), strict=True))
 
 
 def test_a_run_goes_on_only_with_its_teachers_in_their_order(datasets: Datasets) -> None:
     config = TrainConfig(teachers={"sides": PaletteConfig(), "heights": PaletteConfig()})
     opened = {name: dataset for name, (dataset, _) in datasets.items()}
     turned = {name: opened[name] for name in reversed(opened)}
-    first, second = (resume_settings(config, ProcessRank(), each) for each in (opened, turned))
+    first, second = (resume_settings(config, ProcessRank(), each, ["wall_0"]) for each in (opened, turned))
     assert first != second
     assert first_difference(first, second).startswith("teachers=['sides', 'heights'], and this run asks teachers=['hei")
+    assert first != resume_settings(config, ProcessRank(), opened, ["wall_0", "wall_1"])
+
+
+def test_names_that_a_scene_to_train_on_has_gained_need_other_prepared_scenes(datasets: Datasets) -> None:
+    class Named(HeightTeacher):
+        kinds = ("mug", "teapot")
+
+    dataset = PreparedDataset(datasets["sides"][0].folder)
+    dataset.load_kinds = lambda: ("mug",)  # type: ignore[method-assign]
+    with pytest.raises(InputError, match="the classes of this dataset lack teapot, since the scene has changed"):
+        dataset.check_kinds(Named())
+    dataset.load_kinds = lambda: ("teapot", "mug")  # type: ignore[method-assign]
+    dataset.check_kinds(Named())
 
 
 def test_classes_are_counted_again_when_a_scene_gains_the_teacher(tmp_path: Path) -> None:

@@ -196,6 +196,9 @@ def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, 
     trainer(dataset, tmp_path).run()
     with pytest.raises(InputError, match=r"was made with run=1, and this run asks run=2"):
         Trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
+    for key, message in (("samples_per_step", "a step had None samples, and this run has 4"), ("space", "changed")):
+        with pytest.raises(InputError, match=message):
+            Trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 1, key: 4})
 
 
 @pytest.mark.parametrize(
@@ -300,7 +303,7 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
 
 def test_a_gradient_that_is_not_finite_stops_the_run_too(dataset: Prepared, tmp_path: Path) -> None:
     one = trainer(dataset, tmp_path)
-    one.encoder.head.weight.register_hook(lambda gradient: gradient * float("inf"))
+    one.encoder.head_norm.weight.register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(InputError, match="the gradient of wall_"):
         one.run()
 
@@ -313,7 +316,7 @@ def test_what_was_done_before_a_step_that_is_not_finite_is_kept(dataset: Prepare
         calls.append(1)
         return gradient * (float("nan") if len(calls) == 4 else 1.0)
 
-    one.encoder.head.weight.register_hook(spoil)
+    one.encoder.head_norm.weight.register_hook(spoil)
     with pytest.raises(InputError, match="not finite at step 3; parameters were not changed"):
         one.run()
     assert steps_in(tmp_path) == 3
