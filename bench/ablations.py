@@ -1,7 +1,7 @@
 """The ablations that the papers report, on the house scenes: short trainings that differ in one setting each.
 
     python bench/ablations.py HOUSE --prepared outputs/house_cpu.prepared [--out outputs/ablations] [--only render]
-                                    [--steps 1000] [--processes 2]
+                                    [--settings 'all cells'] [--seeds 0] [--steps 1000] [--processes 2]
 
 Every training is `experiment=house_cpu` but for its steps and what is listed below; `recipe` is what the others are
 held against. A training that is in OUT already is not done again, so that the table grows over several calls. `letter`
@@ -133,17 +133,19 @@ def main() -> None:
     parser.add_argument("--out", default="outputs/ablations")
     parser.add_argument("--only", default="", help="groups, separated by commas")
     parser.add_argument("--settings", default="", help="settings of these groups, separated by commas; empty = all")
+    parser.add_argument("--seeds", default="", help="seeds, separated by commas; empty = all")
     parser.add_argument("--prepare-only", action="store_true", help="prepare the scenes that are missing, and stop")
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
     chosen = arguments.only.split(",") if arguments.only else list(GROUPS)
     settings = arguments.settings.split(",") if arguments.settings else []
+    seeds = arguments.seeds.split(",") if arguments.seeds else []
     rows = [
         (group, name, overrides)
         for group in chosen
         for name, overrides in GROUPS[group].items()
-        if not settings or name.split(", seed")[0] in settings
+        if (not settings or name.split(", seed")[0] in settings) and (not seeds or name.rpartition(" ")[2] in seeds)
     ]
     if arguments.prepare_only:
         prepare(arguments, [overrides for _, _, overrides in rows])
