@@ -169,7 +169,6 @@ def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pyt
         (["teacher=[palette,p/2:palette]"], "expected names of letters, digits and _, got 'p/2'"),
         (["teacher=[palette,labels]", "teachers.radio.size=3"], "teachers.radio.size: there is no radio among"),
         (["teacher=[palette,labels]", "teachers.labels.size=3"], "and labels is teacher=labels"),
-        (["teacher=palette", "loss.contrast_weight=1", "loss.field_weight=0", "loss.render_weight=0"], "no classes"),
         (["teacher=[palette,labels]", words, "loss.teacher_weights=[1.0]"], "loss.teacher_weights: expected 2 numbers"),
         (["teacher=[palette,other:palette]"], "teachers: palette and other have the same features"),
         (["teacher=[palette,labels]", "teacher.words=x"], "teacher.words: is for a single teacher, and teachers="),
@@ -178,6 +177,8 @@ def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pyt
         (["teacher=[palette,x:onnx]"], "teacher.model= is missing"),
     ):
         assert message in refusal(capsys, *train, *more), more
+    alone = ["teacher=palette", "loss.contrast_weight=1", "loss.field_weight=0", "loss.render_weight=0"]
+    assert "L_contrast has no classes" in refusal(capsys, *train[:-1], *alone, f"prepared={tmp_path / 'alone'}")
     fresh = [f"out={tmp_path / 'out'}", f"prepared={tmp_path / 'fresh'}"]
     line = refusal(capsys, "train", str(rooms / "room_1"), *QUICK[2:], "teacher=[labels,palette]", words, *fresh)
     assert "the scene lists no objects" in line

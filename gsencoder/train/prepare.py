@@ -154,7 +154,9 @@ class PreparedDataset:
         arrays, header = output_space_parts(space.outputs)
         if space.codebook is not None:
             arrays["codebook"] = space.codebook
-        write_archive(self.folder / SPACE_FILE, arrays, {**header, "kinds": list(space.kinds)})
+        # Another run that prepares the same scenes may have stored a space in the meantime, and scenes in it.
+        if not (self.folder / SPACE_FILE).is_file():
+            write_archive(self.folder / SPACE_FILE, arrays, {**header, "kinds": list(space.kinds)})
 
     def fingerprint(self) -> str:
         """A hash of the output space, by which a resumed training checks that its targets are the same."""

@@ -169,7 +169,13 @@ def prepare_scenes(
         assigned: Iterable[Path] = track(share, "preparing scenes")
         for path in assigned:
             trained = path in training
-            _prepare_scene(path, missing[path], datasets, reader, config.prepare, trained=trained, optional=several)
+            try:
+                _prepare_scene(path, missing[path], datasets, reader, config.prepare, trained=trained, optional=several)
+            except InputError as error:
+                # The error is raised when all processes have ended their shares, which may take hours.
+                if process.world_size > 1:
+                    warnings.warn(f"process {process.rank} stops: {error}", SceneWarning, stacklevel=2)
+                raise
     with fail_together():
         if process.is_first:
             _check_teachers(datasets, training, held_out)
@@ -224,13 +230,25 @@ def _prepare_scene(
 
     With `optional` those are left out for which it lacks something.
     """
-    scene = reader.with_gaussians(path)
-    for name in names:
-        with about(path):
+    with about(path):
+        scene, teachers = reader.load(path), dict[str, Teacher]()
+        for name in names:
             try:
                 teacher = reader.teacher(name, scene)
-                if trained:
-                    datasets[name].check_kinds(teacher)
+                # Known before Gaussians are made, which takes minutes where they come from photographs.
+                if teacher.needs_images and scene.views is not None and scene.views.images is None:
+                    raise MissingInput(f"teacher {name}: the scene has no pictures")
+                teachers[name] = teacher
+            except MissingInput:
+                if not optional:
+                    raise
+        if not teachers:
+            return
+        scene = reader.with_gaussians(scene, path)
+        for name, teacher in teachers.items():
+            if trained:
+                datasets[name].check_kinds(teacher)
+            try:
                 datasets[name].prepare(scene, teacher, config, source=path)
             except MissingInput:
                 if not optional:
@@ -283,13 +301,13 @@ class _SceneReader:
     def with_views(self, name: str, path: Path) -> tuple[Scene, Teacher]:
         """A scene with views, which is enough for maps, and the teacher of this name."""
         with about(path):
-            scene = self._load(path)
+            scene = self.load(path)
             return scene, self.teacher(name, scene)
 
     def weights_of_teachers(self, path: Path) -> dict[str, str]:
         """The digests of the weights of the teachers that a scene has, by their names."""
         with about(path):
-            scene, weights = self._load(path), dict[str, str]()
+            scene, weights = self.load(path), dict[str, str]()
             for name in self.config.teachers_by_name:
                 try:
                     weights[name] = self.teacher(name, scene).space.weights
@@ -297,13 +315,13 @@ class _SceneReader:
                     continue
         return weights
 
-    def with_gaussians(self, path: Path) -> Scene:
-        """A scene with views and Gaussians, of known unit, named by its path."""
-        with about(path):
-            scene = with_gaussians(self._load(path), self.config.seeds)
-            return replace(scene, name=path.name, metres_per_unit=unit_of(scene, self.voxel))
+    def with_gaussians(self, scene: Scene, path: Path) -> Scene:
+        """A scene that `load` read, with Gaussians, of known unit, named by its path."""
+        scene = with_gaussians(scene, self.config.seeds)
+        return replace(scene, name=path.name, metres_per_unit=unit_of(scene, self.voxel))
 
-    def _load(self, path: Path) -> Scene:
+    def load(self, path: Path) -> Scene:
+        """A scene with views, as it is on disk; cameras are placed in a splat without any."""
         config = self.config
         scene = load_scene(path, splat=config.splat or None, options=config.data)
         if scene.views is None:
