@@ -110,6 +110,11 @@ def test_the_teacher_of_a_head_is_that_of_its_name_or_its_number(folder: Path, t
     small_radio(tmp_path, teachers=[{"type": "siglip2", "model": "siglip2-g-384"}, {"type": "sam"}])
     (head,) = read(tmp_path, "siglip")
     assert (head.text, head.model) == ("siglip2", "siglip2-g-384")
+    # Where teachers are named, the number of another one says nothing.
+    named = [{"name": "clip", "type": "clip", "model": "ViT-H"}, {"name": "sam", "type": "sam"}]
+    change_config(tmp_path, args={"mlp_version": "v2", "teachers": named})
+    (head,) = read(tmp_path, "siglip")
+    assert (head.text, head.model) == ("siglip", "")
     change_config(tmp_path, args={"mlp_version": "v2"})
     (head,) = read(tmp_path, "siglip")
     assert (head.text, head.model) == ("siglip", "")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import transformers
-from onnx import helper
+from onnx import helper, numpy_helper
 from PIL import Image
 from region_scenes import (
     HEIGHT,
@@ -106,6 +106,9 @@ def test_small_regions_have_no_vector_and_are_counted(tmp_path: Path) -> None:
     assert one.table is not None
     assert (one.codes[labels_of(0) == 9] == -1).all()
     assert len(one.table) == 2
+    exact = made(build(masks, model, "map", min_area=12), 0)
+    assert exact.table is not None
+    assert len(exact.table) == 3
     with pytest.raises(InputError, match="all 5 regions in 2 views have less than 5000 pixels"):
         build(masks, model, "map", min_area=5000)
     for name in "ab":
@@ -347,3 +350,21 @@ def test_a_crop_teacher_without_a_joint_space_takes_no_words_beside_one_that_has
     assert not takes_text(config)
     assert takes_text(replace(config, joint=True))
     assert takes_text(replace(config, model=str(tmp_path / "clip")))
+
+
+def test_tokens_before_those_of_patches_are_skipped(tmp_path: Path) -> None:
+    """The same map as a grid, and as tokens behind one of the whole picture."""
+    masks, grid = write_masks(tmp_path / "m"), save_colors(tmp_path / "grid.onnx")
+    constants = {"shape": np.array([1, 3, -1]), "first": np.full((1, 1, 3), 9, np.float32)}
+    tokens = save_net(
+        tmp_path / "tokens.onnx",
+        *(helper.make_node("Constant", [], [name], value=numpy_helper.from_array(v)) for name, v in constants.items()),
+        helper.make_node("AveragePool", ["image"], ["cells"], kernel_shape=[4, 4], strides=[4, 4]),
+        helper.make_node("Reshape", ["cells", "shape"], ["rows"]),
+        helper.make_node("Transpose", ["rows"], ["patches"], perm=[0, 2, 1]),
+        helper.make_node("Concat", ["first", "patches"], ["out"], axis=1),
+    )
+    options = OnnxRegionOptions(layout="tokens", skip_tokens=1, patch=4, size=WIDTH, **PLAIN)
+    expected = made(build(masks, grid, "map", min_area=1), 0)
+    found = made(build(masks, tokens, "map", min_area=1, onnx=options), 0)
+    np.testing.assert_allclose(found.table, expected.table, rtol=1e-6)
