@@ -2,7 +2,7 @@
 
     python bench/unseen_kinds.py without HOUSE OUT --kinds mug,banana
     torchrun --nproc_per_node=2 -m gsencoder train OUT experiment=house_cpu out=encoder
-    python bench/unseen_kinds.py score HOUSE --kinds mug,banana --weights encoder [--rooms 'train_04*']
+    python bench/unseen_kinds.py score HOUSE --kinds mug,banana --weights encoder [--space labels] [--rooms 'train_04*']
 
 `without` copies labeled rooms without the objects of some kinds: their pixels, and those beside them, are masked, so
 that neither seeds nor targets come from them, and objects.json does not list them. `score` localizes names in the whole
@@ -190,6 +190,7 @@ def main() -> None:
     parser.add_argument("out", type=Path, nargs="?")
     parser.add_argument("--kinds", required=True)
     parser.add_argument("--weights", help="an encoder; without it features are fused from labels")
+    parser.add_argument("--space", help="of an encoder with several teachers, the one whose words are asked")
     parser.add_argument("--rooms", default="train_04*")
     arguments = parser.parse_args()
     kinds = arguments.kinds.split(",")
@@ -202,9 +203,11 @@ def main() -> None:
     retain_freed_memory()
     words = text_table_of(LabelsConfig())
     assert words is not None
-    source = (
-        encoder_source(load_encoder(arguments.weights)) if arguments.weights else fusion_source(LabelsConfig(), words)
-    )
+    source = fusion_source(LabelsConfig(), words)
+    if arguments.weights:
+        encoder = load_encoder(arguments.weights)
+        source = encoder_source(encoder, space=arguments.space)
+        words = encoder.tables[arguments.space] if arguments.space else words
     score(rooms, arguments.rooms, source, words, kinds)
 
 
