@@ -39,6 +39,7 @@ class HashTower:
     """A vector of normal noise for each phrase, drawn by its letters."""
 
     name, identity, pooling, channels = "t", "onnx:0", "mean", 8
+    lower = False
 
     def embed(self, phrases: Sequence[str]) -> np.ndarray:
         return unit(np.stack([np.random.default_rng(list(p.encode())).normal(size=8) for p in phrases]))

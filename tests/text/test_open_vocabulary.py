@@ -23,6 +23,7 @@ class HashTower:
     """A vector of normal noise for each phrase, drawn by its letters; counts what it is asked."""
 
     name, identity, pooling, channels = "hash", "onnx:0123456789abcdef", "mean", 16
+    lower = False
 
     def __init__(self) -> None:
         self.asked: list[str] = []
