@@ -1,6 +1,5 @@
 """SplatDistill's way with a small random RADIO: fused, distilled, adapter heads applied after; words in, boxes out."""
 
-import json
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command_runs import refusal, results_of
 from radios import change_weights, small_joint_model, small_radio
 from symbolic import symbolic_sizes
 
@@ -78,20 +78,6 @@ class World:
 
 def run(*words: str) -> None:
     assert cli.main([*words, "quiet=true"]) == 0
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    """The one line that a refused command prints."""
-    capsys.readouterr()
-    assert cli.main([*words, "quiet=true"]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
-    assert len(lines) == 1
-    return lines[0]
-
-
-def results_of(folder: Path) -> dict[str, Any]:
-    results: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
-    return results
 
 
 def features_of(folder: Path) -> GaussianFeatures:

@@ -93,6 +93,7 @@ def dataset_space(
     moments = Moments(teacher.space.channels)
     for path, of_scene, feature_map in sampled_maps(scenes, open_scene, views, optional=optional):
         teacher = _same_space(teacher, of_scene, path)
+        kinds |= dict.fromkeys(getattr(of_scene, "kinds", ()))
         rows = distinct_rows(feature_map)
         moments.add(rows[:: max(1, len(rows) // MAX_CELLS_PER_MAP)])
     outputs = replace(_dense_space(moments, teacher, config), centered=center, scaled=scale)

@@ -366,5 +366,5 @@ def test_tokens_before_those_of_patches_are_skipped(tmp_path: Path) -> None:
     )
     options = OnnxRegionOptions(layout="tokens", skip_tokens=1, patch=4, size=WIDTH, **PLAIN)
     expected = made(build(masks, grid, "map", min_area=1), 0)
-    found = made(build(masks, tokens, "map", min_area=1, onnx=options), 0)
-    np.testing.assert_allclose(found.table, expected.table, rtol=1e-6)
+    skipped = made(build(masks, tokens, "map", min_area=1, onnx=options), 0)
+    np.testing.assert_allclose(skipped.table, expected.table, rtol=1e-6)

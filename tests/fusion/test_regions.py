@@ -325,12 +325,12 @@ def test_captions_that_change_their_labels_and_instances_that_change_have_other_
     maps = [labels_of(view).astype(np.int32) for view in (0, 1)]
     (tmp_path / "captions.json").write_text(json.dumps(CAPTIONS))
     options = RegionsConfig(masks="instances", captions=str(tmp_path / "captions.json"))
-    whole = build_teacher(options, region_scene(instances=maps), WORDS).settings()
-    assert build_teacher(options, region_scene(instances=maps), WORDS).settings() == whole
+    first_settings = build_teacher(options, region_scene(instances=maps), WORDS).settings()
+    assert build_teacher(options, region_scene(instances=maps), WORDS).settings() == first_settings
     changed = [np.where(maps[0] == 9, 7, maps[0]).astype(np.int32), maps[1]]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)
-        assert build_teacher(options, region_scene(instances=changed), WORDS).settings() != whole
+        assert build_teacher(options, region_scene(instances=changed), WORDS).settings() != first_settings
 
 
 def test_captions_of_a_view_are_never_those_of_another_that_ends_alike(tmp_path: Path) -> None:

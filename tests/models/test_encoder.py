@@ -361,6 +361,6 @@ def test_one_linear_layer_has_outputs_of_the_rank_of_its_inputs_and_projectors_h
     torch.manual_seed(0)
     config = replace(CONFIG, projector=projector)
     width = config.transformer.channels_out
-    found = run(GaussianEncoder(config, 2 * width).eval(), splat(400, 1)).double()
-    rank = int(torch.linalg.matrix_rank(found - found.mean(dim=0), rtol=1e-5))
+    outputs = run(GaussianEncoder(config, 2 * width).eval(), splat(400, 1)).double()
+    rank = int(torch.linalg.matrix_rank(outputs - outputs.mean(dim=0), rtol=1e-5))
     assert rank <= width if projector == 0 else rank > width

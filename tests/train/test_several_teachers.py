@@ -238,13 +238,17 @@ def test_a_run_goes_on_only_with_its_teachers_in_their_order(datasets: Datasets)
 
 
 def test_names_that_a_scene_to_train_on_has_gained_need_other_prepared_scenes(datasets: Datasets) -> None:
-    class Named(HeightTeacher):
+    class Named(SideTeacher):
+        kinds = ("mug", "teapot")
+
+    class Dense(HeightTeacher):
         kinds = ("mug", "teapot")
 
     dataset = PreparedDataset(datasets["sides"][0].folder)
     dataset.load_kinds = lambda: ("mug",)  # type: ignore[method-assign]
     with pytest.raises(InputError, match="the classes of this dataset lack teapot, since the scene has changed"):
         dataset.check_kinds(Named())
+    dataset.check_kinds(Dense())
     dataset.load_kinds = lambda: ("teapot", "mug")  # type: ignore[method-assign]
     dataset.check_kinds(Named())
 
@@ -301,6 +305,16 @@ def test_the_space_is_that_of_the_scenes_that_have_the_teacher() -> None:
         dataset_space([Path("bare")], open_scene, optional=True, **arguments)  # type: ignore[arg-type]
     with pytest.raises(MissingInput, match="no labels"):
         dataset_space([Path("bare"), Path("a")], open_scene, **arguments)  # type: ignore[arg-type]
+
+
+def test_the_names_of_a_dense_teacher_are_those_of_all_scenes_whose_maps_are_used() -> None:
+    def open_scene(path: Path) -> tuple[object, object]:
+        teacher = HeightTeacher()
+        teacher.kinds = (path.name,)  # type: ignore[attr-defined]
+        return scene(0), teacher
+
+    space = dataset_space([Path("mug"), Path("cup")], open_scene, PREPARE.fusion, views=2)  # type: ignore[arg-type]
+    assert space.kinds == ("mug", "cup")
 
 
 def test_scenes_prepared_for_one_teacher_are_not_taken_for_those_of_several(datasets: Datasets) -> None:
