@@ -6,7 +6,7 @@ a floor counts no more than a spoon. A name that is in no training scene counts 
 protocol (`protocols.naming`) does not have this limit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,14 +17,15 @@ from gsencoder.core.errors import about
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.infer.draw.pictures import contact_sheet, fit_pca_colors, pca_picture
 from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode.encode import encode
+from gsencoder.infer.encode.encode import encode_spaces
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.output_space import OutputSpaces
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.render import blend
 from gsencoder.render.images import render_image
 from gsencoder.train.class_balance import nearest_codes
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.trainer import ValidationResult
+from gsencoder.train.training_scene import TrainingScene
 
 PICTURED_SCENES = 3
 """Held-out scenes of which a view is drawn at each validation during training."""
@@ -70,79 +71,108 @@ def nearest_classes(
 
 
 def validate_encoder(
-    scenes: Sequence[PreparedScene],
+    scenes: Sequence[TrainingScene],
     encoder: GaussianEncoder,
     outputs: OutputSpaces,
-    teacher: str,
-    codebook: Float32[np.ndarray, "C channels"],
+    codebooks: Mapping[str, Float32[np.ndarray, "C channels"]],
     config: EncodeConfig = EncodeConfig(),
     *,
     pictured: int = 0,
     track: Track = untracked,
-) -> ClassAccuracy:
-    """Encodes prepared scenes and classifies the predicted features.
+) -> dict[str, ClassAccuracy]:
+    """Encodes prepared scenes, each once, and classifies the predicted features of each teacher.
 
     Args:
-        scenes: prepared scenes.
+        scenes: prepared scenes, with a part for each of the teachers that they have.
         encoder: the encoder to validate.
         outputs: its output spaces.
-        teacher: whose targets the scenes hold, and whose features are scored.
-        codebook: the target classes, in standard units.
+        codebooks: the target classes of each teacher, in standard units, in the order of the scenes' parts.
         config: settings of encoding.
-        pictured: number of scenes of which a view is drawn.
+        pictured: number of scenes of which a view is drawn for each teacher.
         track: wraps the loop over scenes to show progress.
+
+    Returns:
+        The accuracy for each teacher; teachers that all scenes lack are left out.
     """
-    space = outputs[teacher]
-    pictures: list[np.ndarray] = []
-    titles: list[str] = []
-    correct, total = np.zeros(len(codebook)), np.zeros(len(codebook))
-    cosines, count = 0.0, 0
+    tallies = {
+        teacher: _Tally(outputs[teacher], codebook, pictured=pictured) for teacher, codebook in codebooks.items()
+    }
     for scene in track(scenes, "validation"):
-        seen = np.flatnonzero(scene.weights)
         gaussians = scene.gaussians(np.arange(len(scene)))
         with about(f"scene {scene.name}"):
             unit = scene.metres_per_unit or 1.0
-            encoded = encode(gaussians, encoder, outputs, config, space=teacher, metres_per_unit=unit)
-        predicted = space.standardize(encoded.features[seen])
-        targets = scene.targets(seen)
-        if len(pictures) < 3 * pictured:
-            pictures += draw_middle_view(scene, seen, targets, predicted)
-            titles += [f"{scene.name}: {content}" for content in ("colors", "fused", "predicted")]
+            encoded = encode_spaces(gaussians, encoder, outputs, config, metres_per_unit=unit)
+        for (teacher, tally), part in zip(tallies.items(), scene.parts, strict=True):
+            if part is not None:
+                tally.add(part, encoded[teacher].features)
+        scene.close()
+    return {teacher: tally.accuracy() for teacher, tally in tallies.items() if tally.scenes}
+
+
+class _Tally:
+    """Counts how a teacher's targets and the features predicted for them are classified, scene by scene."""
+
+    def __init__(self, space: OutputSpace, codebook: Float32[np.ndarray, "C channels"], *, pictured: int) -> None:
+        self.scenes = 0
+        self._space, self._codebook, self._pictured = space, codebook, pictured
+        self._pictures: list[np.ndarray] = []
+        self._titles: list[str] = []
+        self._correct, self._total = np.zeros(len(codebook)), np.zeros(len(codebook))
+        self._cosines, self._named = 0.0, 0
+
+    def add(self, scene: PreparedScene, features: Float32[np.ndarray, "N D"]) -> None:
+        """Classifies the targets of a scene's seen Gaussians and the features predicted for them."""
+        space, codebook = self._space, self._codebook
+        seen = np.flatnonzero(scene.weights)
+        predicted, targets = space.standardize(features[seen]), scene.targets(seen)
+        if self.scenes < self._pictured:
+            self._pictures += draw_middle_view(scene, seen, targets, predicted)
+            self._titles += [f"{scene.name}: {content}" for content in ("colors", "fused", "predicted")]
         true_codes = nearest_codes(codebook, targets)
-        choices = np.unique(true_codes)
-        predicted_codes = nearest_classes(predicted, codebook, choices)
-        correct += np.bincount(true_codes, weights=predicted_codes == true_codes, minlength=len(codebook))
-        total += np.bincount(true_codes, minlength=len(codebook))
+        predicted_codes = nearest_classes(predicted, codebook, np.unique(true_codes))
+        self._correct += np.bincount(true_codes, weights=predicted_codes == true_codes, minlength=len(codebook))
+        self._total += np.bincount(true_codes, minlength=len(codebook))
         targets, predicted = space.standard_units(targets), space.standard_units(predicted)
         lengths = np.sqrt(np.square(targets).sum(axis=1))
         named = lengths >= 0.5 * space.channels**0.5
         dots = (targets[named] * predicted[named]).sum(axis=1)
         norms = lengths[named] * np.sqrt(np.square(predicted[named]).sum(axis=1) + 1e-12)
-        cosines += float((dots / norms).sum())
-        count += int(named.sum())
-        scene.close()
-    sheet = contact_sheet(pictures, titles, columns=3, width=400) if pictures else None
-    return ClassAccuracy(correct=correct, total=total, cosine_named=cosines / max(count, 1), sheet=sheet)
+        self._cosines += float((dots / norms).sum())
+        self._named += int(named.sum())
+        self.scenes += 1
+
+    def accuracy(self) -> ClassAccuracy:
+        """The accuracy over the scenes added."""
+        sheet = contact_sheet(self._pictures, self._titles, columns=3, width=400) if self._pictures else None
+        cosine = self._cosines / max(self._named, 1)
+        return ClassAccuracy(correct=self._correct, total=self._total, cosine_named=cosine, sheet=sheet)
 
 
 def validate_names(
-    scenes: Sequence[PreparedScene],
+    scenes: Sequence[TrainingScene],
     encoder: GaussianEncoder,
     outputs: OutputSpaces,
-    teacher: str,
-    codebook: Float32[np.ndarray, "C channels"],
+    codebooks: Mapping[str, Float32[np.ndarray, "C channels"]],
     config: EncodeConfig | None = None,
 ) -> ValidationResult:
     """Runs `validate_encoder` in the form that `gsencoder.train.train` expects, by default on the encoder's device.
 
     Its scores are "names", the accuracy averaged over classes, and "cosine_named", the mean cosine over named
-    Gaussians; its picture "features" is the sheet of the first scenes.
+    Gaussians; its picture "features" is the sheet of the first scenes. Where there are several teachers, names of
+    scores and pictures begin with the teacher's.
     """
     if config is None:
         config = EncodeConfig(device="cuda" if next(encoder.parameters()).is_cuda else "cpu")
-    accuracy = validate_encoder(scenes, encoder, outputs, teacher, codebook, config, pictured=PICTURED_SCENES)
-    pictures = {} if accuracy.sheet is None else {"features": accuracy.sheet}
-    return ValidationResult({"names": accuracy.score, "cosine_named": accuracy.cosine_named}, pictures)
+    scores: dict[str, float] = {}
+    pictures: dict[str, np.ndarray] = {}
+    accuracies = validate_encoder(scenes, encoder, outputs, codebooks, config, pictured=PICTURED_SCENES)
+    for teacher, accuracy in accuracies.items():
+        several = len(codebooks) > 1
+        prefix, prefix_of_file = (f"{teacher}/", f"{teacher}_") if several else ("", "")
+        scores |= {f"{prefix}names": accuracy.score, f"{prefix}cosine_named": accuracy.cosine_named}
+        if accuracy.sheet is not None:
+            pictures[f"{prefix_of_file}features"] = accuracy.sheet
+    return ValidationResult(scores, pictures)
 
 
 def draw_middle_view(

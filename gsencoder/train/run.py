@@ -2,8 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +29,16 @@ from gsencoder.train.distributed import ProcessRank, check_agreement, join_proce
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
-from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
 from gsencoder.train.trainer import EncoderValidator, Trainer, TrainerConfig, ValidationResult
 from gsencoder.train.training_scene import TrainingScene
 
 SceneValidator = Callable[
-    [Sequence[PreparedScene], GaussianEncoder, OutputSpaces, str, Float32[np.ndarray, "C channels"]], ValidationResult
+    [Sequence[TrainingScene], GaussianEncoder, OutputSpaces, Mapping[str, Float32[np.ndarray, "C channels"]]],
+    ValidationResult,
 ]
-"""Scores an encoder on held-out scenes, given these, the encoder, its output spaces, a teacher's name, and the codebook
-of its target classes."""
+"""Scores an encoder on held-out scenes, given these, the encoder, its output spaces, and the codebook of each teacher's
+target classes."""
 CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
 """Settings of the trainer that a resumed run may change, since they do not change the result of a step."""
 
@@ -221,8 +220,10 @@ def fit(
     )
     score_encoder: EncoderValidator = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
     if validate is not None and held_out:
-        scenes = {name: dataset.scenes(held_out) for name, dataset in datasets.items()}
-        score_encoder = partial(_validate, validate, scenes, outputs, recipe.teachers)
+        parts = [[dataset.find_scene(name) for dataset in datasets.values()] for name in held_out]
+        scenes = [TrainingScene(each) for each in parts if any(part is not None for part in each)]
+        codebooks = {teacher.name: teacher.class_balance.codebook for teacher in recipe.teachers}
+        score_encoder = lambda encoder: validate(scenes, encoder, outputs, codebooks)  # noqa: E731
     scenes_to_train_on = [
         TrainingScene([dataset.find_scene(name) for dataset in datasets.values()]) for name in training
     ]
@@ -250,8 +251,12 @@ def fit(
 
 
 def _table_of(words: Words, dataset: PreparedDataset) -> TextTable:
-    """The names that are known without a tower: those of a table, or of a tower's vocabulary and the dataset."""
-    return closed_table(words.including(dataset.load_kinds()) if isinstance(words, OpenVocabulary) else words)
+    """The names that are known without a tower: those of a table, or of a tower's vocabulary and the dataset. It states
+    those trained on, where the dataset has classes with names."""
+    kinds = dataset.load_kinds()
+    if not kinds:
+        return closed_table(words)
+    return words.trained_on(kinds).table if isinstance(words, OpenVocabulary) else replace(words, trained=kinds)
 
 
 def resume_settings(
@@ -283,23 +288,3 @@ def resume_settings(
         "heads": heads,
         "samples_per_step": config.train.samples_per_step(process.world_size),
     }
-
-
-def _validate(
-    validate: SceneValidator,
-    scenes: Mapping[str, Sequence[PreparedScene]],
-    outputs: OutputSpaces,
-    teachers: Sequence[TeacherRecipe],
-    encoder: GaussianEncoder,
-) -> ValidationResult:
-    """`validate` for each teacher; names of scores and pictures begin with the teacher's where there are several."""
-    scores: dict[str, float] = {}
-    pictures: dict[str, np.ndarray] = {}
-    for teacher in teachers:
-        if not scenes[teacher.name]:
-            continue
-        result = validate(scenes[teacher.name], encoder, outputs, teacher.name, teacher.class_balance.codebook)
-        prefix = f"{teacher.name}/" if len(teachers) > 1 else ""
-        scores |= {prefix + name: value for name, value in result.scores.items()}
-        pictures |= {prefix.replace("/", "_") + name: pixels for name, pixels in result.pictures.items()}
-    return ValidationResult(scores, pictures)

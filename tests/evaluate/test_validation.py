@@ -1,14 +1,16 @@
 """Validation on prepared scenes, with an encoder that knows, and with ones that do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from training_scenes import prepared, small_encoder
 
 from gsencoder.evaluate import validation
-from gsencoder.evaluate.validation import ClassAccuracy, nearest_classes, validate_encoder
+from gsencoder.evaluate.validation import ClassAccuracy, nearest_classes, validate_encoder, validate_names
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.train.prepared_scene import PreparedScene
+from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import GaussianFeatures
 
 
@@ -18,43 +20,48 @@ def test_choices_are_those_that_occur_in_the_scene() -> None:
 
 
 @pytest.fixture(scope="module")
-def walls(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[PreparedScene], OutputSpaces, np.ndarray]:
+def walls(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[TrainingScene], OutputSpaces, np.ndarray]:
     dataset, names = prepared(tmp_path_factory.mktemp("prepared"), count=2)
     outputs, codebook = dataset.load_space()
     assert codebook is not None
-    return dataset.scenes(names), OutputSpaces(by_teacher={"sides": outputs}), codebook
+    return (
+        [TrainingScene([scene]) for scene in dataset.scenes(names)],
+        OutputSpaces(by_teacher={"sides": outputs}),
+        codebook,
+    )
 
 
 def judged(
-    walls: tuple[list[PreparedScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch, answers: object
+    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch, answers: object
 ) -> ClassAccuracy:
     """Validation of an encoder that answers with what a function makes of the targets of each scene in turn."""
     scenes, outputs, codebook = walls
     turn, space = iter(scenes), outputs["sides"]
 
-    def encode(*_: object, **__: object) -> GaussianFeatures:
-        scene = next(turn)
+    def encode_spaces(*_: object, **__: object) -> dict[str, GaussianFeatures]:
+        (scene,) = next(turn).parts
+        assert scene is not None
         values = answers(scene.targets(np.arange(len(scene))))  # type: ignore[operator]
         weights = np.ones(len(scene), np.float32)
-        return GaussianFeatures(
-            features=space.restore(values), weights=weights, mean=space.mean, space=space.space, basis=None
-        )
+        features = space.restore(values)
+        return {"sides": GaussianFeatures(features=features, weights=weights, mean=space.mean, space=space.space)}
 
-    monkeypatch.setattr(validation, "encode", encode)
-    return validate_encoder(scenes, small_encoder(), outputs, "sides", codebook)
+    monkeypatch.setattr(validation, "encode_spaces", encode_spaces)
+    return validate_encoder(scenes, small_encoder(), outputs, {"sides": codebook})["sides"]
 
 
 def test_who_gives_the_targets_is_always_right(
-    walls: tuple[list[PreparedScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = judged(walls, monkeypatch, lambda targets: targets)
     assert found.score == 1
     assert found.cosine_named == pytest.approx(1, abs=1e-5)
-    assert found.total.sum() == sum(int((scene.weights > 0).sum()) for scene in walls[0])
+    parts = [part for scene in walls[0] for part in scene.parts if part is not None]
+    assert found.total.sum() == sum(int((part.weights > 0).sum()) for part in parts)
 
 
 def test_who_always_says_the_same_is_right_about_one_kind_and_who_says_the_opposite_about_none(
-    walls: tuple[list[PreparedScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     codebook = walls[2]
     found = judged(walls, monkeypatch, lambda targets: np.broadcast_to(codebook[1], targets.shape).copy())
@@ -67,12 +74,36 @@ def test_who_always_says_the_same_is_right_about_one_kind_and_who_says_the_oppos
 
 @pytest.mark.slow
 def test_an_encoder_is_drawn_beside_the_truth(
-    walls: tuple[list[PreparedScene], OutputSpaces, np.ndarray],
+    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray],
 ) -> None:
     scenes, outputs, codebook = walls
-    found = validate_encoder(
-        scenes, small_encoder(), outputs, "sides", codebook, EncodeConfig(precision="float32"), pictured=1
-    )
+    config = EncodeConfig(precision="float32")
+    found = validate_encoder(scenes, small_encoder(), outputs, {"sides": codebook}, config, pictured=1)["sides"]
     assert found.sheet is not None
     assert found.sheet.shape[2] == 3
     assert len(np.unique(found.sheet.reshape(-1, 3), axis=0)) > 10
+
+
+@pytest.mark.slow
+def test_teachers_are_scored_together_as_each_alone_over_the_scenes_that_have_them(
+    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray],
+) -> None:
+    scenes, outputs, codebook = walls
+    first, second = (part for scene in scenes for part in scene.parts)
+    sides, encoder = outputs["sides"], small_encoder((outputs.channels, outputs.channels))
+    other = replace(sides, space=replace(sides.space, name="other"))
+    both, codebooks = OutputSpaces(by_teacher={"a": sides, "b": other}), {"a": codebook, "b": codebook}
+    config = EncodeConfig(precision="float32")
+    scenes = [TrainingScene([first, None]), TrainingScene([second, second])]
+    together = validate_names(scenes, encoder, both, codebooks, config)
+    assert list(together.scores) == ["a/names", "a/cosine_named", "b/names", "b/cosine_named"]
+    assert list(together.pictures) == ["a_features", "b_features"]
+    alone = validate_encoder([TrainingScene([None, second])], encoder, both, codebooks, config)
+    assert list(alone) == ["b"]
+    assert alone["b"].score == together.scores["b/names"]
+    of_first, of_second = (
+        validate_encoder([TrainingScene([part, None])], encoder, both, codebooks, config)["a"]
+        for part in (first, second)
+    )
+    correct, total = of_first.correct + of_second.correct, of_first.total + of_second.total
+    assert together.scores["a/names"] == pytest.approx(float(np.nanmean(correct[total > 0] / total[total > 0])))
