@@ -160,11 +160,11 @@ def test_masks_are_looked_for_in_the_scenes_folder_first(tmp_path: Path, monkeyp
 
 
 def test_label_images_are_called_like_their_views(tmp_path: Path) -> None:
-    for name in ("x/1.png", "y/1.npy", "frame-07.color.png", "2.safetensors"):
+    for name in ("x/1.png", "y/1.npy", "frame-07.color.PNG", "2.safetensors"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     names = ("x/1.jpg", "y/1.jpg", "frame-07.color.png", "images/2.JPG")
-    expected = ["x/1.png", "y/1.npy", "frame-07.color.png", "2.safetensors"]
+    expected = ["x/1.png", "y/1.npy", "frame-07.color.PNG", "2.safetensors"]
     assert label_paths(tmp_path, names) == [tmp_path / name for name in expected]
     (tmp_path / "2.png").touch()
     with pytest.raises(InputError, match="view 'images/2.JPG' has 2 label images, .*2.png and .*2.safetensors"):

@@ -15,6 +15,8 @@ from gsencoder.data.readers.label_images import LABEL_SUFFIXES, label_files
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.types import Scene, Views
 
+ENDINGS = tuple(ending for suffix in LABEL_SUFFIXES for ending in (suffix, suffix.upper()))
+"""Of label images, as cameras and people write them."""
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 
 
@@ -157,8 +159,12 @@ def label_paths(folder: Path, names: Sequence[str]) -> list[Path]:
     for name, stem in zip(names, stems, strict=True):
         places = [folder / stem, folder / stem.name] if count[stem.name] == 1 else [folder / stem]
         # Not with_suffix, which would cut off the last part of "frame-000012.color".
-        candidates = [place.with_name(place.name + suffix) for place in places for suffix in LABEL_SUFFIXES]
-        known = [path for path in dict.fromkeys(candidates) if path.is_file()]
+        candidates = [place.with_name(place.name + suffix) for place in places for suffix in ENDINGS]
+        known: list[Path] = []
+        for path in dict.fromkeys(candidates):
+            # A file system that ignores case has one file under both spellings of an ending.
+            if path.is_file() and not any(path.samefile(other) for other in known):
+                known.append(path)
         if len(known) > 1:
             raise InputError(
                 f"teacher.folder: view {name!r} has {len(known)} label images, {known[0]} and {known[1]}; remove all "
