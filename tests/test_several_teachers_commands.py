@@ -104,6 +104,15 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named
     assert cli.main([*words, "spaces=palette", f"out={tmp_path / 'one'}"]) == 0
     (only,) = load_features(tmp_path / "one").features.values()
     np.testing.assert_array_equal(only.features, scene.features["palette"].features)
+    asked = [
+        "localize",
+        str(tmp_path / "one"),
+        "query=red",
+        "space=palette",
+        "localize.min_probability=0",
+        "quiet=true",
+    ]
+    assert cli.main([*asked, "pictures=0", f"out={tmp_path / 'red'}"]) == 0
     assert {path.name for path in (tmp_path / "one").iterdir()} >= {"features.safetensors", "words.safetensors"}
     assert "got 'depth'" in refusal(capsys, *words[:3], "spaces=[depth,labels]", f"out={tmp_path / 'none'}")
     (encoded / "words.labels.safetensors").rename(tmp_path / "lost")
@@ -133,6 +142,10 @@ def test_evaluation_takes_the_space_of_the_words(rooms: Path, trained: Path, tmp
     command = ["evaluate", str(rooms / "room_2"), f"weights={trained}", words, "protocol=naming", "quiet=true"]
     assert cli.main([*command, f"out={tmp_path / 'scores'}"]) == 0
     assert results_of(tmp_path / "scores")["names"]
+    # Without words, those beside the weights are meant.
+    without = [word for word in command if word != words]
+    assert cli.main([*without, f"out={tmp_path / 'again'}"]) == 0
+    assert results_of(tmp_path / "again")["names"] == results_of(tmp_path / "scores")["names"]
 
 
 def test_fusing_in_the_basis_of_one_of_several_teachers_needs_a_teacher_of_its_space(

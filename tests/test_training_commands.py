@@ -79,7 +79,9 @@ def test_training_leaves_weights_words_a_log_and_pictures(trained: Path) -> None
     assert list(outputs) == ["labels"]
     assert outputs["labels"].space.text_encoder == "room-words"
     assert encoder.channels == outputs.channels
-    assert (trained / "words.safetensors").is_file()
+    words = load_text_table(trained / "words.safetensors")
+    taught = {each.name for room in (0, 1) for each in load_scene(rooms / f"room_{room}").objects}
+    assert set(words.trained or ()) == taught < set(words.names)
     assert (trained / "log.csv").read_text().splitlines()[0].startswith("step,loss")
     assert list((trained / "validation").glob("features_*.png"))
     assert list((trained / "tensorboard").iterdir())

@@ -89,6 +89,11 @@ class OpenVocabulary:
         )
         return OpenVocabulary(table, lambda: self.tower)
 
+    def trained_on(self, names: Sequence[str]) -> "OpenVocabulary":
+        """The vocabulary, stating that the encoder of the features was trained on these names."""
+        vocabulary = self.including(names)
+        return OpenVocabulary(replace(vocabulary.table, trained=tuple(names)), lambda: vocabulary.tower)
+
     def _embed(self, phrases: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
         try:
             return cached_vectors(

@@ -60,6 +60,7 @@ class TextTable:
         mean: the mean of the embeddings. Text and image features of a joint model have different means, so each side
             is centered by its own.
         tower: which text tower made the embeddings, where one did that can be asked for other phrases.
+        trained: the names that the encoder of the features was trained on; None where nothing states them.
     """
 
     names: tuple[str, ...]
@@ -67,7 +68,9 @@ class TextTable:
     space: FeatureSpace
     mean: Float32[np.ndarray, " D"]
     tower: TowerRecord | None = None
+    trained: tuple[str, ...] | None = None
     _row_of: dict[str, int] = field(init=False, repr=False, default_factory=dict)
+    _trained_rows: frozenset[int] = field(init=False, repr=False, default=frozenset())
 
     def __post_init__(self) -> None:
         table = self.embeddings
@@ -103,6 +106,13 @@ class TextTable:
                 wrong = "repeated" if key else "empty"
                 raise InputError(f"TextTable: name {name[:MAX_SHOWN]!r} in row {row} is {wrong}")
             self._row_of[key] = row
+        rows = {name: self.find(name) for name in self.trained or ()}
+        missing = [name for name, row in rows.items() if row is None]
+        if missing:
+            raise InputError(
+                f"TextTable: expected the names trained on among its {len(self)} names, got {missing[0][:MAX_SHOWN]!r}"
+            )
+        object.__setattr__(self, "_trained_rows", frozenset(rows.values()))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -111,6 +121,10 @@ class TextTable:
         """The row of a word, else of its singular or plural, or None."""
         key = normalize(word)
         return next((self._row_of[form] for form in (key, *_singulars_and_plurals(key)) if form in self._row_of), None)
+
+    def is_trained(self, word: str) -> bool | None:
+        """Whether the encoder of the features was trained on a word; None where that is not stated."""
+        return None if self.trained is None else self.find(word) in self._trained_rows
 
     def near(self, word: str, count: int = 6) -> tuple[str, ...]:
         """Suggestions for an unknown word: names that share a word with it, and names that are spelled similarly."""
@@ -203,6 +217,8 @@ def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float
     header: dict[str, Any] = {"names": list(table.names), "space": space, "dtype": dtype}
     if table.tower is not None:
         header["tower"] = tower_to_json(table.tower)
+    if table.trained is not None:
+        header["trained"] = list(table.trained)
     write_archive(Path(path), arrays, header)
 
 
@@ -228,6 +244,17 @@ def tower_from_json(values: Any) -> TowerRecord:
     return TowerRecord(**{**values, "templates": tuple(values["templates"])})
 
 
+def trained_from_json(values: Any) -> tuple[str, ...]:
+    """The names trained on that JSON values hold.
+
+    Raises:
+        InputError: they hold none.
+    """
+    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+        raise InputError(f"expected a list of the names trained on, got {str(values)[:60]!r}")
+    return tuple(values)
+
+
 def _read_archive(file: Path) -> TextTable:
     with open_archive(file) as archive:
         dtype = archive.value("dtype", str)
@@ -238,7 +265,8 @@ def _read_archive(file: Path) -> TextTable:
             "mean": archive.array("mean", "float32", ("D",)),
         }
         tower = tower_from_json(archive.value("tower", dict)) if "tower" in archive else None
-        return _table(file, archive.value("names", list), archive.value("space", dict), arrays, tower)
+        trained = trained_from_json(archive.value("trained", list)) if "trained" in archive else None
+        return _table(file, archive.value("names", list), archive.value("space", dict), arrays, tower, trained)
 
 
 def _is_version_1(file: Path) -> bool:
@@ -267,7 +295,12 @@ def _read_version_1(file: Path) -> TextTable:
 
 
 def _table(
-    file: Path, names: Any, space: Any, arrays: dict[str, np.ndarray], tower: TowerRecord | None = None
+    file: Path,
+    names: Any,
+    space: Any,
+    arrays: dict[str, np.ndarray],
+    tower: TowerRecord | None = None,
+    trained: tuple[str, ...] | None = None,
 ) -> TextTable:
     """A table of what a file holds.
 
@@ -286,7 +319,7 @@ def _table(
     if arrays["embeddings"].dtype == np.float16:
         arrays["embeddings"] = unrounded(arrays["embeddings"].astype(np.float32))
     with about(file):
-        return TextTable(names=tuple(names), space=FeatureSpace(**space), tower=tower, **arrays)
+        return TextTable(names=tuple(names), space=FeatureSpace(**space), tower=tower, trained=trained, **arrays)
 
 
 def _read_npz(file: Path, encoder: str) -> TextTable:

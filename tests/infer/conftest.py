@@ -1,5 +1,6 @@
 """An encoder that is small, and what it was exported to."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("encoder")
     rng = np.random.default_rng(0)
     table = make_text_table(("mug", "plant", "chair"), np.linalg.qr(rng.normal(size=(6, 3)))[0].T, "words-6")
+    table = replace(table, trained=("mug", "plant"))
     space = FeatureSpace(name="six", channels=6, teacher="labels", text_encoder="words-6", preprocessing="none")
     mean = rng.normal(size=6).astype(np.float32)
     basis = FeatureBasis(

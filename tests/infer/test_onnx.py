@@ -122,6 +122,7 @@ def test_the_file_says_what_its_features_mean(both: tuple[TorchEncoder, OnnxEnco
     assert ours.words is not None
     assert theirs.words is not None
     assert ours.words.names == WORDS
+    assert ours.words.trained == theirs.words.trained == WORDS[:2]
     np.testing.assert_allclose(ours.words.encode(WORDS), theirs.words.encode(WORDS), atol=1e-3)
     assert ours.voxel == theirs.voxel == 0.05
 

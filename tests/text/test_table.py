@@ -4,6 +4,7 @@ import io
 import json
 import tracemalloc
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,18 @@ def test_a_saved_table_reads_back_as_it_was(table: TextTable, tmp_path: Path, su
     assert read.space == table.space
     np.testing.assert_allclose(read.embeddings, table.embeddings, atol=2e-7)
     np.testing.assert_allclose(read.mean, table.mean, atol=2e-7)
+
+
+def test_a_table_states_the_names_trained_on_and_so_does_its_file(table: TextTable, tmp_path: Path) -> None:
+    assert table.is_trained(NAMES[0]) is None
+    trained = replace(table, trained=NAMES[:2])
+    save_text_table(tmp_path / "table.safetensors", trained)
+    for each in (trained, load_text_table(tmp_path / "table.safetensors")):
+        assert each.trained == tuple(NAMES[:2])
+        assert [each.is_trained(word) for word in (f"the {NAMES[1]}", NAMES[2], "no such word")] == [True, False, False]
+    assert replace(table, trained=()).is_trained(NAMES[0]) is False
+    with pytest.raises(InputError, match="expected the names trained on among its .* names, got 'zebra'"):
+        replace(table, trained=("zebra",))
 
 
 def test_a_table_saved_in_half_precision_is_half_as_large_and_has_unit_rows(tmp_path: Path) -> None:

@@ -41,6 +41,7 @@ from gsencoder.evaluate.sources import (
     head_source,
     load_scenes,
     space_of_words,
+    stating_trained,
 )
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.heads.of_teacher import heads_of
@@ -51,7 +52,7 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import file_of_encoder, load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, words_of_table
 from gsencoder.types import Scene
 
 SHOWN_NAMES = 15
@@ -127,17 +128,29 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
 
 
 def _source(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
-    """The source of the features, and the words that they are compared with."""
+    """The source of the features, and the words that they are compared with: those of teacher= and text=, or where
+    neither is given, those beside the weights."""
+    if config.weights:
+        retain_freed_memory()
+        encoder = load_encoder(config.weights, config.encode.device)
+        beside = encoder.tables.get(config.space) if config.space else encoder.words
+        if beside is not None and config.teacher == LabelsConfig() and config.text == TableTextConfig():
+            words: Words = words_of_table(beside)
+        else:
+            words = _given_words(config)
+        space = config.space or space_of_words(encoder, words)
+        return encoder_source(encoder, config.encode, space), stating_trained(encoder, words, space)
+    words = _given_words(config)
+    return fusion_source(config.teacher, words, config.fusion), words
+
+
+def _given_words(config: EvaluateConfig) -> Words:
     words = words_of(config.teacher, config.text)
     if words is None:
         raise InputError(
             f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words= or text="
         )
-    if config.weights:
-        retain_freed_memory()
-        encoder = load_encoder(config.weights, config.encode.device)
-        return encoder_source(encoder, config.encode, config.space or space_of_words(encoder, words)), words
-    return fusion_source(config.teacher, words, config.fusion), words
+    return words
 
 
 def _source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:

@@ -113,9 +113,10 @@ def localize(
     Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
     score that `gsencoder.infer.localize.boxes.score_clusters` and the probability that
     `gsencoder.infer.localize.presence` defines. Boxes that are less probable than `config.min_probability` are left
-    out, and a word that has no box is absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless
-    `config.extent` says "sigma", and have the scene's origin added back in float64. A word's boxes do not depend on the
-    other queries, unless `config.contrast` is on.
+    out, and a word that has no box is absent. Boxes are ranked by score; those of words that the features' encoder was
+    not trained on, where the vocabulary states that, by probability. Axis-aligned and oriented boxes are drawn around
+    Gaussian means, unless `config.extent` says "sigma", and have the scene's origin added back in float64. A word's
+    boxes do not depend on the other queries, unless `config.contrast` is on.
 
     Args:
         scene: Gaussians with features.
@@ -143,6 +144,9 @@ def localize(
         probable = [
             (each, value) for each, value in zip(one.clusters, values, strict=True) if value >= config.min_probability
         ]
+        if any(each.trained is False for each in one.evidence):
+            # The cluster with the best score may be something known that resembles the word.
+            probable.sort(key=lambda pair: pair[1], reverse=True)
         boxes += boxes_of_word(
             word,
             probable,
@@ -231,7 +235,8 @@ def find_candidates(
         ranked = score_clusters(labels, rows, scores[number][rows], features.weights[rows], min_share=config.min_share)[
             : config.max_boxes
         ]
-        evidence = presence.evidence(vectors[number], cosines[number], ranked)
+        trained = rivals.is_trained(queries[number]) if rivals is not None else None
+        evidence = presence.evidence(vectors[number], cosines[number], ranked, trained=trained)
         words.append(WordCandidates(threshold=cutoff, clusters=tuple(ranked), evidence=tuple(evidence)))
     return Candidates(relevancy=scores, words=tuple(words))
 
@@ -248,7 +253,8 @@ def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, Gaussia
 
     Args:
         scene: with both.
-        space: name of the feature set, or of its space; None = the only one, or the only one that words lead into.
+        space: name of the feature set, of its space, or of its teacher; None = the only one, or the only one that words
+            lead into.
 
     Raises:
         InputError: no feature set of that name, or several and no name.
@@ -261,9 +267,10 @@ def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, Gaussia
         candidates = list(scene.features.values()) if len(scene.features) == 1 else with_words
         if len(candidates) == 1:
             return scene.gaussians, candidates[0]
-    by_space = [each for each in scene.features.values() if each.space.name == space]
-    if space not in scene.features and len(by_space) == 1:
-        return scene.gaussians, by_space[0]
+    for attribute in ("name", "teacher"):
+        fitting = [each for each in scene.features.values() if getattr(each.space, attribute) == space]
+        if space is not None and space not in scene.features and len(fitting) == 1:
+            return scene.gaussians, fitting[0]
     if space not in scene.features:
         raise InputError(
             f"scene {scene.name} has features of {', '.join(sorted(scene.features))}; "

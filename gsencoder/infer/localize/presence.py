@@ -10,13 +10,18 @@ The evidence of a cluster c of the word q, with centered cosines cos and weights
 
 Words whose cosine with q is `SYNONYM` or more are no rivals: "couch" does not speak against "sofa". A phrase such as
 "something to sit on" is less like any name than names are like themselves: its cosines are taken relative to the
-largest that it has with a name of the vocabulary, and the names that come as near to it are no rivals. The coefficients
-were fitted by `bench/presence.py`; `docs/measurements.md` has the reliability of the probabilities.
+largest that it has with a name of the vocabulary, and the names that come as near to it are no rivals.
+
+An encoder calls what it was never trained on by the name of something known that looks alike: a sponge is a box. So a
+rival speaks against a word that the encoder was trained on, and hardly against another one. Words on which the encoder
+was not trained, as the vocabulary states, have coefficients of their own.
+
+The coefficients were fitted by `bench/presence.py`; `docs/measurements.md` has the reliability of the probabilities.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -43,6 +48,8 @@ class Evidence:
 
     Attributes:
         mean, margin, prominence, size, share: as there; margin is None without a vocabulary.
+        trained: whether the encoder of the features was trained on the word; None where that is not stated, as for
+            fused features.
     """
 
     mean: float
@@ -50,6 +57,7 @@ class Evidence:
     prominence: float
     size: float
     share: float
+    trained: bool | None = None
 
 
 WITH_RIVALS: Mapping[str, float] = MappingProxyType(
@@ -61,15 +69,22 @@ WITHOUT_RIVALS: Mapping[str, float] = MappingProxyType(
 )
 """Coefficients where nothing is known but the word itself."""
 
+UNTRAINED: Mapping[str, float] = MappingProxyType(
+    {"intercept": -2.186, "mean": 4.13, "margin": 5.47, "prominence": -0.06, "size": 0.68, "share": -0.26}
+)
+"""Coefficients of words that the encoder was not trained on."""
+
 
 def probability(evidence: Evidence) -> float:
     """The probability that the Gaussians of a cluster are what the word says, in [0, 1]."""
-    coefficients = WITHOUT_RIVALS if evidence.margin is None else WITH_RIVALS
+    if evidence.margin is None:
+        coefficients = WITHOUT_RIVALS
+    else:
+        coefficients = UNTRAINED if evidence.trained is False else WITH_RIVALS
     logit = coefficients["intercept"]
-    for each in fields(evidence):
-        value = getattr(evidence, each.name)
-        if value is not None:
-            logit += coefficients[each.name] * value
+    for name, coefficient in coefficients.items():
+        if name != "intercept":
+            logit += coefficient * getattr(evidence, name)
     # The tanh form of the logistic function does not overflow.
     return 0.5 * (1 + math.tanh(logit / 2))
 
@@ -100,6 +115,8 @@ class Presence:
         word: Float32[np.ndarray, " D"],
         cosines: Float32[np.ndarray, " N"],
         clusters: Sequence[Cluster],
+        *,
+        trained: bool | None = None,
     ) -> list[Evidence]:
         """The evidence for each cluster of one word.
 
@@ -107,6 +124,7 @@ class Presence:
             word: its vector.
             cosines: its centered cosine with every Gaussian, NaN where that was never seen.
             clusters: those of the word.
+            trained: whether the encoder of the features was trained on the word; None where that is not stated.
         """
         if not clusters:
             return []
@@ -136,6 +154,7 @@ class Presence:
                     prominence=math.log(max(height, 1e-3)),
                     size=math.log10(len(rows)),
                     share=each.share,
+                    trained=trained,
                 )
             )
         return listed

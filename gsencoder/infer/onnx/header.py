@@ -22,7 +22,7 @@ from gsencoder.core.int8 import round_columns
 from gsencoder.core.runtime.device_names import Stored
 from gsencoder.models.grid.serialize import ALIGN, Order
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, output_spaces_parts
-from gsencoder.text.table import TextTable, tower_from_json, tower_to_json, unrounded
+from gsencoder.text.table import TextTable, tower_from_json, tower_to_json, trained_from_json, unrounded
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 KEY = "gsencoder"
@@ -117,6 +117,8 @@ def _words_parts(words: TextTable, *, in_int8: bool) -> tuple[dict[str, np.ndarr
     values: dict[str, Any] = {"names": list(words.names), "space": asdict(words.space)}
     if words.tower is not None:
         values["tower"] = tower_to_json(words.tower)
+    if words.trained is not None:
+        values["trained"] = list(words.trained)
     return arrays, values
 
 
@@ -190,6 +192,7 @@ def _text_table(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> 
         space=FeatureSpace(**values["space"]),
         mean=arrays["words_mean"],
         tower=tower_from_json(values["tower"]) if "tower" in values else None,
+        trained=trained_from_json(values["trained"]) if "trained" in values else None,
     )
 
 
