@@ -1,42 +1,84 @@
 """The weights that come with the package: small, whole, and good for what they were made for."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from gsencoder.app.commands.train import TrainCommandConfig
+from gsencoder.app.settings.compose import compose
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.json_values import plain
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
+from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.evaluate.protocols.naming import evaluate_naming, naming_scores
 from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.fusion.store.words import load_tables
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.localize.localize import localize
 from gsencoder.models.weights import SHIPPED_WEIGHTS, load_weights
-from gsencoder.text.table import load_text_table
+from gsencoder.text.build import words_of_table
+from gsencoder.train.run import CHANGEABLE_ON_RESUME
 
 pytestmark = pytest.mark.slow
 
-FOLDER = SHIPPED_WEIGHTS / "house_cpu"
+WEIGHTS = {"house_cpu": ["labels"], "house": ["labels", "dinov2_s14"]}
+"""The weights, and the teachers of each."""
 
 
-def test_they_take_less_than_ten_megabytes_and_say_how_they_were_made() -> None:
-    assert (FOLDER / "encoder.safetensors").stat().st_size < 10e6
-    _, outputs, made_by = load_weights("house_cpu")
-    words = load_text_table(FOLDER / WORDS_FILE)
-    assert outputs.select().space.text_encoder == words.space.text_encoder
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_they_are_small_and_say_how_they_were_made(name: str) -> None:
+    folder = SHIPPED_WEIGHTS / name
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 14e6
+    _, outputs, made_by = load_weights(name)
+    assert list(outputs) == WEIGHTS[name]
+    tables = load_tables(folder, outputs)
+    assert list(tables) == ["labels"]
+    words = tables["labels"]
+    assert outputs["labels"].space.text_encoder == words.space.text_encoder
+    assert len(words.trained or ()) == 63
+    assert (words.is_trained("mugs"), words.is_trained("zebra")) == (True, False)
     assert made_by["steps"] == made_by["settings"]["train"]["steps"]
     assert not any(Path(path).is_absolute() for path in made_by["settings"]["paths"])
 
 
+def test_those_of_several_teachers_have_the_settings_of_their_experiment() -> None:
+    _, _, made_by = load_weights("house")
+    settings = plain(compose("train", TrainCommandConfig, ["MIX", "experiment=house", "out=house"]))
+    for section in ("teachers", "text", "model", "sampling", "augment", "loss", "prepare", "splat"):
+        assert made_by["settings"][section] == settings[section], section
+    changeable = {name: made_by["settings"]["train"][name] for name in CHANGEABLE_ON_RESUME}
+    assert made_by["settings"]["train"] == settings["train"] | changeable
+
+
+def test_phrases_lead_into_the_space_of_a_sentence_encoder(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSENCODER_MODELS", str(shared / "models"))
+    encoder = TorchEncoder("house")
+    scene = with_gaussians(load_scene(shared / "scenes" / "house" / "train_045"))
+    assert scene.gaussians is not None
+    encoded = encoder.encode_spaces(scene.gaussians)
+    words = words_of_table(encoder.tables["labels"])
+    asked = localize(replace(scene, features=encoded), ["something to sit on"], words, space="labels")
+    best = asked.boxes[0]
+    seats = [each for each in scene.objects if each.name in ("chair", "sofa")]
+    assert max(aabb_iou(best.aabb_min, best.aabb_max, each.aabb_min, each.aabb_max) for each in seats) >= 0.25
+    # DINOv2 has no words.
+    with pytest.raises(InputError, match="dinov2-s14"):
+        localize(replace(scene, features=encoded), ["mug"], words, space="dinov2_s14")
+
+
 @pytest.mark.parametrize("number", [40, 45])
-def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, number: int) -> None:
-    encoder = TorchEncoder("house_cpu")
-    words = load_text_table(FOLDER / WORDS_FILE)
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, name: str, number: int) -> None:
+    encoder = TorchEncoder(name)
+    words = encoder.tables["labels"]
     scene = with_gaussians(load_scene(shared / "scenes" / "house" / f"train_{number:03d}"))
     assert scene.gaussians is not None
     accuracies, features = [], []
     for chunk in (0, 80_000):
-        given = encoder.encode(scene.gaussians, EncodeConfig(chunk=chunk))
+        given = encoder.encode(scene.gaussians, EncodeConfig(chunk=chunk), space="labels")
         named = evaluate_naming([(scene, 0.0)], lambda _, given=given: (given, {}), words)
         accuracies.append(naming_scores(named)["accuracy"])
         features.append(given)
