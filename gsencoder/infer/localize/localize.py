@@ -113,10 +113,9 @@ def localize(
     Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
     score that `gsencoder.infer.localize.boxes.score_clusters` and the probability that
     `gsencoder.infer.localize.presence` defines. Boxes that are less probable than `config.min_probability` are left
-    out, and a word that has no box is absent. Boxes are ranked by score; those of words that the features' encoder was
-    not trained on, where the vocabulary states that, by probability. Axis-aligned and oriented boxes are drawn around
-    Gaussian means, unless `config.extent` says "sigma", and have the scene's origin added back in float64. A word's
-    boxes do not depend on the other queries, unless `config.contrast` is on.
+    out, and a word that has no box is absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless
+    `config.extent` says "sigma", and have the scene's origin added back in float64. A word's boxes do not depend on the
+    other queries, unless `config.contrast` is on.
 
     Args:
         scene: Gaussians with features.
@@ -144,9 +143,6 @@ def localize(
         probable = [
             (each, value) for each, value in zip(one.clusters, values, strict=True) if value >= config.min_probability
         ]
-        if any(each.trained is False for each in one.evidence):
-            # The cluster with the best score may be something known that resembles the word.
-            probable.sort(key=lambda pair: pair[1], reverse=True)
         boxes += boxes_of_word(
             word,
             probable,

@@ -13,8 +13,8 @@ Words whose cosine with q is `SYNONYM` or more are no rivals: "couch" does not s
 largest that it has with a name of the vocabulary, and the names that come as near to it are no rivals.
 
 An encoder calls what it was never trained on by the name of something known that looks alike: a sponge is a box. So a
-rival speaks against a word that the encoder was trained on, and hardly against another one. Words on which the encoder
-was not trained, as the vocabulary states, have coefficients of their own.
+rival speaks against a word that the encoder was trained on, and not against another one. Where the vocabulary states
+which words the encoder was trained on, these and all others have coefficients of their own.
 
 The coefficients were fitted by `bench/presence.py`; `docs/measurements.md` has the reliability of the probabilities.
 """
@@ -63,16 +63,20 @@ class Evidence:
 WITH_RIVALS: Mapping[str, float] = MappingProxyType(
     {"intercept": -11.048, "mean": 12.38, "margin": 2.662, "prominence": -0.226, "size": 0.41, "share": 3.293}
 )
-"""Coefficients where the words come from a vocabulary."""
+"""Coefficients where the words come from a vocabulary, and nothing states what an encoder was trained on."""
 WITHOUT_RIVALS: Mapping[str, float] = MappingProxyType(
     {"intercept": -13.295, "mean": 16.358, "prominence": -0.305, "size": 0.369, "share": 2.834}
 )
 """Coefficients where nothing is known but the word itself."""
 
-UNTRAINED: Mapping[str, float] = MappingProxyType(
-    {"intercept": -2.186, "mean": 4.13, "margin": 5.47, "prominence": -0.06, "size": 0.68, "share": -0.26}
+TRAINED: Mapping[str, float] = MappingProxyType(
+    {"intercept": -15.794, "mean": 15.848, "margin": 3.697, "prominence": 0.122, "size": 1.159, "share": 1.238}
 )
-"""Coefficients of words that the encoder was not trained on."""
+"""Coefficients of words that the encoder of the features was trained on."""
+UNTRAINED: Mapping[str, float] = MappingProxyType(
+    {"intercept": -7.858, "mean": 5.657, "margin": -1.032, "prominence": 0.507, "size": 0.747, "share": 1.083}
+)
+"""Coefficients of words that it was not trained on."""
 
 
 def probability(evidence: Evidence) -> float:
@@ -80,7 +84,7 @@ def probability(evidence: Evidence) -> float:
     if evidence.margin is None:
         coefficients = WITHOUT_RIVALS
     else:
-        coefficients = UNTRAINED if evidence.trained is False else WITH_RIVALS
+        coefficients = {None: WITH_RIVALS, True: TRAINED, False: UNTRAINED}[evidence.trained]
     logit = coefficients["intercept"]
     for name, coefficient in coefficients.items():
         if name != "intercept":
