@@ -1,7 +1,7 @@
 """Fits the probabilities of boxes to evidence gathered in labeled rooms, and shows how reliable they are in others.
 
     python bench/presence_evidence.py HOUSE EVIDENCE/GROUP …
-    python bench/presence.py EVIDENCE --known fused,encoded,others:0.3 --untrained unseen,others_encoded
+    python bench/presence.py EVIDENCE --known fused,encoded,others:0.3 --untrained unseen,others
                              [--fit 'train_0[0-3]*'] [--test 'train_04*'] [--plot docs/reliability.png]
 
 A group is a folder of EVIDENCE that `bench/presence_evidence.py` wrote, with its weight, 1 if none is given. A
@@ -78,16 +78,16 @@ def plot(path: Path, tables: dict[str, list[dict[str, float]]]) -> None:
     matplotlib.use("agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(figsize=(4.4, 3.8), dpi=100, layout="constrained")
+    figure, axes = pyplot.subplots(figsize=(5.2, 4.6), dpi=100, layout="constrained")
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
     for (title, rows), marker in zip(tables.items(), "os^vD*", strict=False):
         x, y = [row["probability"] for row in rows], [row["present"] for row in rows]
-        axes.plot(x, y, marker=marker, markersize=5, linewidth=1.2, label=title)
+        axes.plot(x, y, marker=marker, markersize=5, linewidth=1.2, label=title.replace("_", " "))
         for row in rows:
             axes.annotate(str(row["words"]), (row["probability"], row["present"]), fontsize=6, xytext=(4, -7),
                           textcoords="offset points", color="0.35")  # fmt: skip
     axes.set(xlabel="mean probability of the words of a bin", ylabel="share of them that is present")
-    figure.legend(loc="outside upper center", ncols=3, fontsize=8)
+    figure.legend(loc="outside upper center", ncols=2, fontsize=8)
     figure.savefig(path)
 
 
@@ -123,7 +123,7 @@ def main() -> None:
             report(f"{title}, other rooms, a model of its own", unknown[title], alone)
             rows = report(f"{title}, other rooms", unknown[title], together)
             if keys is WITH:
-                tables[f"{title}, {model}"] = rows
+                tables[f"{title}, {model}" if title in tables else title] = rows
     for title, rows in tables.items():
         print(f"\n| {title}: probability | words | mean probability | present |\n|---|---|---|---|")
         for row in rows:
