@@ -70,7 +70,7 @@ class TextTable:
     tower: TowerRecord | None = None
     trained: tuple[str, ...] | None = None
     _row_of: dict[str, int] = field(init=False, repr=False, default_factory=dict)
-    _trained_rows: frozenset[int] = field(init=False, repr=False, default=frozenset())
+    _trained_rows: tuple[int, ...] = field(init=False, repr=False, default=())
 
     def __post_init__(self) -> None:
         table = self.embeddings
@@ -112,7 +112,7 @@ class TextTable:
             raise InputError(
                 f"TextTable: expected the names trained on among its {len(self)} names, got {missing[0][:MAX_SHOWN]!r}"
             )
-        object.__setattr__(self, "_trained_rows", frozenset(rows.values()))
+        object.__setattr__(self, "_trained_rows", tuple(rows.values()))
 
     def __len__(self) -> int:
         return len(self.names)

@@ -99,16 +99,20 @@ def leaves(data: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 def base_of(group: str, defaults: list[Any]) -> list[str]:
     """The members that a YAML file builds on, by its defaults list, as words of a command line."""
-    words = []
+    words, members = [], list[str]()
     for entry in defaults:
         if isinstance(entry, Mapping):
             (overridden, member), *others = entry.items()
             assert not others
+            if overridden.startswith("/teacher@teachers."):
+                members.append(f"{overridden.removeprefix('/teacher@teachers.')}:{member}")
+                continue
             assert overridden.startswith("override /")
             words.append(f"{overridden.removeprefix('override /')}={member}")
         elif entry != "_self_":
             words.append(f"{group}={entry}")
-    return words
+    # Several teachers are an option of their own.
+    return [f"teacher=[{','.join(members)}]", *words] if members else words
 
 
 @pytest.mark.parametrize("path", sorted(conf_folder().rglob("*.*")), ids=lambda path: f"{path.parent.name}/{path.name}")
