@@ -15,11 +15,11 @@ import fnmatch
 from pathlib import Path
 
 import numpy as np
+from presence_evidence import KEYS
 
 from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error, reliability
 
-WITH = ("mean", "margin", "prominence", "size", "share")
-WITHOUT = ("mean", "prominence", "size", "share")
+WITHOUT_RIVALS = tuple(key for key in KEYS if key != "margin")
 
 
 def load(folder: Path, rooms: str) -> np.ndarray:
@@ -106,9 +106,10 @@ def main() -> None:
     parser.add_argument("--test", default="train_04*")
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
-    models = {"with rivals": (weighted(arguments.known), WITH), "without rivals": (weighted(arguments.known), WITHOUT)}
+    known_groups = weighted(arguments.known)
+    models = {"with rivals": (known_groups, KEYS), "without rivals": (known_groups, WITHOUT_RIVALS)}
     if arguments.untrained:
-        models["untrained words"] = (weighted(arguments.untrained), WITH)
+        models["untrained words"] = (weighted(arguments.untrained), KEYS)
     tables = {}
     for model, (weights, keys) in models.items():
         known, unknown = (
@@ -122,7 +123,7 @@ def main() -> None:
             report(f"{title}, rooms of the fit", known[title], together)
             report(f"{title}, other rooms, a model of its own", unknown[title], alone)
             rows = report(f"{title}, other rooms", unknown[title], together)
-            if keys is WITH:
+            if keys is KEYS:
                 tables[f"{title}, {model}" if title in tables else title] = rows
     for title, rows in tables.items():
         print(f"\n| {title}: probability | words | mean probability | present |\n|---|---|---|---|")

@@ -37,7 +37,7 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import aabb_iou, queryable_objects
 from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error
-from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, with_features
+from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, stating_trained, with_features
 from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.load_encoder import load_encoder
@@ -207,7 +207,7 @@ def main() -> None:
     if arguments.weights:
         encoder = load_encoder(arguments.weights)
         source = encoder_source(encoder, space=arguments.space)
-        words = encoder.tables[arguments.space] if arguments.space else words
+        words = stating_trained(encoder, encoder.tables.get(arguments.space or "", words), arguments.space)
     score(rooms, arguments.rooms, source, words, kinds)
 
 

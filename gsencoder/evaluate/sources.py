@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
@@ -18,7 +17,6 @@ from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder
 from gsencoder.text.build import Words, closed_table
-from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.types import GaussianFeatures, Scene
 
 FeatureSource = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
@@ -95,9 +93,7 @@ def stating_trained(encoder: Encoder, words: Words, space: str | None = None) ->
     table = encoder.tables.get(space) if space else encoder.words
     if table is None or table.trained is None or closed_table(words).trained is not None:
         return words
-    if isinstance(words, OpenVocabulary):
-        return words.trained_on(table.trained)
-    return replace(words, trained=tuple(name for name in table.trained if words.find(name) is not None))
+    return words.trained_on(table.trained)
 
 
 def head_source(source: FeatureSource, heads: HeadSet, head: MeasuredHead, text_encoder: str) -> FeatureSource:

@@ -92,7 +92,7 @@ class OpenVocabulary:
     def trained_on(self, names: Sequence[str]) -> "OpenVocabulary":
         """The vocabulary, stating that the encoder of the features was trained on these names."""
         vocabulary = self.including(names)
-        return OpenVocabulary(replace(vocabulary.table, trained=tuple(names)), lambda: vocabulary.tower)
+        return OpenVocabulary(vocabulary.table.trained_on(names), lambda: vocabulary.tower)
 
     def _embed(self, phrases: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
         try:

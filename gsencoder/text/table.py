@@ -5,7 +5,7 @@ import json
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,7 +70,6 @@ class TextTable:
     tower: TowerRecord | None = None
     trained: tuple[str, ...] | None = None
     _row_of: dict[str, int] = field(init=False, repr=False, default_factory=dict)
-    _trained_rows: tuple[int, ...] = field(init=False, repr=False, default=())
 
     def __post_init__(self) -> None:
         table = self.embeddings
@@ -106,13 +105,11 @@ class TextTable:
                 wrong = "repeated" if key else "empty"
                 raise InputError(f"TextTable: name {name[:MAX_SHOWN]!r} in row {row} is {wrong}")
             self._row_of[key] = row
-        rows = {name: self.find(name) for name in self.trained or ()}
-        missing = [name for name, row in rows.items() if row is None]
+        missing = sorted(set(self.trained or ()) - set(self.names))
         if missing:
             raise InputError(
                 f"TextTable: expected the names trained on among its {len(self)} names, got {missing[0][:MAX_SHOWN]!r}"
             )
-        object.__setattr__(self, "_trained_rows", tuple(rows.values()))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -124,7 +121,15 @@ class TextTable:
 
     def is_trained(self, word: str) -> bool | None:
         """Whether the encoder of the features was trained on a word; None where that is not stated."""
-        return None if self.trained is None else self.find(word) in self._trained_rows
+        if self.trained is None:
+            return None
+        row = self.find(word)
+        return row is not None and self.names[row] in self.trained
+
+    def trained_on(self, names: Iterable[str]) -> "TextTable":
+        """The table, stating that the encoder of the features was trained on those of these names that it has."""
+        rows = {row: None for name in names if (row := self.find(name)) is not None}
+        return replace(self, trained=tuple(self.names[row] for row in rows))
 
     def near(self, word: str, count: int = 6) -> tuple[str, ...]:
         """Suggestions for an unknown word: names that share a word with it, and names that are spelled similarly."""

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.text.build import Words, closed_table
-from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable
 from gsencoder.train.adapter_heads import asked_heads, dataset_heads, render_heads, teacher_of_heads
 from gsencoder.train.augment import AugmentConfig
@@ -29,6 +28,7 @@ from gsencoder.train.distributed import ProcessRank, check_agreement, join_proce
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
 from gsencoder.train.trainer import EncoderValidator, Trainer, TrainerConfig, ValidationResult
 from gsencoder.train.training_scene import TrainingScene
@@ -220,13 +220,11 @@ def fit(
     )
     score_encoder: EncoderValidator = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
     if validate is not None and held_out:
-        parts = [[dataset.find_scene(name) for dataset in datasets.values()] for name in held_out]
-        scenes = [TrainingScene(each) for each in parts if any(part is not None for part in each)]
+        held_out_parts = [_parts(datasets, name) for name in held_out]
+        scenes = [TrainingScene(parts) for parts in held_out_parts if any(part is not None for part in parts)]
         codebooks = {teacher.name: teacher.class_balance.codebook for teacher in recipe.teachers}
         score_encoder = lambda encoder: validate(scenes, encoder, outputs, codebooks)  # noqa: E731
-    scenes_to_train_on = [
-        TrainingScene([dataset.find_scene(name) for dataset in datasets.values()]) for name in training
-    ]
+    scenes_to_train_on = [TrainingScene(_parts(datasets, name)) for name in training]
     torch.manual_seed(config.train.seed)
     trainer = Trainer(
         GaussianEncoder(config.model, outputs.widths),
@@ -250,13 +248,16 @@ def fit(
     return Training(encoder=trainer.encoder, outputs=outputs, tables=tables, state=state, scores=scores)
 
 
+def _parts(datasets: Mapping[str, PreparedDataset], name: str) -> list[PreparedScene | None]:
+    """The prepared scene of each teacher; None for those that the scene lacks."""
+    return [dataset.find_scene(name) for dataset in datasets.values()]
+
+
 def _table_of(words: Words, dataset: PreparedDataset) -> TextTable:
     """The names that are known without a tower: those of a table, or of a tower's vocabulary and the dataset. It states
     those trained on, where the dataset has classes with names."""
     kinds = dataset.load_kinds()
-    if not kinds:
-        return closed_table(words)
-    return words.trained_on(kinds).table if isinstance(words, OpenVocabulary) else replace(words, trained=kinds)
+    return closed_table(words.trained_on(kinds) if kinds else words)
 
 
 def resume_settings(

@@ -78,10 +78,10 @@ def test_an_encoder_is_drawn_beside_the_truth(
 ) -> None:
     scenes, outputs, codebook = walls
     config = EncodeConfig(precision="float32")
-    found = validate_encoder(scenes, small_encoder(), outputs, {"sides": codebook}, config, pictured=1)["sides"]
-    assert found.sheet is not None
-    assert found.sheet.shape[2] == 3
-    assert len(np.unique(found.sheet.reshape(-1, 3), axis=0)) > 10
+    accuracy = validate_encoder(scenes, small_encoder(), outputs, {"sides": codebook}, config, pictured=1)["sides"]
+    assert accuracy.sheet is not None
+    assert accuracy.sheet.shape[2] == 3
+    assert len(np.unique(accuracy.sheet.reshape(-1, 3), axis=0)) > 10
 
 
 @pytest.mark.slow

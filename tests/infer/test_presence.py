@@ -252,8 +252,8 @@ def test_the_vocabulary_states_which_words_the_encoder_was_trained_on() -> None:
     trained = replace(TABLE, trained=("mug", "chair"))
     words = ["mugs", "spoon", "chair"]
     for table, stated in ((trained, [True, False, True]), (TABLE, [None, None, None])):
-        found = find_candidates(SCENE, words, table, EVERYTHING).words
-        assert [{each.trained for each in word.evidence} for word in found] == [{each} for each in stated]
+        candidates = find_candidates(SCENE, words, table, EVERYTHING).words
+        assert [{each.trained for each in word.evidence} for word in candidates] == [{each} for each in stated]
     # Rivals that are given have the last word, as they say what else there is.
-    given = find_candidates(SCENE, words, Phrases(), EVERYTHING, rivals=trained).words
-    assert given[1].evidence[0].trained is False
+    against_rivals = find_candidates(SCENE, words, Phrases(), EVERYTHING, rivals=trained).words
+    assert against_rivals[1].evidence[0].trained is False

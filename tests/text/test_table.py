@@ -118,6 +118,7 @@ def test_a_table_states_the_names_trained_on_and_so_does_its_file(table: TextTab
     for each in (trained, load_text_table(tmp_path / "table.safetensors")):
         assert each.trained == tuple(NAMES[:2])
         assert [each.is_trained(word) for word in (f"the {NAMES[1]}", NAMES[2], "no such word")] == [True, False, False]
+    assert table.trained_on(["the mugs", "mug", "zebra", "box"]).trained == ("mug", "box")
     assert replace(table, trained=()).is_trained(NAMES[0]) is False
     with pytest.raises(InputError, match="expected the names trained on among its .* names, got 'zebra'"):
         replace(table, trained=("zebra",))

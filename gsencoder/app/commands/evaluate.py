@@ -133,9 +133,9 @@ def _source(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     if config.weights:
         retain_freed_memory()
         encoder = load_encoder(config.weights, config.encode.device)
-        beside = encoder.tables.get(config.space) if config.space else encoder.words
-        if beside is not None and config.teacher == LabelsConfig() and config.text == TableTextConfig():
-            words: Words = words_of_table(beside)
+        table = encoder.tables.get(config.space) if config.space else encoder.words
+        if table is not None and config.teacher == LabelsConfig() and config.text == TableTextConfig():
+            words: Words = words_of_table(table)
         else:
             words = _given_words(config)
         space = config.space or space_of_words(encoder, words)
