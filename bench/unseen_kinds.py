@@ -37,13 +37,13 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import aabb_iou, queryable_objects
 from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error
-from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, stating_trained, with_features
+from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, with_features
 from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.text.build import Words
+from gsencoder.text.build import Words, stating_trained
 from gsencoder.types import Scene
 
 RIM = 2
@@ -207,7 +207,8 @@ def main() -> None:
     if arguments.weights:
         encoder = load_encoder(arguments.weights)
         source = encoder_source(encoder, space=arguments.space)
-        words = stating_trained(encoder, encoder.tables.get(arguments.space or "", words), arguments.space)
+        words = encoder.tables.get(arguments.space or "", words)
+        words = stating_trained(words, encoder.tables.get(arguments.space) if arguments.space else encoder.words)
     score(rooms, arguments.rooms, source, words, kinds)
 
 

@@ -16,7 +16,7 @@ from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder
-from gsencoder.text.build import Words, closed_table
+from gsencoder.text.build import Words
 from gsencoder.types import GaussianFeatures, Scene
 
 FeatureSource = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
@@ -80,20 +80,6 @@ def space_of_words(encoder: Encoder, words: Words) -> str | None:
             "those of one: give its words (teacher.words= or text=), or name it with space="
         )
     return fitting[0]
-
-
-def stating_trained(encoder: Encoder, words: Words, space: str | None = None) -> Words:
-    """Words that state the names on which an encoder was trained, where the table beside it does.
-
-    Args:
-        encoder: whose features are asked.
-        words: of the space; a closed table states those of the names that it has.
-        space: the teacher in whose space the words are; None = the only one.
-    """
-    table = encoder.tables.get(space) if space else encoder.words
-    if table is None or table.trained is None or closed_table(words).trained is not None:
-        return words
-    return words.trained_on(table.trained)
 
 
 def head_source(source: FeatureSource, heads: HeadSet, head: MeasuredHead, text_encoder: str) -> FeatureSource:

@@ -75,6 +75,18 @@ def words_of_table(table: TextTable, config: TextConfig = TableTextConfig()) -> 
     return OpenVocabulary(table, lambda: tower)
 
 
+def stating_trained(words: Words, beside: TextTable | None) -> Words:
+    """Words that state the names on which an encoder was trained, where the table beside its features does.
+
+    Args:
+        words: that are asked. Names that they state themselves stay; a closed table states those that it has.
+        beside: the table that was written with the encoder or its features.
+    """
+    if beside is None or beside.trained is None or closed_table(words).trained is not None:
+        return words
+    return words.trained_on(beside.trained)
+
+
 def find_tower(record: TowerRecord) -> TextTower:
     """Looks for a tower in the folder of models, first in the folder of its name, then in all others.
 

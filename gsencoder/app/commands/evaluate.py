@@ -41,7 +41,6 @@ from gsencoder.evaluate.sources import (
     head_source,
     load_scenes,
     space_of_words,
-    stating_trained,
 )
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.heads.of_teacher import heads_of
@@ -52,7 +51,7 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import file_of_encoder, load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, words_of_table
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, stating_trained, words_of_table
 from gsencoder.types import Scene
 
 SHOWN_NAMES = 15
@@ -139,7 +138,8 @@ def _source(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
         else:
             words = _given_words(config)
         space = config.space or space_of_words(encoder, words)
-        return encoder_source(encoder, config.encode, space), stating_trained(encoder, words, space)
+        beside = encoder.tables.get(space) if space else encoder.words
+        return encoder_source(encoder, config.encode, space), stating_trained(words, beside)
     words = _given_words(config)
     return fusion_source(config.teacher, words, config.fusion), words
 

@@ -8,8 +8,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, vocabulary_of, words_of_table
-from gsencoder.text.table import load_text_table
+from gsencoder.text.build import TableTextConfig, TextConfig, Words, stating_trained, vocabulary_of, words_of_table
+from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.types import FeatureSpace, Scene
 
 MAX_QUERIES_BYTES = 1 << 20
@@ -90,7 +90,7 @@ def load_words(folder: Path, space: FeatureSpace, given: str, text: TextConfig =
         InputError: there are no words, or the tower is another than the one that made them.
     """
     if given:
-        return words_of_table(load_text_table(given), text)
+        return stating_trained(words_of_table(load_text_table(given), text), _table_beside(folder, space))
     path = table_path(folder, space.text_encoder)
     if path is None and not isinstance(text, TableTextConfig):
         return vocabulary_of(text)
@@ -100,3 +100,12 @@ def load_words(folder: Path, space: FeatureSpace, given: str, text: TextConfig =
             "fuse with a teacher that has words, or give words= or text="
         )
     return words_of_table(load_text_table(path), text)
+
+
+def _table_beside(folder: Path, space: FeatureSpace) -> TextTable | None:
+    """The table of a space in a folder of features; None where it is lost or damaged, for which words= stands in."""
+    try:
+        path = table_path(folder, space.text_encoder)
+        return None if path is None else load_text_table(path)
+    except InputError:
+        return None

@@ -1,13 +1,18 @@
 """Where the words of `localize` come from."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gsencoder.app.commands.localize import LocalizeCommandConfig
-from gsencoder.app.commands.query_words import MAX_QUERIES_BYTES, query_words
+from gsencoder.app.commands.query_words import MAX_QUERIES_BYTES, load_words, query_words
 from gsencoder.core.errors import InputError
+from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.text.build import closed_table
+from gsencoder.text.table import make_text_table, save_text_table
 
 
 def words(**settings: object) -> list[str]:
@@ -42,3 +47,24 @@ def test_what_is_no_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     for path in (tmp_path / "pipe", tmp_path, tmp_path / "nothing", Path("/dev/zero")):
         with pytest.raises(InputError, match="is no file; expected a text file"):
             words(queries=str(path))
+
+
+def test_words_that_are_given_are_those_trained_on_that_the_folder_of_the_features_states(tmp_path: Path) -> None:
+    table = make_text_table(["mug", "ball"], np.eye(2, dtype=np.float32), "toy")
+    given = make_text_table(["mug", "cup"], np.eye(2, dtype=np.float32), "toy")
+    save_text_table(tmp_path / WORDS_FILE, table.trained_on(["mug", "ball"]))
+    save_text_table(tmp_path / "given.safetensors", given)
+    path = str(tmp_path / "given.safetensors")
+
+    def trained(folder: Path) -> tuple[str, ...] | None:
+        return closed_table(load_words(folder, table.space, path)).trained
+
+    assert trained(tmp_path) == ("mug",)
+    save_text_table(tmp_path / "given.safetensors", replace(given, trained=("cup",)))
+    assert trained(tmp_path) == ("cup",)
+    # Where the folder states none, or its table is lost or damaged, the words that are given are taken as they are.
+    save_text_table(tmp_path / "given.safetensors", given)
+    (tmp_path / "without").mkdir()
+    assert trained(tmp_path / "without") is None
+    (tmp_path / WORDS_FILE).write_bytes(b"damaged")
+    assert trained(tmp_path) is None
