@@ -1,6 +1,7 @@
 """Masks of SAM and SAM2: small random models of the true kinds beside direct calls of the library, and plain twins."""
 
 import json
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -126,7 +127,7 @@ def masks_of_library(folder: Path, model: Any, points: np.ndarray) -> tuple[np.n
 @pytest.mark.parametrize("side", [3, 6])
 def test_proposals_are_the_masks_that_the_library_gives_for_the_points(saved: Any, side: int) -> None:
     folder, model = saved(sam)
-    made = SamMasks(config_of(folder, points=side)).proposals(photograph())
+    made = list(SamMasks(config_of(folder, points=side)).proposals(photograph()))
     points = grid_points(side) * (WIDTH, HEIGHT)
     logits, scores = masks_of_library(folder, model, points)
     expected = [
@@ -136,6 +137,8 @@ def test_proposals_are_the_masks_that_the_library_gives_for_the_points(saved: An
         if scores[point, one] >= 0 and (logits[point, one] > 0).any()
     ]
     assert 3 < len(expected) == len(made)
+    assert [each.score for each in made] == sorted((each.score for each in made), reverse=True)
+    expected.sort(key=lambda each: -each[1])
     for proposal, (mask, score) in zip(made, expected, strict=True):
         assert (full(proposal) == mask).mean() > 0.995
         assert proposal.score == pytest.approx(score, abs=1e-4)
@@ -144,7 +147,7 @@ def test_proposals_are_the_masks_that_the_library_gives_for_the_points(saved: An
 
 def test_sam2_sees_the_picture_squeezed_into_its_square(saved: Any) -> None:
     folder, model = saved(sam2)
-    made = SamMasks(config_of(folder)).proposals(photograph())
+    made = list(SamMasks(config_of(folder)).proposals(photograph()))
     from PIL import Image
 
     squeezed = np.asarray(Image.fromarray(photograph()).resize((SIDE, SIDE), Image.Resampling.BILINEAR)) / 255
@@ -156,7 +159,8 @@ def test_sam2_sees_the_picture_squeezed_into_its_square(saved: Any) -> None:
             input_labels=torch.ones(1, 9, 1, dtype=torch.long),
         )
     logits = interpolate(outputs.pred_masks[0], (HEIGHT, WIDTH), mode="bilinear", align_corners=False).flatten(0, 1)
-    expected = [mask.numpy() for mask in logits > 0 if mask.any()]
+    order = (-outputs.iou_scores[0].flatten()).argsort(stable=True)
+    expected = [mask.numpy() for mask in logits[order] > 0 if mask.any()]
     assert 3 < len(expected) == len(made)
     for proposal, mask in zip(made, expected, strict=True):
         assert (full(proposal) == mask).mean() > 0.995
@@ -165,15 +169,27 @@ def test_sam2_sees_the_picture_squeezed_into_its_square(saved: Any) -> None:
 @pytest.mark.parametrize("make", [sam, sam2])
 def test_thresholds_leave_the_proposals_that_reach_them(saved: Any, make: Any) -> None:
     folder, _ = saved(make)
-    every = SamMasks(config_of(folder)).proposals(photograph())
+    every = list(SamMasks(config_of(folder)).proposals(photograph()))
     scores, areas = sorted(each.score for each in every), sorted(each.area for each in every)
     middle = scores[len(scores) // 2] - 1e-6
-    fewer = SamMasks(config_of(folder, min_iou=middle)).proposals(photograph())
+    fewer = list(SamMasks(config_of(folder, min_iou=middle)).proposals(photograph()))
     assert len(fewer) == sum(score >= middle for score in scores) < len(every)
     large = SamMasks(config_of(folder, min_area=areas[-1])).proposals(photograph())
     assert [each.area for each in large] == [areas[-1]] * areas.count(areas[-1])
-    steady = SamMasks(config_of(folder, min_stability=1.0)).proposals(photograph())
+    steady = list(SamMasks(config_of(folder, min_stability=1.0)).proposals(photograph()))
     assert len(steady) < len(every)
+
+
+def test_masks_of_a_large_photograph_are_made_one_at_a_time(saved: Any) -> None:
+    folder, _ = saved(sam)
+    masks, large = SamMasks(config_of(folder, points=4)), np.repeat(np.repeat(photograph(), 20, axis=0), 20, axis=1)
+    tracemalloc.start()
+    count = sum(1 for _ in masks.proposals(large))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    pixels = large.shape[0] * large.shape[1]
+    assert count > 16
+    assert peak < 8 * pixels
 
 
 def test_stability_is_the_iou_of_two_thresholds() -> None:
@@ -208,7 +224,7 @@ def test_iou_of_boxed_masks_is_that_of_whole_masks(rng: np.random.Generator) -> 
 @pytest.mark.parametrize("most", [0.0, 0.3, 1.0])
 def test_of_masks_that_overlap_too_much_the_best_stays(rng: np.random.Generator, most: float) -> None:
     proposals = random_proposals(rng)
-    staying = suppress(proposals, most)
+    staying = suppress(sorted(proposals, key=lambda each: -each.score), most)
     assert [each.score for each in staying] == sorted((each.score for each in staying), reverse=True)
     for index, one in enumerate(staying):
         assert all(mask_iou(one, better) <= most for better in staying[:index])
@@ -267,11 +283,11 @@ def test_the_published_form_of_sam2_a_model_of_videos_makes_masks_of_pictures(sa
         "memory_fuser_embed_dim": 32,
         "memory_fuser_intermediate_dim": 32,
     }
-    of_pictures = SamMasks(config_of(folder)).proposals(photograph())
+    of_pictures = list(SamMasks(config_of(folder)).proposals(photograph()))
     video = transformers.Sam2VideoModel(transformers.Sam2VideoConfig(**parts, **sizes))
     assert not video.load_state_dict(model.state_dict(), strict=False).unexpected_keys
     video.save_pretrained(folder)
-    of_videos = SamMasks(config_of(folder)).proposals(photograph())
+    of_videos = list(SamMasks(config_of(folder)).proposals(photograph()))
     assert len(of_videos) == len(of_pictures) > 3
     for one, other in zip(of_videos, of_pictures, strict=True):
         np.testing.assert_array_equal(full(one), full(other))

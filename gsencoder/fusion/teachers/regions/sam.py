@@ -5,7 +5,7 @@ whose stability are large enough; of two that overlap too much the one with the 
 overlaps, as a mug and the table under it, is painted with the smaller mask on top.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,27 +112,39 @@ class SamMasks:
             raise MissingInput(f"{WHAT}: masks=sam: the scene has no pictures")
         image = views.images[view]
         try:
-            proposals = self.proposals(image)
+            staying = suppress(self.proposals(image), self.config.max_overlap)
         except (InputError, RuntimeError) as error:
             message = " ".join(str(error).split())[:200]
             advice = "" if isinstance(error, InputError) else "; expected a configuration and weights of one SAM model"
             raise InputError(f"{WHAT}: view {views.names[view]!r}: {message}{advice}") from error
-        return paint(suppress(proposals, self.config.max_overlap), image.shape[:2])
+        return paint(staying, image.shape[:2])
 
-    def proposals(self, image: UInt8[np.ndarray, "H W 3"]) -> list[Proposal]:
-        """All masks of the points of the grid whose predicted IoU, stability and size are large enough.
+    def proposals(self, image: UInt8[np.ndarray, "H W 3"]) -> Iterator[Proposal]:
+        """All masks of the points of the grid whose predicted IoU, stability and size are large enough, best first.
+
+        Masks are made at the resolution of the photograph one at a time, so that memory does not grow with it.
 
         Raises:
             InputError: outputs that are not finite.
         """
-        import torch
-
         from gsencoder.core.runtime.device import enough_memory
 
         prepared = self._prepare(image)
         size = image.shape[0], image.shape[1]
+        for score, logits in sorted(self._candidates(prepared), key=lambda candidate: -candidate[0]):
+            with enough_memory(WHAT, "teacher.points="):
+                proposal = self._proposal(self._logits_of_picture(logits, prepared, size), score)
+            if proposal is not None:
+                yield proposal
+
+    def _candidates(self, prepared: _Input) -> list[tuple[float, Any]]:
+        """The masks whose predicted IoU is large enough, as that IoU and logits of the model's own resolution."""
+        import torch
+
+        from gsencoder.core.runtime.device import enough_memory
+
         points = grid_points(self.config.points) * np.array([prepared.columns, prepared.rows], np.float32)
-        proposals = []
+        candidates: list[tuple[float, Any]] = []
         with torch.inference_mode(), enough_memory(WHAT, "teacher.points="):
             embeddings = self._model.get_image_embeddings(prepared.tensor)
             for start in range(0, len(points), POINTS_AT_ONCE):
@@ -147,11 +159,9 @@ class SamMasks:
                 if not (torch.isfinite(scores).all() and torch.isfinite(masks).all()):
                     raise InputError("masks or scores of SAM are not finite; check the weights")
                 good = torch.nonzero(scores >= self.config.min_iou)[:, 0]
-                for row in good.tolist():
-                    logits = self._logits_of_picture(masks[row], prepared, size)
-                    proposal = self._proposal(logits, float(scores[row]))
-                    proposals += [proposal] if proposal is not None else []
-        return proposals
+                # Indexing copies, so that the other masks of the chunk are freed.
+                candidates += zip(scores[good].tolist(), masks[good], strict=True)
+        return candidates
 
     def _prepare(self, image: UInt8[np.ndarray, "H W 3"]) -> _Input:
         import torch
@@ -216,11 +226,11 @@ def mask_iou(a: Proposal, b: Proposal) -> float:
     return shared / (a.area + b.area - shared)
 
 
-def suppress(proposals: Sequence[Proposal], max_overlap: float) -> list[Proposal]:
-    """Greedy non-maximum suppression: from the best score down, a mask stays if its IoU with no better one that stays
-    is above `max_overlap`."""
+def suppress(proposals: Iterable[Proposal], max_overlap: float) -> list[Proposal]:
+    """Greedy non-maximum suppression of masks, best score first: one stays if its IoU with no better one that stays is
+    above `max_overlap`."""
     staying: list[Proposal] = []
-    for proposal in sorted(proposals, key=lambda each: -each.score):
+    for proposal in proposals:
         if not any(_overlap(proposal, better, max_overlap) for better in staying):
             staying.append(proposal)
     return staying
