@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int32
 
 from gsencoder.core.runtime.clock import timed
 from gsencoder.fusion.basis import to_coordinates
@@ -13,6 +13,11 @@ from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import depth_image
 from gsencoder.render.rays import grid_lattice
 from gsencoder.types import FeatureBasis, FeatureMap, Gaussians, Views
+
+MAX_CODES = 256
+"""Up to so many codes are summed by code, however few coordinates there are."""
+BLOCK_VALUES = 1 << 27
+"""Values of a map that are made at once from its codes, 0.5 GiB."""
 
 
 def map_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "P D"]:
@@ -47,9 +52,10 @@ class FeatureSums:
     rows.
 
     Attributes:
-        sums: Σ Bᵀ @ maps in coordinates of the basis (or channels); of maps with one table Σ Bᵀ @ shares, where the
-            shares of a code are one_hot(code), if all maps share it.
-        weights: Σ Bᵀ @ 1; zero where maps share a table, since their weights are the row sums.
+        sums: Σ Bᵀ @ maps in coordinates of the basis (or channels); of maps that share a table Σ Bᵀ @ shares, where the
+            shares of a code are one_hot(code).
+        weights: Σ Bᵀ @ 1; zero where sums are by rows of a table, since their weights are the row sums.
+        table: by whose rows maps are summed; None where sums are of vectors.
         views: how many views were added.
     """
 
@@ -60,11 +66,13 @@ class FeatureSums:
         gaussians: number of rows.
         columns: coordinates or channels of a row.
         basis: whose coordinates are summed; None = channels.
-        table: that all maps share; None = dense maps, or maps with a table each.
+        table: that all maps share; None = dense maps, or maps with a table each. Sums are by its rows, unless it
+            has so many that sums of vectors are far narrower.
         """
-        self.basis, self.table, self.views = basis, table, 0
+        self.basis, self.views, self._shared = basis, 0, table
+        self.table = table if table is not None and _few_codes(len(table), columns) else None
         # numpy, not torch, allocates what is large: its arrays lie in huge pages, which fill many times faster.
-        width = columns if table is None else len(table)
+        width = columns if self.table is None else len(self.table)
         self.sums: Float32[np.ndarray, "N columns"] = np.zeros((gaussians, width), np.float32)
         self.weights: Float32[np.ndarray, " N"] = np.zeros(gaussians, np.float32)
 
@@ -78,6 +86,9 @@ class FeatureSums:
             return
         if feature_map.codes is not None:
             self._add_coded(b, feature_map, share)
+            return
+        if feature_map.shares is not None and self._shared is not None:
+            self._add_mixed(b, feature_map, share)
             return
         vectors = map_rows(feature_map)
         scale = np.isfinite(vectors[:, 0]).astype(np.float32)
@@ -97,10 +108,40 @@ class FeatureSums:
         assert table is not None
         if not len(table):
             return
+        vectors = self._in_columns(table)
+        if not _few_codes(len(table), self.sums.shape[1]):
+            self._add_vectors(b, _codes_in_mask(feature_map, share), vectors)
+            return
         sums = np.zeros((len(self.weights), len(table)), np.float32)
         _lift_shares_into(b, feature_map, share, sums)
-        self.sums += sums @ (to_coordinates(self.basis, table) if self.basis is not None else table)
+        self.sums += sums @ vectors
         self.weights += sums.sum(axis=1)
+
+    def _add_vectors(self, b: Blend, codes: Int32[np.ndarray, " P"], vectors: Float32[np.ndarray, "C columns"]) -> None:
+        """Adds the vectors of codes, a few coordinates at a time: sums by code would be wider than those of vectors."""
+        has_vector = (codes >= 0).astype(np.float32)
+        b.lift_into(torch.from_numpy(has_vector[:, None]), torch.from_numpy(self.weights[:, None]))
+        # The row behind the last one is what code −1 takes.
+        padded = np.concatenate([vectors, np.zeros_like(vectors[:1])])
+        width = max(1, BLOCK_VALUES // len(codes))
+        for start in range(0, vectors.shape[1], width):
+            maps = np.ascontiguousarray(padded[:, start : start + width])[codes]
+            sums = np.zeros((len(self.sums), maps.shape[1]), np.float32)
+            b.lift_into(torch.from_numpy(maps), torch.from_numpy(sums))
+            self.sums[:, start : start + width] += sums
+
+    def _add_mixed(self, b: Blend, feature_map: FeatureMap, share: Float32[np.ndarray, " P"] | None) -> None:
+        """Adds shares of a table that has too many rows for sums by code."""
+        assert feature_map.shares is not None
+        assert self._shared is not None
+        shares = feature_map.shares.reshape(-1, len(self._shared))
+        if share is not None:
+            shares = shares * share[:, None]
+        b.lift_into(torch.from_numpy(shares @ self._in_columns(self._shared)), torch.from_numpy(self.sums))
+        b.lift_into(torch.from_numpy(shares.sum(axis=1, keepdims=True)), torch.from_numpy(self.weights[:, None]))
+
+    def _in_columns(self, table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C columns"]:
+        return to_coordinates(self.basis, table) if self.basis is not None else table
 
     @timed("lift")
     def finish(self) -> tuple[Float32[np.ndarray, "N columns"], Float32[np.ndarray, " N"]]:
@@ -109,11 +150,23 @@ class FeatureSums:
             weights, sums = self.weights, self.sums
         else:
             weights = self.sums.sum(axis=1)
-            sums = self.sums @ (to_coordinates(self.basis, self.table) if self.basis is not None else self.table)
+            sums = self.sums @ self._in_columns(self.table)
         # A row whose whole weight is below the smallest normal number would divide into noise or infinity.
         seen = weights > np.finfo(np.float32).tiny
         features = np.divide(sums, weights[:, None], where=seen[:, None], out=np.zeros_like(sums))
         return features, np.where(seen, weights, 0).astype(np.float32)
+
+
+def _few_codes(codes: int, columns: int) -> bool:
+    """Whether sums by code are no wider than is worth it: one product at the end instead of one for each view."""
+    return codes <= max(MAX_CODES, 2 * columns)
+
+
+def _codes_in_mask(feature_map: FeatureMap, share: Float32[np.ndarray, " P"] | None) -> Int32[np.ndarray, " P"]:
+    """The codes of a map's cells; −1 where at most half of a cell is in the mask."""
+    assert feature_map.codes is not None
+    codes = feature_map.codes.ravel()
+    return codes if share is None else np.where(share > 0.5, codes, np.int32(-1))
 
 
 def _lift_shares_into(
@@ -129,11 +182,7 @@ def _lift_shares_into(
             shares = shares * share[:, None]
         b.lift_into(torch.from_numpy(shares), torch.from_numpy(sums))
         return
-    assert feature_map.codes is not None
-    codes = feature_map.codes.ravel()
-    if share is not None:
-        codes = np.where(share > 0.5, codes, np.int32(-1))
-    b.lift_codes_into(torch.from_numpy(codes), torch.from_numpy(sums))
+    b.lift_codes_into(torch.from_numpy(_codes_in_mask(feature_map, share)), torch.from_numpy(sums))
 
 
 def view_matrix(

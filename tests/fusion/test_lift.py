@@ -5,11 +5,12 @@ import pytest
 import torch
 from splats import front_camera, random_gaussians
 
+from gsencoder.fusion import lift
 from gsencoder.fusion.lift import FeatureSums, capped, center_matrix, map_rows, view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import depth_image
-from gsencoder.types import FeatureMap, FeatureSpace, Views
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Views
 
 WIDTH, HEIGHT, STRIDE = 32, 24, 4
 CAMERA = front_camera(WIDTH, HEIGHT, 30.0)
@@ -62,6 +63,38 @@ def test_shares_are_masked_in_part_and_codes_where_most_of_their_cell_is_out(
     dense = b.render(torch.eye(100)).numpy().astype(np.float64)
     np.testing.assert_allclose(sums.sums, dense.T @ rows.reshape(-1, 3), rtol=1e-3, atol=1e-5)
     assert (sums.views, sums.weights.any()) == (2, False)
+
+
+@pytest.mark.parametrize("rank", [None, 2])
+@pytest.mark.parametrize("form", ["codes", "shares", "own tables"])
+def test_many_codes_are_lifted_as_vectors_with_the_same_result(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, form: str, rank: int | None
+) -> None:
+    shape, space = (HEIGHT // STRIDE, WIDTH // STRIDE), FeatureSpace(name="s", channels=4)
+    table, affine = rng.normal(size=(9, 4)).astype(np.float32), np.array([[1 / STRIDE, 0, 0], [0, 1 / STRIDE, 0]])
+    basis = None
+    if rank is not None:
+        axes = np.linalg.qr(rng.normal(size=(4, rank)))[0].T.astype(np.float32)
+        basis = FeatureBasis(mean=table.mean(axis=0), components=axes, energy_kept=0.9, space=space)
+    codes = rng.integers(-1, 9, shape).astype(np.int32)
+    values = {"shares": rng.random((*shape, 9)).astype(np.float32)} if form == "shares" else {"codes": codes}
+    made = FeatureMap(**values, table=table, grid_from_image=affine, space=space)
+    b, mask = blend(random_gaussians(100), CAMERA, like=made), rng.random((HEIGHT, WIDTH)) < 0.8
+
+    def lifted() -> tuple[np.ndarray, np.ndarray]:
+        sums = FeatureSums(100, rank or 4, basis, None if form == "own tables" else table)
+        sums.add(b, made, mask)
+        sums.add(b, made, None)
+        return sums.finish()
+
+    features, weights = lifted()
+    # Each table has now more rows than are summed by code, and the vectors are made three coordinates at a time.
+    monkeypatch.setattr(lift, "MAX_CODES", 0)
+    monkeypatch.setattr(lift, "BLOCK_VALUES", 3 * codes.size)
+    assert FeatureSums(100, rank or 4, basis, table).table is None
+    for one, other in zip(lifted(), (features, weights), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+    assert (weights > 0).sum() > 50
 
 
 def test_sensor_depth_hides_what_lies_behind_it() -> None:
