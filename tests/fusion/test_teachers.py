@@ -7,10 +7,12 @@ import pytest
 from splats import front_camera
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.teachers.labels import LabelsTeacher
+from gsencoder.fusion.teachers.build import build_teacher
+from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.palette import _PROTOTYPES, COLOR_NAMES, PaletteConfig, PaletteTeacher, lab_from_rgb
-from gsencoder.types import SceneObject, Views
+from gsencoder.text.table import make_text_table
+from gsencoder.types import Scene, SceneObject, Views
 
 
 def views_of(image: np.ndarray | None = None, instances: np.ndarray | None = None) -> Views:
@@ -267,3 +269,12 @@ def test_class_vectors_from_a_damaged_file_are_refused(tmp_path: Path, content: 
 def test_a_palette_without_a_usable_softness_is_refused(softness: float) -> None:
     with pytest.raises(InputError, match="softness: expected a distance"):
         PaletteConfig(softness=softness)
+
+
+def test_labels_are_built_with_the_cells_that_are_asked_for() -> None:
+    words = make_text_table(("mug", "cup"), np.eye(2, dtype=np.float32), "w")
+    labeled = Scene(name="s", objects=(SceneObject(id=1, name="mug", aabb_min=np.zeros(3), aabb_max=np.ones(3)),))
+    for cell in (1, 3):
+        teacher = build_teacher(LabelsConfig(cell=cell), labeled, words)
+        assert isinstance(teacher, LabelsTeacher)
+        assert (teacher.cell, teacher.table is None) == (cell, cell > 1)

@@ -12,8 +12,9 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer.localize.boxes import Cluster
 from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, find_candidates, localize
+from gsencoder.infer.localize.localize import LocalizeConfig, find_candidates, localize, select_features
 from gsencoder.infer.localize.presence import (
+    LEAST_ATTAINABLE,
     SYNONYM,
     TRAINED,
     UNTRAINED,
@@ -257,3 +258,53 @@ def test_the_vocabulary_states_which_words_the_encoder_was_trained_on() -> None:
     # Rivals that are given have the last word, as they say what else there is.
     against_rivals = find_candidates(SCENE, words, Phrases(), EVERYTHING, rivals=trained).words
     assert against_rivals[1].evidence[0].trained is False
+
+
+@pytest.mark.parametrize("likeness", [0.2, 0.5, 0.8])
+def test_a_phrase_is_judged_relative_to_the_name_that_comes_nearest_to_it(likeness: float) -> None:
+    features = SCENE.features["toy"]
+    rows = np.arange(2000, 2125)
+    cluster = Cluster(rows=rows, score=1.0, weight=1.0, share=0.5)
+
+    def evidence(vector: np.ndarray) -> Evidence:
+        cosines = relevancy(features, vector[None], TABLE.mean)[0]
+        (one,) = Presence(features, TABLE.mean, TABLE).evidence(vector, cosines, [cluster])
+        return one
+
+    mug = TABLE.embeddings[WORDS.index("mug")]
+    direction = (mug - TABLE.mean) / np.linalg.norm(mug - TABLE.mean)
+    # Across everything that is in the scene and all words: channel 14 is in none of them.
+    phrase = (TABLE.mean + likeness * direction + math.sqrt(1 - likeness**2) * np.eye(16)[14]).astype(np.float32)
+    of_name, of_phrase = evidence(mug), evidence(phrase)
+    attainable = max(likeness, LEAST_ATTAINABLE)
+    assert of_phrase.mean == pytest.approx(of_name.mean * likeness / attainable, abs=0.02)
+    if likeness < LEAST_ATTAINABLE:
+        return
+    # Mug, and cup beside it, come as near to the phrase as any name does: neither is a rival.
+    assert of_phrase.margin == pytest.approx(of_phrase.mean - (of_name.mean - of_name.margin), abs=0.02)
+
+
+@pytest.mark.parametrize("trained", [None, (), ("mug",), ("spoon", "chair")])
+def test_boxes_are_as_probable_as_is_asked_whatever_was_trained_on(trained: tuple[str, ...] | None) -> None:
+    table, words = replace(TABLE, trained=trained), ["mug", "spoon", "chair"]
+    everything = quietly(SCENE, words, table, EVERYTHING)
+    for least in (0.0, *(box.probability for box in everything.boxes), 1.0):
+        asked = quietly(SCENE, words, table, LocalizeConfig(min_probability=least))
+        expected = [(box.query, box.probability) for box in everything.boxes if box.probability >= least]
+        assert [(box.query, box.probability) for box in asked.boxes] == expected
+
+
+def test_of_several_feature_sets_the_named_one_is_asked_by_key_space_or_teacher() -> None:
+    own = SCENE.features["toy"]
+    space = replace(own.space, name="other", teacher="colors")
+    other = replace(own, features=own.features[::-1].copy(), space=space)
+    both = replace(SCENE, features={"a": own, "b": other})
+    alone = {
+        name: quietly(replace(SCENE, features={name: both.features[name]}), ["mug"], TABLE) for name in both.features
+    }
+    for key, names in (("a", ("a", own.space.name, own.space.teacher)), ("b", ("b", "other", "colors"))):
+        for name in names:
+            assert select_features(both, name)[1] is both.features[key]
+            asked = quietly(both, ["mug"], TABLE, space=name)
+            np.testing.assert_array_equal(asked.relevancy, alone[key].relevancy)
+    assert not np.array_equal(alone["a"].relevancy, alone["b"].relevancy)

@@ -1,19 +1,17 @@
 """An encoder with several teachers: what each of them contributes is what it contributes alone."""
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from joint_training import Datasets, HeightTeacher, batch_of, joint, prepared_by_both
 from training_scenes import (
     LOSSES,
     PREPARE,
     SHORT,
-    SMALL,
-    DenseSideTeacher,
     SideTeacher,
     prepared,
     samples,
@@ -34,56 +32,14 @@ from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
 from gsencoder.train.run import TrainConfig, resume_settings
-from gsencoder.train.samples import Batch, SampleDataset, SampleRecipe, TeacherRecipe, join_samples
+from gsencoder.train.samples import SampleDataset
 from gsencoder.train.trainer import Trainer
 from gsencoder.train.training_scene import TrainingScene
-from gsencoder.types import FeatureMap, FeatureSpace, Views
-
-TALL = FeatureSpace(name="heights", channels=4)
-
-
-class HeightTeacher(DenseSideTeacher):
-    """Says of cells of two pixels how high in the picture they are."""
-
-    space = TALL
-
-    def feature_map(self, views: Views, view: int) -> FeatureMap:
-        seen = super().feature_map(views, view)
-        assert seen.features is not None
-        rows = np.linspace(-1, 1, len(seen.features), dtype=np.float32)[:, None]
-        features = np.stack(np.broadcast_arrays(rows, rows**2, np.sin(3 * rows), np.float32(0)), axis=-1)
-        features = np.broadcast_to(features, seen.features.shape).astype(np.float32)
-        return FeatureMap(features=features.copy(), grid_from_image=seen.grid_from_image, space=TALL)
-
-
-Datasets = Mapping[str, tuple[PreparedDataset, list[str]]]
 
 
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory: pytest.TempPathFactory) -> Datasets:
-    """The same walls, prepared for two teachers; the second one lacks the last wall."""
-    folder = tmp_path_factory.mktemp("prepared")
-    sides, names = prepared(folder / "sides", teacher=SideTeacher())
-    heights, _ = prepared(folder / "heights", count=2, teacher=HeightTeacher())
-    return {"sides": (sides, names), "heights": (heights, names)}
-
-
-def joint(datasets: Datasets, weights: Mapping[str, float] = {}, **changes: object) -> SampleDataset:
-    """Samples of all walls with the targets of both teachers."""
-    recipe: SampleRecipe = samples(*datasets["sides"], **changes).recipe
-    teachers = tuple(
-        TeacherRecipe(name=name, class_balance=dataset.load_class_balance(), weight=weights.get(name, 1.0))
-        for name, (dataset, _) in datasets.items()
-    )
-    names = datasets["sides"][1]
-    scenes = [TrainingScene([dataset.find_scene(name) for dataset, _ in datasets.values()]) for name in names]
-    return SampleDataset(scenes, replace(recipe, teachers=teachers))
-
-
-def batch_of(data: SampleDataset, numbers: range) -> Batch:
-    batch = join_samples([data[number] for number in numbers], SMALL.transformer.patch)
-    assert isinstance(batch, Batch)
-    return batch
+    return prepared_by_both(tmp_path_factory.mktemp("prepared"))
 
 
 def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alone(datasets: Datasets) -> None:

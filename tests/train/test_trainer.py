@@ -24,7 +24,13 @@ from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.trainer import Trainer, TrainerConfig, ValidationResult, _silence_connection_errors
+from gsencoder.train.trainer import (
+    Trainer,
+    TrainerConfig,
+    ValidationResult,
+    _parameter_groups,
+    _silence_connection_errors,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -450,3 +456,12 @@ def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_
     subprocess.run([sys.executable, "-W", "ignore", str(cut)], check=True, timeout=300)
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
     assert_same_weights(tmp_path / "cut", tmp_path / "whole")
+
+
+def test_matrices_decay_and_norms_and_biases_do_not() -> None:
+    encoder = small_encoder([4, 4])
+    groups = _parameter_groups(encoder, replace(SHORT, weight_decay=0.3))
+    decay = {id(value): group["weight_decay"] for group in groups for value in group["params"]}
+    assert len(decay) == sum(len(group["params"]) for group in groups) == len(list(encoder.parameters()))
+    for name, value in encoder.named_parameters():
+        assert decay[id(value)] == (0.0 if name.endswith("bias") or "norm" in name else 0.3), name

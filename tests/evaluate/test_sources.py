@@ -1,0 +1,87 @@
+"""Of an encoder with several teachers, the space that is asked for is the one that is evaluated."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from splats import random_gaussians
+
+from gsencoder.app.commands import evaluate
+from gsencoder.core.errors import InputError
+from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words
+from gsencoder.text.build import stating_trained
+from gsencoder.text.table import TextTable, make_text_table, save_text_table
+from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
+
+WORDS = {name: make_text_table(("mug", "cup"), np.eye(2, dtype=np.float32), f"{name}-words") for name in "abc"}
+TRAINED = {name: replace(table, trained=("cup",)) for name, table in WORDS.items()}
+
+
+class Stub:
+    """An encoder whose features say nothing but which space they are of."""
+
+    voxel = 0.02
+    made_by: Mapping[str, Any] = {}
+
+    def __init__(self, tables: Mapping[str, TextTable] = TRAINED) -> None:
+        self.tables = tables
+        self.spaces = {name: FeatureSpace(name=name, channels=2, text_encoder=f"{name}-words") for name in WORDS}
+        self.words = next(iter(tables.values()), None)
+
+    def encode_spaces(self, gaussians: Gaussians, *_: object, **__: object) -> dict[str, GaussianFeatures]:
+        rows = np.ones((len(gaussians), 2), np.float32)
+        return {
+            name: GaussianFeatures(features=rows, weights=rows[:, 0], mean=rows[0], space=space)
+            for name, space in self.spaces.items()
+        }
+
+    def encode(self, gaussians: Gaussians, *_: object, space: str, **__: object) -> GaussianFeatures:
+        return self.encode_spaces(gaussians)[space]
+
+
+def asked(source: FeatureSource) -> str:
+    """The name of the space of a source's features."""
+    features, _ = source(Scene(name="s", gaussians=random_gaussians(5), metres_per_unit=1.0))
+    return features.space.name
+
+
+@pytest.mark.parametrize("name", ["a", "b", "c"])
+def test_the_space_is_that_which_is_named_or_that_of_the_words(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    encoder: Any = Stub()
+    assert asked(encoder_source(encoder, space=name)) == name
+    assert space_of_words(encoder, WORDS[name]) == name
+    monkeypatch.setattr(evaluate, "load_encoder", lambda *_: encoder)
+    source, words = evaluate._source(evaluate.EvaluateConfig(paths=("s",), weights="w", space=name))
+    assert asked(source) == name
+    assert words.space.text_encoder == f"{name}-words"
+    save_text_table(tmp_path / "words.safetensors", WORDS[name])
+    own = replace(evaluate.LabelsConfig(), words=str(tmp_path / "words.safetensors"))
+    source, words = evaluate._source(evaluate.EvaluateConfig(paths=("s",), weights="w", teacher=own))
+    assert asked(source) == name
+    # What the encoder was trained on is stated by the table of this space, also for words that are given.
+    assert words.trained == ("cup",)
+
+
+def test_two_spaces_of_one_text_encoder_are_told_apart_by_their_name_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoder: Any = Stub(TRAINED | {"b": TRAINED["a"]})
+    encoder.spaces["b"] = replace(encoder.spaces["b"], text_encoder="a-words")
+    with pytest.raises(InputError, match="those of 2 of the encoder's teachers"):
+        space_of_words(encoder, WORDS["a"])
+    monkeypatch.setattr(evaluate, "load_encoder", lambda *_: encoder)
+    for name in ("a", "b"):
+        source, _ = evaluate._source(evaluate.EvaluateConfig(paths=("s",), weights="w", space=name))
+        assert asked(source) == name
+
+
+def test_words_state_the_names_trained_on_where_the_table_beside_them_does() -> None:
+    assert stating_trained(WORDS["a"], TRAINED["a"]).trained == ("cup",)  # type: ignore[union-attr]
+    other = replace(TRAINED["b"], trained=("mug",))
+    # Words that state them themselves stay as they are.
+    assert stating_trained(other, TRAINED["a"]).trained == ("mug",)  # type: ignore[union-attr]
+    for table in (WORDS["a"], None):
+        assert stating_trained(WORDS["a"], table).trained is None  # type: ignore[union-attr]

@@ -1,0 +1,137 @@
+"""What a training gives its loop: weight and classes of each teacher, parts of each scene, and what is held out."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from training_scenes import LOSSES, SMALL, DenseSideTeacher, SideTeacher, prepared
+
+from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
+from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.heads.store import save_heads
+from gsencoder.fusion.store.heads_file import HEADS_FILE
+from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.fusion.teachers.radio import RadioConfig
+from gsencoder.models.output_space import OutputSpaces
+from gsencoder.train import run
+from gsencoder.train.distributed import ProcessRank
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.run import TrainConfig, fit
+from gsencoder.train.samples import SampleDataset
+from gsencoder.train.trainer import ValidationResult
+from gsencoder.types import FeatureSpace
+
+Datasets = Mapping[str, PreparedDataset]
+
+
+class DenseTeacher(DenseSideTeacher):
+    """A dense teacher of a space of its own."""
+
+    space = FeatureSpace(name="dense sides", channels=4)
+
+    def feature_map(self, views: Any, view: int) -> Any:
+        return replace(super().feature_map(views, view), space=self.space)
+
+
+class Begun(Exception):
+    """Raised instead of the training loop."""
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> Datasets:
+    """Three walls with a coded teacher, of which the last lacks the dense one."""
+    folder = tmp_path_factory.mktemp("prepared")
+    coded, _ = prepared(folder / "coded", teacher=SideTeacher())
+    dense, _ = prepared(folder / "dense", count=2, teacher=DenseTeacher())
+    return {"coded": coded, "dense": dense}
+
+
+def begin(
+    datasets: Datasets,
+    training: Sequence[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    heads: tuple[str, ...] = (),
+    **losses: Any,
+) -> tuple[SampleDataset, list[str], dict[str, Any]]:
+    """The samples and heads that `fit` gives the loop, and the scenes that its validation is given."""
+    given: dict[str, Any] = {}
+
+    def trainer(encoder: torch.nn.Module, dataset: SampleDataset, *others: object, **named: Any) -> None:
+        given.update(dataset=dataset, heads=named["heads"])
+        named["validate"](encoder)
+        raise Begun
+
+    def validate(scenes: Sequence[Any], encoder: object, outputs: OutputSpaces, codebooks: object) -> ValidationResult:
+        given.update(validated=[scene.name for scene in scenes])
+        return ValidationResult({})
+
+    monkeypatch.setattr(run, "Trainer", trainer)
+    # Nothing of the teachers is read here but which of them has heads.
+    teachers = {name: RadioConfig() if name == "dense" else PaletteConfig() for name in datasets}
+    config = TrainConfig(teachers=teachers, model=SMALL, loss=replace(LOSSES, **losses), heads=heads)
+    around = {"work": tmp_path, "process": ProcessRank(), "device": torch.device("cpu")}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(Begun):
+            fit(datasets, training, ["wall_1"], {}, config, validate=validate, **around)  # type: ignore[arg-type]
+    return given["dataset"], given["validated"], given["heads"]
+
+
+def test_each_teacher_has_its_own_weight_and_classes(
+    datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for weights, expected in (((), [1.0, 1.0]), ((2.0, 0.25), [2.0, 0.25])):
+        data, *_ = begin(datasets, ["wall_0"], tmp_path, monkeypatch, teacher_weights=weights)
+        assert [teacher.weight for teacher in data.recipe.teachers] == expected
+        for teacher, (name, dataset) in zip(data.recipe.teachers, datasets.items(), strict=True):
+            assert teacher.name == name
+            np.testing.assert_array_equal(teacher.class_balance.codebook, dataset.load_class_balance().codebook)
+
+
+@pytest.mark.parametrize(("clusters", "expected"), [(False, [True, False]), (True, [True, True])])
+def test_each_teacher_with_classes_has_a_contrast(
+    clusters: bool, expected: list[bool], datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, *_ = begin(datasets, ["wall_0"], tmp_path, monkeypatch, contrast_clusters=clusters)
+    assert [teacher.contrast for teacher in data.recipe.teachers] == expected
+    # The order of teachers does not matter.
+    reversed_order = {name: datasets[name] for name in reversed(datasets)}
+    data, *_ = begin(reversed_order, ["wall_0"], tmp_path, monkeypatch, contrast_clusters=clusters)
+    assert [teacher.contrast for teacher in data.recipe.teachers] == expected[::-1]
+
+
+def test_scenes_are_numbered_by_name_each_with_its_own_parts_and_others_are_validated(
+    datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, validated, _ = begin(datasets, ["wall_2", "wall_0"], tmp_path, monkeypatch)
+    assert [scene.name for scene in data.scenes] == ["wall_0", "wall_2"]
+    assert [[part.name if part else None for part in scene.parts] for scene in data.scenes] == [
+        ["wall_0", "wall_0"],
+        ["wall_2", None],
+    ]
+    assert validated == ["wall_1"]
+
+
+def test_the_heads_of_the_render_loss_go_to_the_teacher_that_has_them(
+    datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert begin(datasets, ["wall_0"], tmp_path, monkeypatch)[2] == {"dense": []}
+    head = Head(name="siglip.summary", body=torch.nn.Sequential(torch.nn.Linear(4, 3)))
+    fit_of_head = HeadFit(cells=5, cosine=0.9, worst=0.5)
+    measured = MeasuredHead(head=head, mean=np.arange(3, dtype=np.float32), scale=2.0, fit=fit_of_head)
+    path = datasets["dense"].folder / HEADS_FILE
+    save_heads(path, HeadSet(space=DenseTeacher.space, heads=(measured,)))
+    *_, heads = begin(datasets, ["wall_0"], tmp_path, monkeypatch, heads=("siglip.summary",))
+    path.unlink()
+    ((adapter, decode),) = heads["dense"]
+    assert list(heads) == ["dense"]
+    outputs, vectors = datasets["dense"].load_space()[0], torch.randn(5, 4)
+    standard = torch.from_numpy(outputs.standardize(vectors.numpy()))
+    expected = (head.body(vectors) - torch.arange(3)) / (2.0 / 3**0.5)
+    torch.testing.assert_close(adapter(decode(standard)), expected, rtol=1e-4, atol=1e-4)

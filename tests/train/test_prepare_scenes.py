@@ -1,0 +1,87 @@
+"""Preparation for several teachers: scenes for each teacher that they have, and classes of training scenes alone."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from training_scenes import PREPARE, DenseSideTeacher, SideTeacher, scene
+
+from gsencoder.core.errors import SceneWarning
+from gsencoder.fusion.teachers import MissingInput
+from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.train import prepare_scenes as module
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
+
+LACKING = {"coded": {"wall_1"}, "dense": {"wall_0", "wall_3"}}
+WALLS = [Path(f"wall_{number}") for number in range(4)]
+
+
+class DenseTeacher(DenseSideTeacher):
+    """A dense teacher of a space of its own."""
+
+    space = FeatureSpace(name="dense sides", channels=4)
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        seen = super().feature_map(views, view)
+        return FeatureMap(features=seen.features, grid_from_image=seen.grid_from_image, space=self.space)
+
+
+TEACHERS: dict[str, Any] = {"coded": SideTeacher(), "dense": DenseTeacher()}
+
+
+class Reader:
+    """Makes scenes instead of reading them; some lack what a teacher needs."""
+
+    def __init__(self, *_: object) -> None: ...
+
+    def load(self, path: Path) -> Scene:
+        return scene(int(path.name[5:]), 200)
+
+    def teacher(self, name: str, of: Scene) -> Any:
+        if of.name in LACKING[name]:
+            raise MissingInput(f"{of.name} has none")
+        return TEACHERS[name]
+
+    def with_views(self, name: str, path: Path) -> tuple[Scene, Any]:
+        return self.load(path), self.teacher(name, self.load(path))
+
+    def with_gaussians(self, of: Scene, _: Path) -> Scene:
+        return of
+
+
+@pytest.fixture(autouse=True)
+def _reader(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_SceneReader", Reader)
+    for each in TEACHERS.values():
+        monkeypatch.setattr(type(each), "needs_images", False)
+
+
+def prepare(folder: Path) -> dict[str, PreparedDataset]:
+    config = SourceConfig(teachers={name: PaletteConfig() for name in TEACHERS}, prepare=PREPARE)
+    with pytest.warns(SceneWarning, match="scenes lack what it needs"):
+        return prepare_scenes(WALLS[:3], WALLS[3:], {}, config, folder, voxel=0.1)
+
+
+def test_a_scene_is_prepared_for_each_teacher_that_it_has_and_again_where_its_file_was_removed(
+    tmp_path: Path,
+) -> None:
+    datasets = prepare(tmp_path)
+    paths = {}
+    for name, dataset in datasets.items():
+        assert dataset.load_space()[0].space == TEACHERS[name].space
+        files = {path.stem: path for path in (dataset.folder / "scenes").iterdir()}
+        assert set(files) == {wall.name for wall in WALLS} - LACKING[name]
+        paths |= {(name, wall): path for wall, path in files.items()}
+        # Classes are counted over the scenes to train on, and not over those held out.
+        seen = [np.count_nonzero(each.weights) for each in dataset.scenes([wall.name for wall in WALLS[:3]])]
+        assert dataset.load_class_balance().counts.sum() == sum(seen)
+    for removed in paths.values():
+        content = removed.read_bytes()
+        before = {path: path.stat().st_mtime_ns for path in paths.values() if path != removed}
+        removed.unlink()
+        prepare(tmp_path)
+        assert removed.read_bytes() == content
+        assert {path: path.stat().st_mtime_ns for path in before} == before
