@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from symbolic import symbolic_sizes
 from gsencoder.core.errors import InputError
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.onnx import export
 from gsencoder.infer.onnx.export import Cloud, check_cosines, check_parity, export_onnx, lower, random_cloud
 from gsencoder.infer.onnx.runtime import OnnxEncoder
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
@@ -18,7 +20,7 @@ from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.point_transformer import TransformerConfig
 from gsencoder.models.weights import save_weights
 from gsencoder.text.table import load_text_table, save_text_table
-from gsencoder.types import FeatureSpace
+from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians
 
 SHAPE = TransformerConfig(
     encoder_depths=(1, 1),
@@ -61,3 +63,36 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights
     encoder.outputs = swapped
     with pytest.raises(InputError, match="onnxruntime and torch differ"):
         check_parity(model, encoder, clouds[1:])
+
+
+class FeaturesOf:
+    """Stands in for a runtime: features of two spaces, of which one may be others than in float32."""
+
+    header = SimpleNamespace(precision="int8_weights")
+
+    def __init__(self, model: bytes, device: str) -> None:
+        self.wrong = model.decode()
+        assert device == "cpu"
+
+    def encode_spaces(self, gaussians: Gaussians, *_: object, **__: object) -> dict[str, GaussianFeatures]:
+        rows = np.random.default_rng(0).normal(size=(2, len(gaussians), 3)).astype(np.float32)
+        return {
+            name: GaussianFeatures(
+                features=rows[int(name == self.wrong)],
+                weights=np.ones(len(gaussians), np.float32),
+                mean=np.zeros(3, np.float32),
+                space=FeatureSpace(name=name, channels=3),
+            )
+            for name in ("first", "second")
+        }
+
+
+@pytest.mark.parametrize("wrong", ["first", "second"])
+def test_a_cheaper_precision_is_refused_if_any_space_is_too_far_from_float32(
+    wrong: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export, "OnnxEncoder", FeaturesOf)
+    cloud = Cloud("cloud", random_cloud(50, 0.05, seed=1))
+    assert check_cosines(b"", b"", [cloud]) == {"cloud": pytest.approx(1)}
+    with pytest.raises(InputError, match="on cloud int8_weights gives features whose mean centered cosine"):
+        check_cosines(wrong.encode(), b"", [cloud])
