@@ -1,9 +1,11 @@
 """SplatDistill's way with a small random RADIO: fused, distilled, adapter heads applied after; words in, boxes out."""
 
+import math
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -415,18 +417,19 @@ def test_heads_that_a_training_cannot_use_are_refused(
 def test_maps_that_are_not_finite_are_refused_before_heads_see_them(
     world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoiled = tmp_path / "radio"
-    shutil.copytree(world.radio, spoiled)
-
-    def change(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def change(weights: dict[str, torch.Tensor], value: float) -> dict[str, torch.Tensor]:
         key = "radio_model.model.blocks.0.norm1.weight"
-        return {**weights, key: torch.full_like(weights[key], torch.nan)}
+        return {**weights, key: torch.full_like(weights[key], value)}
 
-    change_weights(spoiled, change)
-    teacher = [word.replace(str(world.radio), str(spoiled)) for word in world.teacher]
-    line = refusal(capsys, "fuse", world.room(0), *teacher, "teacher.heads=siglip", *SEEDS, f"out={tmp_path / 'x'}")
-    assert "features of view" in line
-    assert "are not finite; check the weights" in line
+    # Weights that are not finite, and finite ones whose outputs are not.
+    cases = ((math.nan, "1 weights are not finite"), (torch.finfo(torch.float32).max, "features of view"))
+    for value, message in cases:
+        spoiled = tmp_path / message.replace(" ", "_")
+        shutil.copytree(world.radio, spoiled)
+        change_weights(spoiled, partial(change, value=value))
+        teacher = [word.replace(str(world.radio), str(spoiled)) for word in world.teacher]
+        line = refusal(capsys, "fuse", world.room(0), *teacher, "teacher.heads=siglip", *SEEDS, f"out={tmp_path / 'x'}")
+        assert message in line
 
 
 def test_a_siglip2_head_with_a_tower_that_keeps_capital_letters_warns(fused: Path, tmp_path: Path) -> None:

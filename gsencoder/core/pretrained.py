@@ -10,6 +10,8 @@ from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.model_files import check_fetched
 
 EXTRA = "pip install 'gsencoder[teachers]'"
+UNREADABLE = (ImportError, OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError)
+"""What transformers raises about a folder; an ImportError where the code of a model is in another library."""
 VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
 
 
@@ -35,7 +37,8 @@ def load_pretrained(
         options: further arguments of `from_pretrained`.
 
     Raises:
-        InputError: the folder holds no model of that class, or weights that do not fit its configuration.
+        InputError: the folder holds no model of that class, or weights that do not fit its configuration or are not
+            finite.
 
     Warns:
         SceneWarning: weights of other modules are not used, with `other_parts="warn"`.
@@ -48,6 +51,7 @@ def load_pretrained(
         model, report = _from_pretrained(loader, str(folder), use_safetensors=True, dtype=torch.float32, **options)
     report["unexpected_keys"] = [key for key in report["unexpected_keys"] if not key.startswith(tuple(known_parts))]
     _check_keys(folder, model, report, what, other_parts)
+    _check_finite(folder, model, what)
     return model.eval()
 
 
@@ -68,7 +72,8 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, what: str) ->
         The part, and the files that hold weights of it.
 
     Raises:
-        InputError: the files hold no such part or several, or weights that do not fit its configuration.
+        InputError: the files hold no such part or several, or weights that do not fit its configuration or are not
+            finite.
     """
     files = weight_files(folder, what)
     with _readable(folder, what):
@@ -91,6 +96,7 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, what: str) ->
                         weights[name.removeprefix(prefixes[0])] = opened.get_tensor(name)
         model, report = _from_pretrained(loader, None, config=config, state_dict=weights, dtype=torch.float32)
     _check_keys(folder, model, report, what, "warn")
+    _check_finite(folder, model, what)
     return model.eval(), used
 
 
@@ -132,7 +138,7 @@ def _readable(folder: Path, what: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError, SafetensorError) as error:
+    except (*UNREADABLE, SafetensorError) as error:
         for path in folder.glob("*.safetensors"):
             check_fetched(path)
         raise _unreadable(folder, what, error) from error
@@ -151,7 +157,7 @@ def read_config(folder: Path, what: str) -> Any:
     try:
         with quiet_transformers():
             return AutoConfig.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
-    except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError) as error:
+    except UNREADABLE as error:
         raise _unreadable(folder, what, error) from error
 
 
@@ -163,6 +169,16 @@ def _unreadable(folder: Path, what: str, error: Exception) -> InputError:
             "that transformers knows"
         )
     return InputError(f"{what}: {folder} holds no model that transformers reads: {message[:160]}")
+
+
+def _check_finite(folder: Path, model: Any, what: str) -> None:
+    """Kernels of attention may turn weights that are not finite into features that are, and wrong."""
+    broken = [name for name, value in model.named_parameters() if not value.isfinite().all()]
+    if broken:
+        raise InputError(
+            f"{what}: {folder}: {len(broken)} weights are not finite ({listed(broken, 3)}); the files are damaged, or "
+            "the model's training diverged; get them again"
+        )
 
 
 def load_companion(loader: Any, folder: Path, what: str, noun: str, **options: Any) -> Any:

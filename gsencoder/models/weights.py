@@ -1,5 +1,6 @@
 """Encoder weights on disk: one safetensors file with parameters, configuration of the network and output spaces."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -17,23 +18,37 @@ from gsencoder.models.output_space import OutputSpaces, output_spaces_parts, rea
 WEIGHTS_FILE = "encoder.safetensors"
 SHIPPED_WEIGHTS = Path(__file__).resolve().parent.parent / "weights"
 """Folder of the encoders that come with the package, one folder each."""
+DEFAULT_WEIGHTS = "house_cpu"
+"""The one of them that is taken where none is named."""
+SHIPPED = "shipped:"
+"""What a name of them begins with that cannot be taken for a path."""
 
 
 def find_weights(source: str) -> Path:
     """Finds the file of weights: in a folder that `train` wrote, at a path, or by the name of an encoder that comes
     with the package. Relative paths are also looked up in GSENCODER_MODELS.
 
+    Args:
+        source: the path or name; `shipped:NAME` is never a path, and "" is DEFAULT_WEIGHTS.
+
     Raises:
-        InputError: there is no such file.
+        InputError: there is no such file, or the name of an encoder that comes with the package is that of a file or
+            folder, too.
     """
     names = sorted(path.parent.name for path in SHIPPED_WEIGHTS.glob(f"*/{WEIGHTS_FILE}"))
+    name = (source or SHIPPED + DEFAULT_WEIGHTS).removeprefix(SHIPPED)
     try:
+        if name in names and (name != source or not os.path.lexists(source)):
+            return SHIPPED_WEIGHTS / name / WEIGHTS_FILE
+        if name in names:
+            raise InputError(
+                f"weights: {source} is the name of an encoder that comes with gsencoder, and there is "
+                f"{Path(source).absolute()}, too; give {SHIPPED}{source} or ./{source}"
+            )
         in_folder = Path(source) / WEIGHTS_FILE
-        if source and in_folder.is_file():
+        if in_folder.is_file():
             return in_folder
-        if source in names:
-            return SHIPPED_WEIGHTS / source / WEIGHTS_FILE
-        if source and Path(source).is_dir():
+        if Path(source).is_dir():
             exports = sorted(path.name for path in Path(source).glob("*.onnx"))
             hint = f"; give its {', '.join(exports)} by its full path" if exports else ""
             raise InputError(f"weights: the folder {source} holds no {WEIGHTS_FILE}{hint}")

@@ -86,7 +86,10 @@ def split_scenes(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[P
         raise InputError(f"paths: two scenes are called {duplicate!r}; prepared scenes need distinct names")
     for pattern in patterns:
         if not any(fnmatch(name, pattern) for name in names):
-            raise InputError(f"holdout: no scene is called {pattern!r}; the scenes are {', '.join(names[:5])}, …")
+            raise InputError(
+                f"holdout: no scene is called {pattern!r}; the scenes are {listed(names, 5)}; give names of these, or "
+                "holdout=[] for none (experiments hold out scenes of the data that they are made for)"
+            )
     held_out = [path for path in paths if any(fnmatch(path.name, pattern) for pattern in patterns)]
     training = [path for path in paths if path not in held_out]
     if not training:

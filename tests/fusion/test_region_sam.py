@@ -314,8 +314,16 @@ def test_folders_of_other_models_are_refused(saved: Any, tmp_path: Path) -> None
     )
     views = region_scene().views
     assert views is not None
+    with pytest.raises(
+        InputError, match=r"1 weights are not finite \(mask_decoder.iou_prediction_head.proj_out.bias\)"
+    ):
+        SamMasks(config_of(folder))
+    model.mask_decoder.iou_prediction_head.proj_out.bias.data[:] = 0
+    model.save_pretrained(folder)
+    masks = SamMasks(config_of(folder))
+    masks._model.mask_decoder.iou_prediction_head.proj_out.bias.data[:] = torch.nan
     with pytest.raises(InputError, match="view 'images/a.jpg': masks or scores of SAM are not finite"):
-        SamMasks(config_of(folder)).labels(views, 0)
+        masks.labels(views, 0)
 
 
 @pytest.mark.parametrize("change", [{"points": 4}, {"min_iou": 0.1}, {"min_stability": 0.1}, {"max_overlap": 0.5}])

@@ -1,6 +1,7 @@
 """The `transformers` teacher: its settings in its space, large pictures, and what is refused."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -153,7 +154,9 @@ def test_the_size_of_the_model_is_the_default(models: Path) -> None:
 @pytest.mark.parametrize("settings", [{}, {"large": "windows"}])
 def test_values_that_are_not_finite_name_the_view(copied: Any, settings: dict[str, Any]) -> None:
     folder = copied("dinov2")
-    change_weights(folder, lambda weights: {**weights, "layernorm.bias": torch.full((16,), float("nan"))})
+    # Finite weights whose outputs are not.
+    huge = torch.full((16,), torch.finfo(torch.float32).max)
+    change_weights(folder, lambda weights: {**weights, "layernorm.weight": huge, "layernorm.bias": huge.clone()})
     with pytest.raises(InputError, match="features of view 'left.png' are not finite"):
         features(folder, **settings)
 
@@ -206,6 +209,8 @@ def test_a_model_that_is_not_named_or_not_there_is_refused() -> None:
         ({"model_type": "bert"}, "holds a bert model; expected one of CLIP, SigLIP, .* or a vision-language model"),
         ({"model_type": "radio"}, "give teacher=radio for it"),
         ({"model_type": "qwen2_vl"}, r"holds a qwen2_vl model with a qwen2_vl\w* tower; expected one of CLIP"),
+        # The code of these is in another library, whether that is installed or not.
+        ({"model_type": "timm_wrapper"}, "holds no model that transformers reads: .*timm|holds a timm_wrapper model"),
         (
             {"model_type": "mine", "auto_map": {"AutoConfig": "mine.Config"}},
             "needs Python code of its own, which is never run|holds no model that transformers reads",
@@ -283,6 +288,26 @@ def test_weights_that_do_not_fit_are_refused(copied: Any, kind: str, spoil: str,
     change_weights(folder, change)
     with pytest.raises(InputError, match=f"the weights do not fit the configuration: {message}"):
         teacher(folder)
+
+
+@pytest.mark.parametrize("kind", ["clip", "dinov2", "dinov3", "sam", "llava"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_refused_by_name(copied: Any, kind: str, value: float) -> None:
+    folder = copied(kind)
+    last = f".{LAYERS - 1}." if kind != "sam" else f"vision_encoder.layers.{LAYERS - 1}."
+    broken: list[str] = []
+
+    def change(weights: dict[str, Any]) -> dict[str, Any]:
+        broken.append(
+            next(name for name in weights if last in name and "norm" in name and not re.search("language|text", name))
+        )
+        weights[broken[0]].view(-1)[0] = value
+        return weights
+
+    change_weights(folder, change)
+    with pytest.raises(InputError, match="1 weights are not finite .*; the files are damaged") as raised:
+        teacher(folder)
+    assert broken[0].rpartition("layer")[2] in str(raised.value)
 
 
 @pytest.mark.parametrize("kind", ["dinov2", "llava"])

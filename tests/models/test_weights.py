@@ -1,5 +1,6 @@
 """Weights on disk: what is read is what was written, and anything else is refused with a reason."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +11,10 @@ from archives import header_of, rewrite
 from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError
+from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
-from gsencoder.models.weights import load_weights, save_weights
+from gsencoder.models.weights import DEFAULT_WEIGHTS, SHIPPED_WEIGHTS, find_weights, load_weights, save_weights
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=6, teacher="labels", text_encoder="t")
@@ -139,3 +141,37 @@ def test_several_teachers_of_equal_width_keep_their_projectors_and_bases(tmp_pat
         assert own.basis is not None
         assert spaces_read[name].basis.energy_kept == own.basis.energy_kept
         np.testing.assert_array_equal(spaces_read[name].basis.components, own.basis.components)
+
+
+def test_a_name_of_shipped_weights_that_is_a_folder_too_is_refused_and_both_have_an_unmistakable_form(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = SHIPPED_WEIGHTS / "house" / "encoder.safetensors"
+    for name in ("house", "shipped:house"):
+        assert find_weights(name) == shipped
+    for name in ("", "shipped:house_cpu", "house_cpu"):
+        assert find_weights(name) == SHIPPED_WEIGHTS / DEFAULT_WEIGHTS / "encoder.safetensors"
+    # Whether or not the folder of that name has an encoder.
+    for make in (
+        Path("house").mkdir,
+        lambda: save_weights(Path("house/encoder.safetensors"), encoder(outputs(True)), outputs(True), {}),
+    ):
+        make()
+        with pytest.raises(InputError, match=r"weights: house is the name of an .*; give shipped:house or \./house"):
+            find_weights("house")
+        assert find_weights("shipped:house") == shipped
+    assert find_weights("./house") == Path("house/encoder.safetensors")
+    Path("house_cpu").mkdir()
+    assert find_weights("") == SHIPPED_WEIGHTS / DEFAULT_WEIGHTS / "encoder.safetensors"
+
+
+def test_words_of_another_encoder_beside_the_weights_are_refused(tmp_path: Path) -> None:
+    for name in ("encoder.safetensors", "words.safetensors"):
+        shutil.copyfile(SHIPPED_WEIGHTS / "house_cpu" / name, tmp_path / name)
+    assert TorchEncoder(str(tmp_path)).words is not None
+    shutil.copyfile(SHIPPED_WEIGHTS / "house" / "words.labels.safetensors", tmp_path / "words.safetensors")
+    with pytest.raises(
+        InputError, match=r"words beside the encoder are of .* \(384 channels\), and its space labels has 512"
+    ):
+        TorchEncoder(str(tmp_path))

@@ -1,6 +1,7 @@
 """`gsencoder encode SPLAT weights=FILE`: features of every Gaussian in one pass, without photographs or a teacher."""
 
 import warnings
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings, typed
 from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.files.model_files import digest_files
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -36,8 +38,11 @@ class EncodeCommandConfig(CommonConfig):
         metadata={"help": "splats, scenes, or folders of scenes", "metavar": "SPLAT", "required": True},
     )
     weights: str = field(
-        default="house_cpu",
-        metadata={"help": "folder or file written by `train` or `export`, or the name of shipped weights"},
+        default="",
+        metadata={
+            "help": "folder or file written by `train` or `export`, or the name of an encoder that comes with "
+            "gsencoder; empty = house_cpu, which does"
+        },
     )
     spaces: tuple[str, ...] = field(
         default=(),
@@ -73,16 +78,25 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     paths = find_scenes(config.paths)
     with summary.step("weights"):
         encoder = load_encoder(config.weights, config.encode.device)
-        heads = heads_beside(file_of_encoder(config.weights))
+        file = file_of_encoder(config.weights)
+        heads = heads_beside(file)
         trained_with = encoder.made_by.get("settings", {}).get("heads") or ()
         if heads is None and trained_with:
             warnings.warn(
                 f"weights: the adapter heads {', '.join(trained_with)} that the encoder was trained with do not lie "
-                f"beside {config.weights}; head= will not work with its features",
+                f"beside {file}; head= will not work with its features",
                 SceneWarning,
                 stacklevel=2,
             )
-        requested_teachers(encoder, config.spaces)
+        for name in requested_teachers(encoder, config.spaces):
+            if encoder.spaces[name].text_encoder and name not in encoder.tables:
+                warnings.warn(
+                    f"weights: no words of {encoder.spaces[name].text_encoder} lie beside {file}, so the features of "
+                    f"{name} have none; `localize` needs words= or text=",
+                    SceneWarning,
+                    stacklevel=2,
+                )
+    made_with = {"weights": str(file), "weights_digest": digest_files(file)}
     screen = console(config.quiet)
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
@@ -94,7 +108,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
                     scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
             scene = with_reported_up(scene, one, quiet=config.quiet)
             with about(scene.name):
-                spaces = _encode_into(folder, scene, encoder, config, one)
+                spaces = _encode_into(folder, scene, encoder, config, made_with, one)
             if heads is not None:
                 others = [space for space in encoder.spaces.values() if space not in spaces]
                 copy_heads(heads, folder / HEADS_FILE, spaces, left_out=others)
@@ -121,9 +135,11 @@ def _encode_into(
     scene: Scene,
     encoder: Encoder,
     config: EncodeCommandConfig,
+    made_with: Mapping[str, str],
     summary: Summary,
 ) -> list[FeatureSpace]:
-    """Encodes a scene and writes its features and words; returns the spaces that were written."""
+    """Encodes a scene and writes its features and words, and what they were made with; returns the spaces that were
+    written."""
     assert scene.gaussians is not None
     unit = unit_of(scene, encoder.voxel)
     with summary.step("encode"):
@@ -145,7 +161,7 @@ def _encode_into(
             "features": file,
         }
     with summary.step("write"):
-        save_features(folder, scene, by_teacher, {"encode": settings(config.encode), "weights": config.weights})
+        save_features(folder, scene, by_teacher, {"encode": settings(config.encode), **made_with})
         save_tables(folder, {name: encoder.tables[name] for name in by_teacher if name in encoder.tables}, by_teacher)
     first = next(iter(by_teacher.values()))
     summary.results.update(
@@ -153,6 +169,7 @@ def _encode_into(
         seen=int(first.seen.sum()),
         views=len(scene.views) if scene.views is not None else 0,
         metres_per_unit=unit,
+        **made_with,
         **(next(iter(figures.values())) if single else {"teachers": figures}),
     )
     return [features.space for features in by_teacher.values()]

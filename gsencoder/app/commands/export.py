@@ -44,8 +44,11 @@ class ExportConfig(CommonConfig):
         },
     )
     weights: str = field(
-        default="house_cpu",
-        metadata={"help": "folder or file written by `train`, or the name of shipped weights"},
+        default="",
+        metadata={
+            "help": "folder or file written by `train`, or the name of an encoder that comes with gsencoder; empty = "
+            "house_cpu, which does"
+        },
     )
     out: Path | None = field(
         default=None,

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features
@@ -90,10 +91,12 @@ def load_words(folder: Path, space: FeatureSpace, given: str, text: TextConfig =
         InputError: there are no words, or the tower is another than the one that made them.
     """
     if given:
-        return stating_trained(words_of_table(load_text_table(given), text), _table_beside(folder, space))
-    path = table_path(folder, space.text_encoder)
-    if path is None and not isinstance(text, TableTextConfig):
+        return stating_trained(
+            words_of_table(load_text_table(find_file(given, "words")), text), _table_beside(folder, space)
+        )
+    if not isinstance(text, TableTextConfig) and _table_beside(folder, space) is None:
         return vocabulary_of(text)
+    path = table_path(folder, space.text_encoder)
     if path is None:
         raise InputError(
             f"{folder}: there is no {WORDS_FILE} beside these features: no words lead into them, or the file was lost; "
@@ -103,9 +106,11 @@ def load_words(folder: Path, space: FeatureSpace, given: str, text: TextConfig =
 
 
 def _table_beside(folder: Path, space: FeatureSpace) -> TextTable | None:
-    """The table of a space in a folder of features; None where it is lost or damaged, for which words= stands in."""
+    """The table of a space in a folder of features; None where it is lost, damaged or of another space, for which
+    words= and text= stand in."""
     try:
         path = table_path(folder, space.text_encoder)
-        return None if path is None else load_text_table(path)
+        table = None if path is None else load_text_table(path)
     except InputError:
         return None
+    return table if table is not None and table.space.text_encoder == space.text_encoder else None

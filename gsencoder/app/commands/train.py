@@ -49,7 +49,12 @@ class TrainCommandConfig(TrainConfig, CommonConfig):
         default=(), metadata={"help": "scenes, or folders of scenes", "metavar": "SCENE", "required": True}
     )
     holdout: tuple[str, ...] = field(
-        default=(), metadata={"help": "names of scenes for validation, with * and ? as in file names"}
+        default=(),
+        metadata={
+            "names": True,
+            "help": "names of scenes for validation, with * and ? as in file names; [] = none, where an experiment has "
+            "some",
+        },
     )
     prepared: Path | None = field(
         default=None,

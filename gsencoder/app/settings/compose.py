@@ -214,9 +214,10 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
             # Hydra merges several experiments in the order in which they are listed.
             several = re.fullmatch(r"\[(.*)\]", value) if key == EXPERIMENT else None
             secret = any(name.startswith(f"{key}.") and each.secret for name, each in choices.options.items())
-            unknown = [
-                name for name in (several[1].replace(" ", "").split(",") if several else [value]) if name not in names
-            ]
+            listed = several[1].replace(" ", "").split(",") if several else [value]
+            if repeated := [name for name in listed if listed.count(name) > 1]:
+                raise InputError(f"{key}: {repeated[0]} is given twice in {value}; give it once")
+            unknown = [name for name in listed if name not in names]
             if unknown and (secret or not sweep):
                 got = "" if secret else f", got {unknown[0]!r}{near(unknown[0], names)}"
                 raise InputError(f"{key}: expected one of {', '.join(names)}{got}")
@@ -293,6 +294,16 @@ def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) ->
             f"hydra/launcher={missing[1]}: no such launcher is installed; submitit_slurm and submitit_local come with "
             "pip install 'gsencoder[slurm]'"
         )
+    twice = re.search(r"(\w+)@(\w+)\.(\w+) appears more than once", str(error))
+    if twice:
+        return (
+            f"{twice[2]}.{twice[3]}: is given by {EXPERIMENT}={given.get(EXPERIMENT, '')} and once more; leave out "
+            f"{twice[1]}=, since those of an experiment cannot be replaced, or leave out {EXPERIMENT}="
+        )
+    absent = re.search(r"Could not find '(\w+)/([^']+)'", str(error))
+    if absent and absent[1] in choices.groups:
+        names = choices.groups[absent[1]]
+        return f"{absent[1]}: expected one of {', '.join(names)}, got {absent[2]!r}{near(absent[2], names)}"
     match = re.search(r"Could not override '([^']+)'", str(error))
     if match and match[1] in given:
         key = match[1]
@@ -334,7 +345,26 @@ def compose(
             composed = hydra.compose_config(command, written, RunMode.RUN, from_shell=False)
         except HydraException as error:
             raise InputError(hydra_error(error, given, choices)) from error
-        return typed(cls, plain_settings(composed))
+        data = plain_settings(composed)
+        check_single(data, given, choices)
+        return typed(cls, data)
+
+
+def check_single(data: Mapping[str, Any], given: Mapping[str, str], choices: Choices) -> None:
+    """Checks that nothing was given for a single member of a choice of which an experiment gives several.
+
+    Raises:
+        InputError: it was.
+    """
+    for key, option in choices.options.items():
+        single = option.several
+        unused = [name for name in given if single and (name == single or name.startswith(f"{single}."))]
+        if unused and data.get(key):
+            raise InputError(
+                f"{unused[0]}: is for a single {single}, and {EXPERIMENT}={given.get(EXPERIMENT, '')} gives several, "
+                f"{', '.join(data[key])}; options of one of them are {key}.NAME.OPTION=…, others need another "
+                f"{EXPERIMENT}="
+            )
 
 
 def plain_settings(composed: Any) -> dict[str, Any]:

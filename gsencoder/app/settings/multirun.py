@@ -6,7 +6,7 @@ OUT.
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from gsencoder.app.runs.printable import one_line
 from gsencoder.app.settings.compose import (
     SWEPT_TEXT,
     Choices,
+    check_single,
     choices_of,
     hydra_error,
     open_hydra,
@@ -35,13 +36,23 @@ from gsencoder.core.errors import InputError
 OmegaConf.register_new_resolver("text", unseal, replace=True)
 
 
-def _job(composed: Any, *, cls: type[CommonConfig], run: Callable[[Any], str], swept: Sequence[str]) -> str:
+def _job(
+    composed: Any,
+    *,
+    cls: type[CommonConfig],
+    run: Callable[[Any], str],
+    swept: Sequence[str],
+    given: Mapping[str, str],
+    choices: Choices,
+) -> str:
     """Runs one job in its folder and returns its error, so that a failed run does not stop the others."""
     from hydra.core.hydra_config import HydraConfig
 
     job = HydraConfig.get()
     try:
-        config = typed(cls, plain_settings(composed))
+        data = plain_settings(composed)
+        check_single(data, given, choices)
+        config = typed(cls, data)
     except InputError as error:
         message = f"run {job.job.num}: {error}"
         print(one_line(f"error: {message}"), file=sys.stderr)
@@ -95,7 +106,7 @@ def run_many(
     parsed = OverridesParser.create().parse_overrides(requested)
     swept = tuple(override.get_key_element() for override in parsed if override.is_sweep_override())
     launcher = given.get("hydra/launcher", "basic")
-    job = partial(_job, cls=cls, run=run, swept=swept)
+    job = partial(_job, cls=cls, run=run, swept=swept, given=given, choices=choices)
     with open_hydra(command, cls, conf) as hydra:
         try:
             batches = hydra.multirun(command, job, written, with_log_configuration=False)

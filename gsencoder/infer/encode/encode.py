@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device import autocast_dtype, choose_device
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.store.words import load_tables
@@ -22,10 +23,22 @@ class TorchEncoder:
     """A trained network with its output spaces and its words; see `gsencoder.infer.load_encoder.Encoder`."""
 
     def __init__(self, weights: str) -> None:
-        """Reads a file, a folder of `train`, or weights that come with the package; see `find_weights`."""
+        """Reads a file, a folder of `train`, or weights that come with the package; see `find_weights`.
+
+        Raises:
+            InputError: they cannot be read, or the words beside them are those of another encoder.
+        """
         file = find_weights(weights)
         self.network, self.outputs, self.made_by = load_weights(file)
         self.tables: Mapping[str, TextTable] = load_tables(file.parent, self.outputs)
+        for name, table in self.tables.items():
+            space = self.outputs[name].space
+            if (table.space.text_encoder, table.space.channels) != (space.text_encoder, space.channels):
+                raise InputError(
+                    f"{file.parent}: the words beside the encoder are of {table.space.text_encoder} "
+                    f"({table.space.channels} channels), and its space {name} has {space.channels} channels and words "
+                    f"of {space.text_encoder or 'no text encoder'}: they belong to another encoder; put its own there"
+                )
 
     @property
     def spaces(self) -> Mapping[str, FeatureSpace]:
