@@ -18,6 +18,9 @@ import sys
 import time
 from pathlib import Path
 
+from errors import one_line_errors, positive
+
+from gsencoder.core.errors import listed
 from gsencoder.train.augment import AugmentConfig
 
 GROUPS: dict[str, dict[str, list[str]]] = {
@@ -97,6 +100,62 @@ def command(arguments: argparse.Namespace, overrides: list[str]) -> list[str]:
     return [*words, *overrides, "tensorboard=false", "quiet=true"]
 
 
+def run(words: list[str]) -> None:
+    """Runs a command of gsencoder, also under torchrun.
+
+    Each of its processes prints the line of an error, after which torchrun prints its report and a traceback of its
+    own: only the first of these lines is shown.
+
+    Raises:
+        CalledProcessError: the command failed.
+    """
+    after: list[str] = []
+    refused = False
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, errors="replace") as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if refused:
+                after.append(line)
+            else:
+                print(line, end="", file=sys.stderr, flush=True)
+            refused = refused or line.startswith("error: ")
+    if process.returncode:
+        raise subprocess.CalledProcessError(2 if refused else process.returncode, words)
+    print(*after, sep="", end="", file=sys.stderr)
+
+
+def choose(
+    parser: argparse.ArgumentParser, only: list[str], settings: list[str], seeds: list[str]
+) -> list[tuple[str, str, list[str]]]:
+    """The trainings of groups, settings and seeds, each with its group, name and overrides; an empty list chooses all.
+
+    A word that matches nothing ends the script.
+    """
+
+    def check(option: str, noun: str, words: list[str], known: list[str]) -> None:
+        unknown = [word for word in words if word not in known]
+        if unknown:
+            parser.error(
+                f"{option} {','.join(unknown)}: no such {noun}; there are: {listed(known, limit=40) or 'none'}"
+            )
+
+    check("--only", "group", only, list(GROUPS))
+    groups = only or list(GROUPS)
+    parts = [name.partition(", seed ") for group in groups for name in GROUPS[group]]
+    check("--settings", "setting of these groups", settings, list(dict.fromkeys(setting for setting, _, _ in parts)))
+    check("--seeds", "seed", seeds, sorted({seed for _, _, seed in parts if seed}))
+    rows = [
+        (group, name, overrides)
+        for group in groups
+        for name, overrides in GROUPS[group].items()
+        if (not settings or name.split(", seed")[0] in settings) and (not seeds or name.rpartition(" ")[2] in seeds)
+    ]
+    if not rows:
+        names = [name for group in groups for name in GROUPS[group] if name.split(", seed")[0] in settings]
+        parser.error(f"--seeds {','.join(seeds)}: none of these settings has it; they are: {listed(names, limit=40)}")
+    return rows
+
+
 def train(arguments: argparse.Namespace, group: str, name: str, overrides: list[str]) -> dict[str, object]:
     """One training, unless it has been done; its row of the table."""
     out = Path(arguments.out) / group / name.replace(" ", "_").replace(",", "")
@@ -104,7 +163,7 @@ def train(arguments: argparse.Namespace, group: str, name: str, overrides: list[
     steps = max(min(20, arguments.steps), round(arguments.steps * share))
     if not (out / "summary.json").is_file():
         words = [f"out={out}", f"train.steps={steps}", "train.validate_every=0"]
-        subprocess.run([*command(arguments, overrides), *words], check=True)
+        run([*command(arguments, overrides), *words])
     summary = json.loads((out / "summary.json").read_text())
     results = summary["results"]
     return {
@@ -122,7 +181,7 @@ def prepare(arguments: argparse.Namespace, rows: list[list[str]]) -> None:
     """Prepares the scenes of all settings, each once."""
     for folder, overrides in {prepared_folder(arguments.prepared, row): row for row in rows}.items():
         start = time.monotonic()
-        subprocess.run([*command(arguments, overrides), "prepare_only=true"], check=True)
+        run([*command(arguments, overrides), "prepare_only=true"])
         print(f"{folder}: {time.monotonic() - start:.0f} s", flush=True)
 
 
@@ -135,18 +194,11 @@ def main() -> None:
     parser.add_argument("--settings", default="", help="settings of these groups, separated by commas; empty = all")
     parser.add_argument("--seeds", default="", help="seeds, separated by commas; empty = all")
     parser.add_argument("--prepare-only", action="store_true", help="prepare the scenes that are missing, and stop")
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--steps", type=positive, default=1000)
+    parser.add_argument("--processes", type=positive, default=2)
     arguments = parser.parse_args()
-    chosen = arguments.only.split(",") if arguments.only else list(GROUPS)
-    settings = arguments.settings.split(",") if arguments.settings else []
-    seeds = arguments.seeds.split(",") if arguments.seeds else []
-    rows = [
-        (group, name, overrides)
-        for group in chosen
-        for name, overrides in GROUPS[group].items()
-        if (not settings or name.split(", seed")[0] in settings) and (not seeds or name.rpartition(" ")[2] in seeds)
-    ]
+    given = (arguments.only, arguments.settings, arguments.seeds)
+    rows = choose(parser, *(words.split(",") if words else [] for words in given))
     if arguments.prepare_only:
         prepare(arguments, [overrides for _, _, overrides in rows])
         return
@@ -158,4 +210,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors():
+        main()

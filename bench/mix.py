@@ -18,6 +18,10 @@ import sys
 import tempfile
 from pathlib import Path
 
+from errors import existing_folder, one_line_errors, output_folder
+
+from gsencoder.core.errors import listed
+
 SEEDS_ALONE = ["optimize.steps=0", "holdout=0"]
 
 
@@ -41,15 +45,24 @@ def add(scene: Path, target: Path, options: list[str]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("house", type=Path)
-    parser.add_argument("out", type=Path)
+    parser.add_argument("house", type=existing_folder)
+    parser.add_argument("out", type=output_folder)
     parser.add_argument("--names", default="train_0*")
     parser.add_argument("--fitted", default="*", help="names of the scenes that are reconstructed")
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--options", nargs="*", default=["raster.eps2d=0.1"])
     arguments = parser.parse_args()
+    try:
+        scenes = sorted(arguments.house.glob(arguments.names))
+    except (ValueError, NotImplementedError) as error:
+        parser.error(f"--names {arguments.names!r}: not a pattern of names ({error}); expected one such as 'train_0*'")
+    if not scenes:
+        present = sorted(path.name for path in arguments.house.iterdir())
+        parser.error(
+            f"--names {arguments.names!r}: matches nothing in {arguments.house} ({listed(present) or 'empty'})"
+        )
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for scene in sorted(arguments.house.glob(arguments.names)):
+    for scene in scenes:
         add(scene, arguments.out / scene.name, SEEDS_ALONE)
         if fnmatch.fnmatch(scene.name, arguments.fitted):
             options = [f"optimize.steps={arguments.steps}", *arguments.options]
@@ -58,4 +71,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors():
+        main()

@@ -12,19 +12,37 @@ the rooms of --test is what `gsencoder evaluate protocol=absent` measures: a wor
 
 import argparse
 import fnmatch
+import math
 from pathlib import Path
 
 import numpy as np
+from errors import existing_folder, one_line_errors
 from presence_evidence import KEYS
 
+from gsencoder.core.errors import InputError, listed
 from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error, reliability
 
 WITHOUT_RIVALS = tuple(key for key in KEYS if key != "margin")
 
 
 def load(folder: Path, rooms: str) -> np.ndarray:
-    """The rows of a group in the rooms of a pattern."""
-    return np.concatenate([np.load(file) for file in sorted(folder.glob("*.npy")) if fnmatch.fnmatch(file.stem, rooms)])
+    """The rows of a group in the rooms of a pattern.
+
+    Raises:
+        InputError: there is no such folder, or it has no such room.
+    """
+    if not folder.is_dir():
+        groups = sorted(path.name for path in folder.parent.iterdir() if path.is_dir())
+        raise InputError(
+            f"{folder}: no such folder; the groups of {folder.parent} are: {listed(groups) or 'none'}; "
+            "bench/presence_evidence.py writes one"
+        )
+    files = sorted(folder.glob("*.npy"))
+    chosen = [np.load(file) for file in files if fnmatch.fnmatch(file.stem, rooms)]
+    if not chosen:
+        names = listed([file.stem for file in files]) or "none"
+        raise InputError(f"{folder}: no room matches {rooms!r} (--fit, --test); its rooms are: {names}")
+    return np.concatenate(chosen)
 
 
 def fit(groups: dict[str, np.ndarray], weights: dict[str, float], keys: tuple[str, ...]) -> dict[str, float]:
@@ -93,23 +111,35 @@ def plot(path: Path, tables: dict[str, list[dict[str, float]]]) -> None:
 
 def weighted(argument: str) -> dict[str, float]:
     """Groups and their weights: "fused,others:0.3"."""
-    pairs = (each.partition(":") for each in argument.split(","))
-    return {name: float(weight) if weight else 1.0 for name, _, weight in pairs}
+    weights = {}
+    for each in argument.split(","):
+        name, _, text = each.partition(":")
+        try:
+            weight = float(text or 1)
+        except ValueError:
+            weight = math.nan
+        if not name or not 0 < weight < math.inf:
+            raise argparse.ArgumentTypeError(
+                f"{each!r}: expected a group, or one with its weight, a number above 0, such as others:0.3"
+            )
+        weights[name] = weight
+    return weights
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("evidence", type=Path)
-    parser.add_argument("--known", default="fused,encoded,others:0.3")
-    parser.add_argument("--untrained", help="groups of words that an encoder was not trained on")
+    parser.add_argument("evidence", type=existing_folder)
+    parser.add_argument("--known", type=weighted, default="fused,encoded,others:0.3")
+    parser.add_argument("--untrained", type=weighted, help="groups of words that an encoder was not trained on")
     parser.add_argument("--fit", default="train_0[0-3]*")
     parser.add_argument("--test", default="train_04*")
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
-    known_groups = weighted(arguments.known)
-    models = {"with rivals": (known_groups, KEYS), "without rivals": (known_groups, WITHOUT_RIVALS)}
+    if arguments.plot and not arguments.plot.parent.is_dir():
+        parser.error(f"--plot {arguments.plot}: no such folder: {arguments.plot.parent}")
+    models = {"with rivals": (arguments.known, KEYS), "without rivals": (arguments.known, WITHOUT_RIVALS)}
     if arguments.untrained:
-        models["untrained words"] = (weighted(arguments.untrained), KEYS)
+        models["untrained words"] = (arguments.untrained, KEYS)
     tables = {}
     for model, (weights, keys) in models.items():
         known, unknown = (
@@ -135,4 +165,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors():
+        main()

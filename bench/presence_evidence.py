@@ -16,7 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from errors import comma_separated, one_line_errors, output_folder, positive
 
+from gsencoder.core.errors import listed
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
@@ -105,44 +107,61 @@ def evidence_of(
     return np.array(rows, DTYPE)
 
 
-def words_asked(which: str, names: list[str]) -> dict[str, tuple[str, ...]]:
+def words_asked(which: list[str], names: list[str]) -> dict[str, tuple[str, ...]]:
     """The words of an argument --words, each with the names of the objects that it stands for."""
-    if which == "names":
+    if which == ["names"]:
         return {name: (name,) for name in names}
-    if which == "others":
+    if which == ["others"]:
         return OTHER_WORDS
-    if which == "phrases":
+    if which == ["phrases"]:
         with PHRASES.open(encoding="utf-8") as stream:
             return {row["phrase"]: tuple(row["right"].split(";")) for row in csv.DictReader(stream)}
-    return {name: (name,) for name in which.split(",")}
+    return {name: (name,) for name in which}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("house", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--words", required=True)
+    parser.add_argument("out", type=output_folder)
+    parser.add_argument("--words", type=comma_separated, required=True)
     parser.add_argument("--weights", help="an encoder; without it, labels are fused")
     parser.add_argument("--space", help="of an encoder with several teachers, the one whose words are asked")
     parser.add_argument("--text", help="folder of a text tower, in whose space labels are fused")
     parser.add_argument("--rooms", default="*")
-    parser.add_argument("--every", type=int, default=1, help="take one in so many of the rooms")
+    parser.add_argument("--every", type=positive, default=1, help="take one in so many of the rooms")
     arguments = parser.parse_args()
+    if arguments.space and not arguments.weights:
+        parser.error("--space: is of an encoder; give --weights too, or leave it out")
     retain_freed_memory()
     paths = find_scenes([arguments.house])
+    rooms = [path for path in paths if fnmatch.fnmatch(path.name, arguments.rooms)][:: arguments.every]
+    if not rooms:
+        present = listed([path.name for path in paths])
+        parser.error(f"--rooms {arguments.rooms!r}: matches no room of {arguments.house} ({present})")
     names = names_of(load_scene(path) for path in paths)
     asked = words_asked(arguments.words, names)
+    if not {name for kinds in asked.values() for name in kinds} & set(names):
+        parser.error(
+            f"--words {','.join(arguments.words)}: {arguments.house} has no object that they stand for; expected "
+            f"names, others, phrases, or some of its names ({listed(names) or 'it has none'})"
+        )
     text = OnnxTextConfig(model=arguments.text, pooling="mean") if arguments.text else TableTextConfig()
     if arguments.weights:
         encoder = load_encoder(arguments.weights)
-        words: Words | None = words_of_table(encoder.tables[arguments.space or next(iter(encoder.tables))])
+        space = arguments.space or next(iter(encoder.tables), None)
+        if space not in encoder.tables:
+            option = f"--space {arguments.space}" if arguments.space else f"--weights {arguments.weights}"
+            parser.error(
+                f"{option}: no such words beside the encoder; it has those of: {listed(list(encoder.tables)) or 'none'}"
+            )
+        words: Words | None = words_of_table(encoder.tables[space])
         source = encoder_source(encoder, space=arguments.space)
     else:
         words = words_of(LabelsConfig(), text)
         source = fusion_source(LabelsConfig(), words)
     assert words is not None
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for path in [path for path in paths if fnmatch.fnmatch(path.name, arguments.rooms)][:: arguments.every]:
+    for path in rooms:
         file = arguments.out / f"{path.name}.npy"
         if not file.is_file():
             scene, features, _ = with_features(load_scene(path), source, SeedConfig())
@@ -150,4 +169,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors():
+        main()

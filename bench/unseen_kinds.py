@@ -5,8 +5,8 @@
     python bench/unseen_kinds.py score HOUSE --kinds mug,banana --weights encoder [--space labels] [--rooms 'train_04*']
 
 `without` copies labeled rooms without the objects of some kinds: their pixels, and those beside them, are masked, so
-that neither seeds nor targets come from them, and objects.json does not list them. `score` localizes names in the whole
-rooms:
+that neither seeds nor targets come from them, and objects.json does not list them. A room appears in OUT once it is
+whole. `score` localizes names in the whole rooms:
 
 - the unseen kinds in every room that has them, since no room showed them to the encoder,
 - the other placed objects in the rooms of --rooms, which were not trained on either,
@@ -21,22 +21,27 @@ and how it is calibrated on them. Standard errors are over rooms.
 import argparse
 import fnmatch
 import json
+import os
 import shutil
+import sys
+import tempfile
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from errors import comma_separated, existing_folder, one_line_errors, output_folder
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
-from gsencoder.core.errors import SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import aabb_iou, queryable_objects
-from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error
+from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error, names_of
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, with_features
 from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -78,22 +83,65 @@ class Asked:
         return max((probability for probability, _ in self.boxes), default=0.0)
 
 
+def read_labels(room: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The contents of a room's transforms.json and objects.json.
+
+    Raises:
+        InputError: a file is missing or wrong, or the room has masks already.
+    """
+    contents = []
+    for name in ("transforms.json", "objects.json"):
+        try:
+            contents.append(json.loads((room / name).read_text()))
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{room / name}: cannot be read ({reason}); expected a labeled room") from error
+    transforms, objects = contents
+    if not all("instance_file_path" in frame for frame in transforms["frames"]):
+        raise InputError(f"{room / 'transforms.json'}: a frame has no instance_file_path; expected a labeled room")
+    if (room / "masks").exists() or any("mask_path" in frame for frame in transforms["frames"]):
+        raise InputError(f"{room}: has masks already, as rooms that were written without objects do; give whole rooms")
+    return transforms, objects
+
+
 def write_without(source: Path, target: Path, kinds: Sequence[str]) -> int:
-    """Copies a room without the objects of some kinds; returns the number of these objects."""
-    shutil.copytree(source, target)
-    objects = json.loads((source / "objects.json").read_text())
+    """Copies a room without the objects of some kinds; returns the number of these objects.
+
+    The copy is made under a hidden name beside `target`, and renamed once it is whole.
+    """
+    transforms, objects = read_labels(source)
     left_out = [each["id"] for each in objects if each["name"] in kinds]
-    transforms = json.loads((source / "transforms.json").read_text())
-    (target / "masks").mkdir()
-    for number, frame in enumerate(transforms["frames"]):
-        instances = np.asarray(Image.open(source / frame["instance_file_path"]))
-        hidden = binary_dilation(np.isin(instances, left_out), iterations=RIM)
-        frame["mask_path"] = f"masks/{number:03d}.png"
-        Image.fromarray(np.where(hidden, 0, 255).astype(np.uint8)).save(target / frame["mask_path"])
-    (target / "transforms.json").write_text(json.dumps(transforms))
-    kept = [each for each in objects if each["name"] not in kinds]
-    (target / "objects.json").write_text(json.dumps(kept))
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as made:
+        copy = Path(made) / target.name
+        shutil.copytree(source, copy)
+        (copy / "masks").mkdir()
+        for number, frame in enumerate(transforms["frames"]):
+            instances = np.asarray(Image.open(source / frame["instance_file_path"]))
+            hidden = binary_dilation(np.isin(instances, left_out), iterations=RIM)
+            frame["mask_path"] = f"masks/{number:03d}.png"
+            Image.fromarray(np.where(hidden, 0, 255).astype(np.uint8)).save(copy / frame["mask_path"])
+        (copy / "transforms.json").write_text(json.dumps(transforms))
+        others = [each for each in objects if each["name"] not in kinds]
+        (copy / "objects.json").write_text(json.dumps(others))
+        os.rename(copy, target)
     return len(left_out)
+
+
+def write_rooms(rooms: Sequence[Path], out: Path, kinds: Sequence[str]) -> int:
+    """Copies rooms without the objects of some kinds; returns the number of these objects.
+
+    Raises:
+        InputError: a kind is in no room, a room is not labeled, or its copy exists; nothing is copied then.
+    """
+    names = sorted({each["name"] for room in rooms for each in read_labels(room)[1] if each["name"]})
+    missing = [kind for kind in kinds if kind not in names]
+    if missing:
+        raise InputError(f"--kinds {','.join(missing)}: no room has an object of this name; some are: {listed(names)}")
+    existing = [str(out / room.name) for room in rooms if (out / room.name).exists()]
+    if existing:
+        raise InputError(f"{listed(existing, 3)}: exists already; remove it, or give another OUT")
+    out.mkdir(parents=True, exist_ok=True)
+    return sum(write_without(room, out / room.name, kinds) for room in rooms)
 
 
 def ask(
@@ -139,6 +187,9 @@ def report(title: str, asked: Sequence[Asked]) -> None:
     """Prints the shares of right and wrong names at every level."""
     right, wrong = ([each for each in asked if each.right == kind] for kind in (True, False))
     print(f"\n{title}: {len(right)} objects, {len(wrong)} wrong names")
+    if not right:
+        print("  none is seen well enough to be asked")
+        return
     for level in LEVELS:
         (near, error), (half, _) = share(right, level, 0.25), share(right, level, 0.5)
         line = f"  min_probability {level}: Acc@0.25 {near:.3f} ± {error:.3f}, Acc@0.5 {half:.3f}"
@@ -186,26 +237,44 @@ def score(paths: Sequence[Path], held_out: str, source: FeatureSource, words: Wo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("action", choices=("without", "score"))
-    parser.add_argument("house", type=Path)
-    parser.add_argument("out", type=Path, nargs="?")
-    parser.add_argument("--kinds", required=True)
+    parser.add_argument("house", type=existing_folder)
+    parser.add_argument("out", type=output_folder, nargs="?")
+    parser.add_argument("--kinds", type=comma_separated, required=True)
     parser.add_argument("--weights", help="an encoder; without it features are fused from labels")
     parser.add_argument("--space", help="of an encoder with several teachers, the one whose words are asked")
     parser.add_argument("--rooms", default="train_04*")
     arguments = parser.parse_args()
-    kinds = arguments.kinds.split(",")
-    rooms = sorted(path for path in arguments.house.iterdir() if path.is_dir())
+    kinds = arguments.kinds
+    if arguments.action == "without" and arguments.out is None:
+        parser.error("without: needs OUT, the folder for the copies of the rooms")
+    if arguments.space and not arguments.weights:
+        parser.error("--space: is of an encoder; give --weights too, or leave it out")
+    rooms = sorted(path for path in arguments.house.iterdir() if path.is_dir() and not path.name.startswith("."))
+    if not rooms:
+        parser.error(f"{arguments.house}: has no folders; expected a folder of labeled rooms")
     if arguments.action == "without":
-        assert arguments.out is not None, "without needs OUT"
-        count = sum(write_without(room, arguments.out / room.name, kinds) for room in rooms)
-        print(f"{count} objects left out of {len(rooms)} rooms")
+        print(f"{write_rooms(rooms, arguments.out, kinds)} objects left out of {len(rooms)} rooms")
         return
+    if not fnmatch.filter([room.name for room in rooms], arguments.rooms):
+        present = listed([room.name for room in rooms])
+        parser.error(f"--rooms {arguments.rooms!r}: matches no room of {arguments.house} ({present})")
+    names = names_of(load_scene(room) for room in rooms)
+    missing = [kind for kind in kinds if kind not in names]
+    if len(missing) == len(kinds):
+        some = listed(names) or "none"
+        parser.error(
+            f"--kinds {','.join(kinds)}: no room of {arguments.house} has an object of these names; some are: {some}"
+        )
+    if missing:
+        print(f"warning: --kinds {','.join(missing)}: in no room, and so asked as wrong names only", file=sys.stderr)
     retain_freed_memory()
     words = text_table_of(LabelsConfig())
     assert words is not None
     source = fusion_source(LabelsConfig(), words)
     if arguments.weights:
         encoder = load_encoder(arguments.weights)
+        if arguments.space and arguments.space not in encoder.spaces:
+            parser.error(f"--space {arguments.space}: the encoder has the spaces {listed(list(encoder.spaces))}")
         source = encoder_source(encoder, space=arguments.space)
         words = encoder.tables.get(arguments.space or "", words)
         words = stating_trained(words, encoder.tables.get(arguments.space) if arguments.space else encoder.words)
@@ -213,4 +282,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors():
+        main()
