@@ -5,6 +5,7 @@ these only the step is stored.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def load_checkpoint(
         InputError: the file is damaged, or is of another network or of a run with other settings; the first setting
             that differs is named.
     """
-    with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
+    with advised(_begin_anew(path)), open_archive(path) as file:
         stored_settings = with_added_options(file.value("settings", dict))
         if stored_settings != settings:
             raise InputError(f"{path}: {_describe_difference(stored_settings, settings)}")
@@ -98,8 +99,33 @@ def load_checkpoint(
     return state
 
 
+def check_same_teachers(path: Path, teachers: Sequence[str]) -> None:
+    """Checks that a checkpoint, if there is one, is of a run with these teachers, which is known before anything is
+    prepared for them.
+
+    Raises:
+        InputError: the file is damaged, or is of a run with other teachers or with these in another order.
+    """
+    if not path.is_file():
+        return
+    with advised(_begin_anew(path)), open_archive(path) as file:
+        stored, asked = file.value("settings", dict), {"teachers": list(teachers)} if len(teachers) > 1 else {}
+        if stored.get("teachers") != asked.get("teachers"):
+            raise InputError(f"{path}: {_describe_difference(stored, asked)}")
+
+
+def _begin_anew(path: Path) -> str:
+    return f"give resume=false to begin anew, or remove {path}"
+
+
 def _describe_difference(stored: dict[str, Any], settings: dict[str, Any]) -> str:
     """The first difference between the settings of a checkpoint and of this run, and what to do about it."""
+    # Stated by runs with several teachers alone.
+    made_with, asked = stored.get("teachers"), settings.get("teachers")
+    if made_with != asked:
+        one = "one teacher"
+        made_with, asked = (one if each is None else f"teachers={each}" for each in (made_with, asked))
+        return f"was made with {made_with}, and this run asks {asked}; give the same settings or another out="
     if any(stored.get(name) != settings.get(name) for name in ("space", "spaces", "scenes")):
         return "the prepared scenes have changed since; give the former prepared=, or another out="
     before, now = stored.get("samples_per_step"), settings.get("samples_per_step")

@@ -22,9 +22,9 @@ from gsencoder.text.build import Words, closed_table
 from gsencoder.text.table import TextTable
 from gsencoder.train.adapter_heads import asked_heads, dataset_heads, render_heads, teacher_of_heads
 from gsencoder.train.augment import AugmentConfig
-from gsencoder.train.checkpoint import TrainingState
+from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, check_same_teachers
 from gsencoder.train.crops import SamplingConfig
-from gsencoder.train.distributed import ProcessRank, check_agreement, join_processes
+from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
@@ -136,6 +136,9 @@ def train(
     words = words_by_teacher(config.teachers_by_name, config.text)
     with join_processes(device) as (process, chosen_device):
         folder.mkdir(parents=True, exist_ok=True)
+        with fail_together():
+            if process.is_first:
+                check_same_teachers(folder / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
         prepared_folder = Path(prepared) if prepared is not None else folder / "prepared"
         voxel = config.model.voxel
         datasets = prepare_scenes(

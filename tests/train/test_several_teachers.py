@@ -26,12 +26,19 @@ from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.models.output_space import OutputSpaces
+from gsencoder.train.checkpoint import (
+    TRAINING_CHECKPOINT_FILE,
+    TrainingState,
+    check_same_teachers,
+    load_checkpoint,
+    save_checkpoint,
+)
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.distill import Distillation
 from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
-from gsencoder.train.run import TrainConfig, resume_settings
+from gsencoder.train.run import TrainConfig, resume_settings, train
 from gsencoder.train.samples import SampleDataset
 from gsencoder.train.trainer import Trainer
 from gsencoder.train.training_scene import TrainingScene
@@ -191,6 +198,45 @@ def test_a_run_goes_on_only_with_its_teachers_in_their_order(datasets: Datasets)
     assert first != second
     assert first_difference(first, second).startswith("teachers=['sides', 'heights'], and this run asks teachers=['hei")
     assert first != resume_settings(config, ProcessRank(), opened, ["wall_0", "wall_1"])
+
+
+def test_other_teachers_than_those_of_a_checkpoint_are_refused_before_and_after_preparation(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    check_same_teachers(path, ["a", "b", "c"])
+    encoder = small_encoder()
+    optimizer = torch.optim.AdamW(encoder.parameters())
+    several: dict[str, object] = {"teachers": ["a", "b"], "spaces": {"a": "1", "b": "2"}}
+    state = TrainingState(step=1)
+    for stored, asked, message in (
+        (
+            several,
+            ["a", "b", "c"],
+            r"was made with teachers=\['a', 'b'\], and this run asks teachers=\['a', 'b', 'c'\];",
+        ),
+        (several, ["b", "a"], r"was made with teachers=\['a', 'b'\], and this run asks teachers=\['b', 'a'\];"),
+        (several, ["a"], r"was made with teachers=\['a', 'b'\], and this run asks one teacher;"),
+        ({"space": "1"}, ["a", "b"], r"was made with one teacher, and this run asks teachers=\['a', 'b'\];"),
+    ):
+        save_checkpoint(path, encoder, optimizer, state, stored)
+        check_same_teachers(path, several["teachers"] if "teachers" in stored else ["any"])  # type: ignore[arg-type]
+        settings = {"teachers": asked, "spaces": {}} if len(asked) > 1 else {"space": "1"}
+        for check in (
+            lambda asked=asked: check_same_teachers(path, asked),
+            lambda settings=settings: load_checkpoint(path, encoder, optimizer, settings),
+        ):
+            with pytest.raises(InputError, match=f"{message}.*; give resume=false to begin anew"):
+                check()
+
+
+def test_a_run_with_another_list_of_teachers_is_refused_before_anything_is_prepared(tmp_path: Path) -> None:
+    encoder = small_encoder()
+    optimizer = torch.optim.AdamW(encoder.parameters())
+    made_with = {"teachers": ["a", "b"]}
+    save_checkpoint(tmp_path / TRAINING_CHECKPOINT_FILE, encoder, optimizer, TrainingState(step=1), made_with)
+    config = TrainConfig(teachers={name: PaletteConfig() for name in "abc"})
+    with pytest.raises(InputError, match="and this run asks teachers="):
+        train([tmp_path / "nowhere"], config, work=tmp_path, device="cpu")
+    assert not (tmp_path / "prepared").exists()
 
 
 def test_names_that_a_scene_to_train_on_has_gained_need_other_prepared_scenes(datasets: Datasets) -> None:

@@ -33,6 +33,7 @@ from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.train.adapter_heads import asked_heads, dataset_heads, teacher_of_heads
+from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, check_same_teachers
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
 from gsencoder.train.prepared_scene import PreparedScene
@@ -86,6 +87,8 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
             if process.is_first and not config.prepare_only:
                 # Opened now, so that an out= that cannot be written is an error before hours of work.
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
+                if config.resume:
+                    check_same_teachers(state.path / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
         with summary.step("prepare"):
             heads_asked = asked_heads(config.heads, config.teachers_by_name)
             datasets = prepare_scenes(
