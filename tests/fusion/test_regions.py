@@ -155,8 +155,24 @@ def test_masks_are_looked_for_in_the_scenes_folder_first(tmp_path: Path, monkeyp
     shutil.rmtree(tmp_path / "scene/masks")
     build_teacher(config, scene, WORDS)
     shutil.rmtree(tmp_path / "here/masks")
-    with pytest.raises(InputError, match="teacher.folder: nothing at .*scene/masks or masks"):
+    with pytest.raises(MissingInput, match="teacher.folder: nothing at .*scene/masks or masks"):
         build_teacher(config, scene, WORDS)
+
+
+def test_a_scene_lacks_what_is_named_relative_to_it_and_an_absolute_path_without_anything_is_wrong(
+    tmp_path: Path,
+) -> None:
+    write_masks(tmp_path / "masks")
+    scene = region_scene(tmp_path)
+    for options, lacks in (
+        ({"folder": "none"}, True),
+        ({"folder": "masks", "captions": "none.json"}, True),
+        ({"folder": str(tmp_path / "none")}, False),
+        ({"folder": "masks", "captions": str(tmp_path / "none.json")}, False),
+    ):
+        with pytest.raises(InputError, match="nothing at .*none") as error:
+            build_teacher(RegionsConfig(**options), scene, WORDS)  # type: ignore[arg-type]
+        assert isinstance(error.value, MissingInput) == lacks
 
 
 def test_label_images_are_called_like_their_views(tmp_path: Path) -> None:

@@ -94,7 +94,8 @@ class FileMasks:
             folder: see `scene_path`.
 
         Raises:
-            InputError: no folder, files that are missing, or several for one view.
+            MissingInput: no such folder beside the scene.
+            InputError: no folder is named or there, files that are missing, or several for one view.
         """
         if not folder:
             raise InputError(
@@ -126,13 +127,15 @@ def scene_path(scene: Scene, name: str, option: str) -> Path:
     """A file or folder beside a scene: in the scene's folder, else at the path itself.
 
     Raises:
-        InputError: there is none, or the name stands for both.
+        MissingInput: there is none, and the name is relative, so that other scenes may have one.
+        InputError: there is none at an absolute path, or the name stands for both.
     """
     beside = scene.folder / name if scene.folder is not None and not Path(name).is_absolute() else None
     known = [path for path in (beside, Path(name)) if path is not None and path.exists()]
     if not known:
         tried = " or ".join(str(path) for path in (beside, Path(name)) if path is not None)
-        raise InputError(f"{option}: nothing at {tried}")
+        absent = InputError if Path(name).is_absolute() else MissingInput
+        raise absent(f"{option}: nothing at {tried}")
     if len(known) == 2 and not known[0].samefile(known[1]):
         raise InputError(f"{option}={name}: stands for {known[0]} and for {known[1].absolute()}; give a complete path")
     return known[0]
