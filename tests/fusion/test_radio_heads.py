@@ -221,6 +221,43 @@ def test_files_of_pickles_are_refused(tmp_path: Path, name: str) -> None:
         heads_of(RadioConfig(model=str(tmp_path / name)), ["siglip"])
 
 
+@pytest.mark.parametrize("name", ["radio-v2.5-h.pth.tar", "pytorch_model.bin"])
+def test_heads_of_a_folder_of_pickles_are_refused_as_its_backbone_is(tmp_path: Path, name: str) -> None:
+    small_radio(tmp_path)
+    (tmp_path / "model.safetensors").unlink()
+    (tmp_path / name).write_bytes(b"\x80\x04")
+    with pytest.raises(InputError) as of_backbone:
+        RadioTeacher(RadioConfig(model=str(tmp_path)))
+    assert "has no weights as safetensors, and files of pickles are not opened" in str(of_backbone.value)
+    with pytest.raises(InputError) as of_heads:
+        heads_of(RadioConfig(model=str(tmp_path)), ["siglip"])
+    assert str(of_heads.value) == str(of_backbone.value)
+
+
+@pytest.mark.parametrize("present", [True, False])
+def test_files_that_the_index_of_the_weights_names_and_that_are_missing_are_named(
+    tmp_path: Path, present: bool
+) -> None:
+    small_radio(tmp_path)
+    first, second = ("model-00001-of-00002.safetensors", "model-00002-of-00002.safetensors")
+    (tmp_path / "model.safetensors").rename(tmp_path / first)
+    index = tmp_path / "model.safetensors.index.json"
+    index.write_text(json.dumps({"weight_map": {"a": first, "b": second, "c": second}}))
+    if not present:
+        (tmp_path / first).unlink()
+    missing = f"1 of 2 .* missing: {second};" if present else f"2 of 2 .* missing: {first}, {second};"
+    with pytest.raises(InputError, match=missing):
+        heads_of(RadioConfig(model=str(tmp_path)), ["siglip"])
+    index.write_text("{")
+    with pytest.raises(InputError, match="index.json cannot be read"):
+        heads_of(RadioConfig(model=str(tmp_path)), ["siglip"])
+    if present:
+        (tmp_path / second).write_bytes((tmp_path / first).read_bytes())
+        index.write_text(json.dumps({"weight_map": {"a": first}}))
+        (tmp_path / second).unlink()
+        assert [head.name for head in read(tmp_path, "siglip")] == ["siglip.summary"]
+
+
 def test_heads_of_a_teacher_without_any_and_files_of_heads_are_refused(folder: Path) -> None:
     with pytest.raises(InputError, match="heads=siglip: teacher=palette has no adapter heads; teacher=radio has some"):
         heads_of(PaletteConfig(), ["siglip"])

@@ -18,9 +18,10 @@ from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError, about, listed
 from gsencoder.core.files.model_files import check_fetched
+from gsencoder.core.pretrained import weight_files
 from gsencoder.fusion.heads.layers import Residual
 from gsencoder.fusion.heads.names import Part, default_part, split_name, text_kind
-from gsencoder.fusion.teachers.radio import ADAPTERS
+from gsencoder.fusion.teachers.radio import ADAPTERS, WHAT
 
 NORMALIZER = "radio_model.feature_normalizer."
 MODULES: Mapping[Part, str] = {"summary": "head_mlp", "features": "feat_mlp"}
@@ -29,6 +30,8 @@ SECTIONS: Mapping[Part, str] = {"summary": "summary", "features": "feature"}
 SIZES = ("input_dim", "hidden_dim", "output_dim", "num_inner")
 VERSIONS = ("v1", "v2")
 MAX_SIZE = 1 << 16
+INDEX_FILE = "model.safetensors.index.json"
+"""States which file holds which weight where there are several files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,17 +75,41 @@ def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[
         channels: D of the backbone.
 
     Raises:
-        InputError: no such head, weights that are missing or surplus or of another shape, a head of another backbone,
-            or a form of head that is not known.
+        InputError: no such head, no file of weights, weights that are missing or surplus or of another shape, a head of
+            another backbone, or a form of head that is not known.
     """
+    files = _weight_files(folder)
     with about(f"heads of {folder}"):
         config = _read_config(folder)
         heads: dict[str, Head] = {}
-        with _open_weights(folder) as weights:
+        with _open_weights(files) as weights:
             for name in names:
                 head = _read_head(weights, config, name, channels)
                 heads[head.name] = head
         return list(heads.values())
+
+
+def _weight_files(folder: Path) -> list[Path]:
+    """The safetensors files of a folder.
+
+    Raises:
+        InputError: there are none, or not all that the index names.
+    """
+    index = folder / INDEX_FILE
+    if index.is_file():
+        try:
+            stated = json.loads(index.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{WHAT}: {index} cannot be read: {error}") from error
+        shards = stated.get("weight_map") if isinstance(stated, dict) else None
+        names = sorted({str(name) for name in shards.values()}) if isinstance(shards, dict) else []
+        missing = [name for name in names if not (folder / name).is_file()]
+        if missing:
+            raise InputError(
+                f"{WHAT}: {folder}: {len(missing)} of {len(names)} files of weights that {INDEX_FILE} names are "
+                f"missing: {listed(missing, 3)}; fetch the complete folder"
+            )
+    return weight_files(folder, WHAT)
 
 
 def _read_config(folder: Path) -> dict[str, Any]:
@@ -125,12 +152,12 @@ class _Weights:
 
 
 @contextmanager
-def _open_weights(folder: Path) -> Iterator[_Weights]:
+def _open_weights(paths: Sequence[Path]) -> Iterator[_Weights]:
     from safetensors import SafetensorError, safe_open
 
     with ExitStack() as stack:
         files: dict[str, Any] = {}
-        for path in sorted(folder.glob("*.safetensors")):
+        for path in paths:
             check_fetched(path)
             try:
                 file = stack.enter_context(safe_open(path, framework="pt"))
