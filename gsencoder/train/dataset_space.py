@@ -61,8 +61,8 @@ def dataset_space(
         optional: leave out scenes that lack what the teacher needs, since they have other teachers.
 
     Raises:
-        MissingInput: a scene lacks what the teacher needs, or with `optional` all do; then the message is that of the
-            first.
+        MissingInput: a scene lacks what the teacher needs, or with `optional` all do; then the message has that of
+            the first.
         InputError: there are no scenes, or their teachers have different spaces.
     """
     if not scenes:
@@ -84,7 +84,7 @@ def dataset_space(
         tables.append(of_scene.table)
     if teacher is None:
         assert missing is not None
-        raise missing
+        raise MissingInput(f"no scene to train on has what it needs; the first one: {missing}") from missing
     if tables:
         table = np.unique(np.concatenate(tables), axis=0)
         space = replace(_coded_space(table, teacher, config), centered=center, scaled=scale)

@@ -204,6 +204,7 @@ def fit(
         if nothing_else:
             raise InputError(message)
         warnings.warn(message, SceneWarning, stacklevel=2)
+    _check_trained(config.loss, weights, with_contrast)
     recipe = SampleRecipe(
         encoder=config.model,
         sampling=config.sampling,
@@ -249,6 +250,32 @@ def fit(
     scores = dict(trainer.last_validation.scores) if trainer.last_validation is not None else {}
     tables = {name: _table_of(each, datasets[name]) for name, each in words.items()}
     return Training(encoder=trainer.encoder, outputs=outputs, tables=tables, state=state, scores=scores)
+
+
+def _check_trained(losses: LossConfig, weights: Sequence[float], with_contrast: Mapping[str, bool]) -> None:
+    """Warns of teachers on which no loss is computed, since the encoder offers their features all the same.
+
+    Raises:
+        InputError: none is computed on any.
+    """
+    of_all = losses.field_weight + losses.render_weight > 0
+    untrained = [
+        name
+        for (name, contrast), weight in zip(with_contrast.items(), weights, strict=True)
+        if not weight or not (of_all or (contrast and losses.contrast_weight))
+    ]
+    if not untrained:
+        return
+    given = f"loss.teacher_weights={list(weights)}"
+    if len(untrained) == len(weights):
+        raise InputError(f"loss: the losses of every teacher have the weight 0 ({given}); give one of them a weight")
+    names = f"teacher {untrained[0]}" if len(untrained) == 1 else f"teachers {', '.join(untrained)}"
+    warnings.warn(
+        f"{names}: no loss is computed with a weight above 0 ({given}), so that the encoder gives features that were "
+        "never trained; give a weight above 0, or leave the teacher out",
+        SceneWarning,
+        stacklevel=3,
+    )
 
 
 def _parts(datasets: Mapping[str, PreparedDataset], name: str) -> list[PreparedScene | None]:

@@ -1,5 +1,6 @@
 """What a training gives its loop: weight and classes of each teacher, parts of each scene, and what is held out."""
 
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,6 +12,7 @@ import pytest
 import torch
 from training_scenes import LOSSES, SMALL, DenseSideTeacher, SideTeacher, prepared
 
+from gsencoder.core.errors import InputError
 from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import save_heads
@@ -57,6 +59,7 @@ def begin(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     heads: tuple[str, ...] = (),
+    warned: list[str] | None = None,
     **losses: Any,
 ) -> tuple[SampleDataset, list[str], dict[str, Any]]:
     """The samples and heads that `fit` gives the loop, and the scenes that its validation is given."""
@@ -76,10 +79,12 @@ def begin(
     teachers = {name: RadioConfig() if name == "dense" else PaletteConfig() for name in datasets}
     config = TrainConfig(teachers=teachers, model=SMALL, loss=replace(LOSSES, **losses), heads=heads)
     around = {"work": tmp_path, "process": ProcessRank(), "device": torch.device("cpu")}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         with pytest.raises(Begun):
             fit(datasets, training, ["wall_1"], {}, config, validate=validate, **around)  # type: ignore[arg-type]
+    if warned is not None:
+        warned += [str(each.message) for each in caught]
     return given["dataset"], given["validated"], given["heads"]
 
 
@@ -92,6 +97,35 @@ def test_each_teacher_has_its_own_weight_and_classes(
         for teacher, (name, dataset) in zip(data.recipe.teachers, datasets.items(), strict=True):
             assert teacher.name == name
             np.testing.assert_array_equal(teacher.class_balance.codebook, dataset.load_class_balance().codebook)
+
+
+@pytest.mark.parametrize(
+    ("losses", "untrained"),
+    [
+        ({"teacher_weights": (1.0, 0.0)}, r"teacher dense: .*weights=\[1\.0, 0\.0\]"),
+        ({"teacher_weights": (0.0, 1.0)}, "teacher coded: "),
+        # The dense teacher has no classes.
+        ({"field_weight": 0.0, "render_weight": 0.0, "contrast_weight": 1.0}, "teacher dense: "),
+        ({"field_weight": 0.0, "contrast_weight": 1.0}, None),
+        ({"teacher_weights": (0.1, 1.0)}, None),
+    ],
+)
+def test_a_teacher_that_no_loss_is_computed_on_is_named_in_a_warning(
+    losses: dict[str, Any], untrained: str | None, datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warned: list[str] = []
+    begin(datasets, ["wall_0"], tmp_path, monkeypatch, warned=warned, **losses)
+    messages = [each for each in warned if "never trained" in each]
+    assert len(messages) == (untrained is not None)
+    assert untrained is None or re.match(untrained, messages[0])
+
+
+def test_a_training_without_a_loss_on_any_teacher_is_refused(
+    datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only_contrast = {"field_weight": 0.0, "render_weight": 0.0, "contrast_weight": 1.0}
+    with pytest.raises(InputError, match=r"the losses of every teacher have the weight 0 .*weights=\[0\.0, 1\.0\]"):
+        begin(datasets, ["wall_0"], tmp_path, monkeypatch, teacher_weights=(0.0, 1.0), **only_contrast)
 
 
 @pytest.mark.parametrize(("clusters", "expected"), [(False, [True, False]), (True, [True, True])])

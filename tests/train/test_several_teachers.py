@@ -303,7 +303,7 @@ def test_the_space_is_that_of_the_scenes_that_have_the_teacher() -> None:
     found = dataset_space([Path("bare"), Path("a")], open_scene, optional=True, **arguments)  # type: ignore[arg-type]
     expected = dataset_space([Path("a")], open_scene, **arguments)  # type: ignore[arg-type]
     np.testing.assert_allclose(found.outputs.mean, expected.outputs.mean, atol=1e-6)
-    with pytest.raises(MissingInput, match="no labels"):
+    with pytest.raises(MissingInput, match="no scene to train on has what it needs; the first one: .* no labels"):
         dataset_space([Path("bare")], open_scene, optional=True, **arguments)  # type: ignore[arg-type]
     with pytest.raises(MissingInput, match="no labels"):
         dataset_space([Path("bare"), Path("a")], open_scene, **arguments)  # type: ignore[arg-type]
