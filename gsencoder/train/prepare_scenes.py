@@ -191,9 +191,16 @@ def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """The folder of the prepared scenes of each teacher: the given one, or one in it for each of several teachers.
 
     Raises:
-        InputError: there are several teachers, and the folder holds scenes that were prepared for one.
+        InputError: there are several teachers and the folder holds scenes that were prepared for one, or the reverse.
     """
     if len(names) == 1:
+        prepared = sorted(path.parent.name for path in folder.glob(f"*/{DATASET_SETTINGS_FILE}"))
+        if prepared and not (folder / DATASET_SETTINGS_FILE).is_file():
+            own = names[0] if names[0] in prepared else prepared[0]
+            raise InputError(
+                f"{folder}: was prepared for several teachers ({listed(prepared, 3)}), and this run has one; give "
+                f"another prepared=, or the folder of one of them ({folder / own})"
+            )
         return {names[0]: folder}
     if (folder / DATASET_SETTINGS_FILE).is_file():
         raise InputError(

@@ -326,6 +326,15 @@ def test_scenes_prepared_for_one_teacher_are_not_taken_for_those_of_several(data
         teacher_folders(folder, ["sides", "heights"])
 
 
+def test_scenes_prepared_for_several_teachers_are_not_taken_for_those_of_one(datasets: Datasets) -> None:
+    folder = datasets["sides"][0].folder.parent
+    assert set(teacher_folders(folder, ["sides", "heights"])) == {"sides", "heights"}
+    for name, own in (("sides", "sides"), ("colors", "heights")):
+        message = rf"was prepared for several teachers \(heights, sides\), and this run has one; .*/{own}\)"
+        with pytest.raises(InputError, match=message):
+            teacher_folders(folder, [name])
+
+
 def test_two_teachers_of_one_feature_space_are_refused(datasets: Datasets) -> None:
     outputs, _ = datasets["sides"][0].load_space()
     with pytest.raises(InputError, match=r"teachers: a and b have the same features \(sides · 4 channels\)"):
