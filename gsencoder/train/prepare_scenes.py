@@ -63,6 +63,14 @@ class SourceConfig:
         wrong = [name for name in self.teachers if not re.fullmatch(TEACHER_NAME, name)]
         if wrong:
             raise InputError(f"teachers: expected names of letters, digits, _ and -, got {wrong[0]!r}")
+        spelled: dict[str, str] = {}
+        for name in self.teachers:
+            other = spelled.setdefault(name.lower(), name)
+            if other != name:
+                raise InputError(
+                    f"teachers: {other} and {name} differ only in case, and their files would overwrite each other "
+                    f"where a file system ignores it; give another name, such as {name}_2"
+                )
 
     @property
     def teachers_by_name(self) -> dict[str, TeacherConfig]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from training_scenes import PREPARE, DenseSideTeacher, SideTeacher, scene
 
-from gsencoder.core.errors import SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.train import prepare_scenes as module
@@ -85,3 +85,8 @@ def test_a_scene_is_prepared_for_each_teacher_that_it_has_and_again_where_its_fi
         prepare(tmp_path)
         assert removed.read_bytes() == content
         assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_names_of_teachers_that_differ_only_in_case_are_refused() -> None:
+    with pytest.raises(InputError, match="teachers: labels and LABELS differ only in case"):
+        SourceConfig(teachers={name: PaletteConfig() for name in ("labels", "colors", "LABELS")})
