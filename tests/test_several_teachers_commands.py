@@ -187,7 +187,7 @@ def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pyt
         (["teacher=[palette,labels]", "teacher.words=x"], "teacher.words: is for a single teacher, and teachers="),
         (["teachers=palette,labels", "teacher=radio"], "leave out teacher= or teachers="),
         (["teacher=[]"], "teachers: expected one or more of"),
-        (["teacher=[palette,x:onnx]"], "teacher.model= is missing"),
+        (["teacher=[palette,x:onnx]"], "teachers.x.model= is missing"),
     ):
         assert message in refusal(capsys, *train, *more), more
     alone = ["teacher=palette", "loss.contrast_weight=1", "loss.field_weight=0", "loss.render_weight=0"]

@@ -4,7 +4,8 @@ Every message is one line that says what was wrong, where, what was expected, an
 and exits with code 2; any other exception is a bug and is shown with its traceback.
 """
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 
@@ -41,3 +42,20 @@ def advised(advice: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{error}; {advice}") from error
+
+
+@contextmanager
+def renamed_options(section: str, typed: str, options: Iterable[str]) -> Iterator[None]:
+    """Names options in the message of an `InputError` that leaves the block by the keys that are typed for them.
+
+    Args:
+        section: the section that messages name, such as teacher in teacher.model.
+        typed: the section that the user has to type, such as teachers.clip.
+        options: names of the section's options; other words that begin like it, such as files, are left as they are.
+    """
+    try:
+        yield
+    except InputError as error:
+        key = rf"(?<![\w./\\-]){re.escape(section)}\.(?=(?:{'|'.join(map(re.escape, options))})\b)"
+        message = re.sub(key, lambda _: f"{typed}.", str(error))
+        raise error if message == str(error) else type(error)(message) from error

@@ -4,7 +4,7 @@ import hashlib
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import partial
@@ -21,7 +21,7 @@ from gsencoder.data.splats import READABLE
 from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.store.folder import TEACHER_NAME
 from gsencoder.fusion.teachers import MissingInput, Teacher
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
+from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, options_of_member
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.models.output_space import check_distinct
@@ -76,6 +76,10 @@ class SourceConfig:
     def teachers_by_name(self) -> dict[str, TeacherConfig]:
         """The teachers of the training, one or several."""
         return dict(self.teachers) or {self.teacher.name: self.teacher}
+
+    def typed_options(self, name: str) -> AbstractContextManager[None]:
+        """Names options of a teacher in errors by the keys that are typed: teachers.NAME.OPTION with `teachers`."""
+        return options_of_member(name, self.teachers[name]) if name in self.teachers else nullcontext()
 
 
 def split_scenes(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[Path], list[Path]]:
@@ -157,9 +161,9 @@ def prepare_scenes(
                 dataset = PreparedDataset(path, made_with[name])
                 dataset.remove_stale_maps()
                 open_scene, views = partial(reader.with_views, name), config.prepare.basis_views
-                # Read first, since a head that is not there is an error before the teacher has made a map.
-                unmeasured = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
-                with about(f"teacher {name}") if several else nullcontext():
+                with about(f"teacher {name}") if several else nullcontext(), config.typed_options(name):
+                    # Read first, since a head that is not there is an error before the teacher has made a map.
+                    unmeasured = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
                     dataset.fit_space(training, open_scene, config.prepare, optional=several)
                     measure_dataset_heads(dataset, unmeasured, training, open_scene, views, optional=several)
             # Before hours of preparation, since the encoder could not have such columns.
@@ -181,7 +185,7 @@ def prepare_scenes(
         for path in assigned:
             trained = path in training
             try:
-                _prepare_scene(path, missing[path], datasets, reader, config.prepare, trained=trained, optional=several)
+                _prepare_scene(path, missing[path], datasets, reader, config, trained=trained, optional=several)
             except InputError as error:
                 # The error is raised when all processes have ended their shares, which may take hours.
                 if process.world_size > 1:
@@ -239,7 +243,7 @@ def _prepare_scene(
     names: Sequence[str],
     datasets: Mapping[str, PreparedDataset],
     reader: "_SceneReader",
-    config: PrepareConfig,
+    config: SourceConfig,
     *,
     trained: bool,
     optional: bool,
@@ -252,7 +256,8 @@ def _prepare_scene(
         scene, teachers = reader.load(path), dict[str, Teacher]()
         for name in names:
             try:
-                teacher = reader.teacher(name, scene)
+                with config.typed_options(name):
+                    teacher = reader.teacher(name, scene)
                 # Known before Gaussians are made, which takes minutes where they come from photographs.
                 if teacher.needs_images and scene.views is not None and scene.views.images is None:
                     raise MissingInput(f"teacher {name}: the scene has no pictures")
@@ -267,7 +272,8 @@ def _prepare_scene(
             if trained:
                 datasets[name].check_kinds(teacher)
             try:
-                datasets[name].prepare(scene, teacher, config, source=path)
+                with config.typed_options(name):
+                    datasets[name].prepare(scene, teacher, config.prepare, source=path)
             except MissingInput:
                 if not optional:
                     raise
@@ -328,7 +334,8 @@ class _SceneReader:
             scene, weights = self.load(path), dict[str, str]()
             for name in self.config.teachers_by_name:
                 try:
-                    weights[name] = self.teacher(name, scene).space.weights
+                    with self.config.typed_options(name):
+                        weights[name] = self.teacher(name, scene).space.weights
                 except MissingInput:
                     continue
         return weights

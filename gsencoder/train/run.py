@@ -133,7 +133,7 @@ def train(
     """
     folder = Path(work)
     training, validation = [Path(path) for path in scenes], [Path(path) for path in held_out]
-    words = words_by_teacher(config.teachers_by_name, config.text)
+    words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
     with join_processes(device) as (process, chosen_device):
         folder.mkdir(parents=True, exist_ok=True)
         with fail_together():

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 from training_scenes import PREPARE, DenseSideTeacher, SideTeacher, scene
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning, renamed_options
 from gsencoder.fusion.teachers import MissingInput
+from gsencoder.fusion.teachers.build import words_by_teacher
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.teachers.onnx import OnnxConfig
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.train import prepare_scenes as module
 from gsencoder.train.prepare import PreparedDataset
@@ -85,6 +88,49 @@ def test_a_scene_is_prepared_for_each_teacher_that_it_has_and_again_where_its_fi
         prepare(tmp_path)
         assert removed.read_bytes() == content
         assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+class PathOfModel(Reader):
+    """Names options as the errors of a single teacher do."""
+
+    def teacher(self, name: str, of: Scene) -> Any:
+        raise InputError("teacher.model: no file at teacher.onnx or a/teacher.model; lower teacher.size= or more")
+
+
+@pytest.mark.parametrize("name", ["palette", "clip"])
+def test_errors_name_the_options_of_one_of_several_teachers_as_they_are_typed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(module, "_SceneReader", PathOfModel)
+    typed = rf"teachers\.{name}\.model: no file at teacher\.onnx or a/teacher\.model; lower teachers\.{name}\.size="
+    config = SourceConfig(teachers={name: OnnxConfig(), "dense": PaletteConfig()}, prepare=PREPARE)
+    with pytest.raises(InputError, match=typed):
+        prepare_scenes(WALLS[:1], [], {}, config, tmp_path / "several", voxel=0.1)
+    with pytest.raises(InputError, match=typed):
+        prepare_scenes(WALLS[:1], [], {}, SourceConfig(teachers={name: OnnxConfig()}), tmp_path / "one", voxel=0.1)
+    with pytest.raises(InputError, match="^teacher.model: no file"):
+        prepare_scenes(WALLS[:1], [], {}, SourceConfig(teacher=OnnxConfig()), tmp_path / "single", voxel=0.1)
+
+
+def test_errors_of_words_name_the_options_of_one_of_several_teachers_as_they_are_typed() -> None:
+    config = LabelsConfig(words="none.safetensors")
+    for teachers, members, option in (
+        ({"labels": config, "palette": PaletteConfig()}, False, "teachers.labels.words"),
+        ({"things": config}, True, "teachers.things.words"),
+        ({"labels": config}, False, "teacher.words"),
+    ):
+        with pytest.raises(InputError, match=f"^{option}: no file"):
+            words_by_teacher(teachers, members=members)
+
+
+def test_options_are_renamed_at_the_beginning_of_words_in_errors_of_the_same_kind() -> None:
+    renamed = "^teachers.x.words=, teacher.cell or teacher. Not ateacher.words$"
+    with pytest.raises(MissingInput, match=renamed), renamed_options("teacher", "teachers.x", ["words"]):
+        raise MissingInput("teacher.words=, teacher.cell or teacher. Not ateacher.words")
+    unchanged = InputError("teachers.x.words: no file")
+    with pytest.raises(InputError) as error, renamed_options("teacher", "teachers.x", ["words"]):
+        raise unchanged
+    assert error.value is unchanged
 
 
 def test_names_of_teachers_that_differ_only_in_case_are_refused() -> None:

@@ -1,10 +1,12 @@
 """Teachers, and the words that lead into their spaces, from settings."""
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
 
 import numpy as np
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, renamed_options
 from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
@@ -90,8 +92,20 @@ def takes_text(config: TeacherConfig) -> bool:
     return isinstance(config, (LabelsConfig, SegmenterConfig)) or (isinstance(config, OnnxConfig) and config.joint)
 
 
-def words_by_teacher(teachers: Mapping[str, TeacherConfig], text: TextConfig = TableTextConfig()) -> dict[str, Words]:
+def options_of_member(name: str, config: TeacherConfig) -> AbstractContextManager[None]:
+    """Names options in errors by the keys of one of several teachers: teachers.NAME.model for teacher.model."""
+    return renamed_options("teacher", f"teachers.{name}", [each.name for each in fields(config)])
+
+
+def words_by_teacher(
+    teachers: Mapping[str, TeacherConfig], text: TextConfig = TableTextConfig(), *, members: bool = False
+) -> dict[str, Words]:
     """The words of each of several teachers that has any; a text tower is for those whose words it can be.
+
+    Args:
+        teachers: by name.
+        text: see `words_of`.
+        members: whether even a single teacher is given as one of `teachers=`, for errors.
 
     Raises:
         InputError: see `words_of`; or a tower is given that is for none of several teachers.
@@ -99,11 +113,13 @@ def words_by_teacher(teachers: Mapping[str, TeacherConfig], text: TextConfig = T
     several, given = len(teachers) > 1, not isinstance(text, TableTextConfig)
     if several and given and not any(map(takes_text, teachers.values())):
         raise InputError(f"text=: the words of none of the teachers {', '.join(teachers)} can be those of a text tower")
-    words = {
-        name: words_of(config, text if not several or takes_text(config) else TableTextConfig())
-        for name, config in teachers.items()
-    }
-    return {name: each for name, each in words.items() if each is not None}
+    words: dict[str, Words] = {}
+    for name, config in teachers.items():
+        with options_of_member(name, config) if several or members else nullcontext():
+            own = words_of(config, text if not several or takes_text(config) else TableTextConfig())
+        if own is not None:
+            words[name] = own
+    return words
 
 
 def words_beside(teacher: Teacher, words: Words | None) -> TextTable | None:
