@@ -2,6 +2,7 @@
 
 import pytest
 
+from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.app.settings.multirun import run_many
@@ -45,3 +46,10 @@ def test_an_empty_list_of_scenes_to_hold_out_replaces_that_of_the_experiment() -
         assert composed("experiment=house", empty).holdout == ()
     assert composed("holdout=[room_0, room_1*]").holdout == ("room_0", "room_1*")
     assert composed("holdout=room_[0-3]").holdout == ("room_[0-3]",)
+
+
+def test_a_command_that_takes_one_teacher_says_so_where_options_of_several_are_given() -> None:
+    with pytest.raises(InputError, match="^teachers.labels.words: this command takes a single teacher; give"):
+        compose("fuse", FuseCommandConfig, ["ROOM", "teachers.labels.words=names.npz"])
+    with pytest.raises(InputError, match="there is no palette among the teachers of this run"):
+        composed("teacher=[labels]", "teachers.palette.cell=4")

@@ -240,3 +240,9 @@ def test_what_was_checked_is_remembered_until_the_file_is_written_again(
     os.utime(mapped, ns=(1, 1))
     MappedArrays(mapped, wanted, again).array("wide")
     assert looked_at == [0, 1, 2, 3]
+
+
+def test_a_pointer_of_git_lfs_is_named_as_what_it_is(tmp_path: Path) -> None:
+    (tmp_path / "x").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    with pytest.raises(InputError, match="x: is a pointer of git-lfs and not the file itself"):
+        taken(tmp_path / "x")

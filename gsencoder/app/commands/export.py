@@ -98,6 +98,8 @@ def run(config: ExportConfig, summary: Summary) -> None:
     assert config.out is not None
     if config.out.suffix.lower() != SUFFIX:
         raise InputError(f"out: expected a file that ends in {SUFFIX}, got {config.out.name}")
+    if config.weights.lower().endswith(SUFFIX):
+        raise InputError(f"weights: {config.weights} is an exported graph already; give the encoder that `train` wrote")
     for path in (config.out, Path(f"{config.out}.summary.json"), heads_of_graph(config.out)):
         refuse_existing(path, config.overwrite)
     track = Progress(quiet=config.quiet)

@@ -181,6 +181,10 @@ def read_words(
 
 def _unknown(word: str, key: str, choices: Choices) -> str:
     known, shown = [*choices.options, *choices.groups], without_value(word)
+    single = key.partition(".")[0].removesuffix("s")
+    only_one = not any(option.several for option in choices.options.values())
+    if only_one and single in choices.groups and key.startswith(f"{single}s"):
+        return f"{key}: this command takes a single {single}; give {single}= and its options as {single}.OPTION="
     sections = [name for name in known if name.startswith(key + ".")]
     if sections:
         return f"{key}: is a section; set its options one by one: {', '.join(f'{name}=' for name in sections[:4])}"

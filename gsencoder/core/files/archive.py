@@ -19,6 +19,7 @@ import numpy as np
 from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files.atomic import is_full_disk
 from gsencoder.core.files.checksums import block_checksums, bytes_of, damaged_blocks, file_digest
+from gsencoder.core.files.model_files import check_fetched
 
 VERSION = 2
 WITHOUT_CHECKSUMS = 1
@@ -277,5 +278,6 @@ def open_archive(path: Path) -> Iterator[Archive]:
     except InputError:
         raise
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        check_fetched(path)
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged or no safetensors file: {message}") from error
