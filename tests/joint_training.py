@@ -29,6 +29,15 @@ class HeightTeacher(DenseSideTeacher):
         return FeatureMap(features=features.copy(), grid_from_image=seen.grid_from_image, space=TALL)
 
 
+class DenseTeacher(DenseSideTeacher):
+    """A dense teacher of a space of its own."""
+
+    space = FeatureSpace(name="dense sides", channels=4)
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        return replace(super().feature_map(views, view), space=self.space)
+
+
 Datasets = Mapping[str, tuple[PreparedDataset, list[str]]]
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from training_scenes import LOSSES, SMALL, DenseSideTeacher, SideTeacher, prepared
+from joint_training import DenseTeacher
+from training_scenes import LOSSES, SMALL, SideTeacher, prepared
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
@@ -26,18 +27,8 @@ from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.run import TrainConfig, fit
 from gsencoder.train.samples import SampleDataset
 from gsencoder.train.trainer import ValidationResult
-from gsencoder.types import FeatureSpace
 
 Datasets = Mapping[str, PreparedDataset]
-
-
-class DenseTeacher(DenseSideTeacher):
-    """A dense teacher of a space of its own."""
-
-    space = FeatureSpace(name="dense sides", channels=4)
-
-    def feature_map(self, views: Any, view: int) -> Any:
-        return replace(super().feature_map(views, view), space=self.space)
 
 
 class Begun(Exception):

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from training_scenes import PREPARE, DenseSideTeacher, SideTeacher, scene
+from joint_training import DenseTeacher
+from training_scenes import PREPARE, SideTeacher, scene
 
 from gsencoder.core.errors import InputError, SceneWarning, renamed_options
 from gsencoder.fusion.teachers import MissingInput
@@ -16,20 +17,10 @@ from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.train import prepare_scenes as module
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
-from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
+from gsencoder.types import Scene
 
 LACKING = {"coded": {"wall_1"}, "dense": {"wall_0", "wall_3"}}
 WALLS = [Path(f"wall_{number}") for number in range(4)]
-
-
-class DenseTeacher(DenseSideTeacher):
-    """A dense teacher of a space of its own."""
-
-    space = FeatureSpace(name="dense sides", channels=4)
-
-    def feature_map(self, views: Views, view: int) -> FeatureMap:
-        seen = super().feature_map(views, view)
-        return FeatureMap(features=seen.features, grid_from_image=seen.grid_from_image, space=self.space)
 
 
 TEACHERS: dict[str, Any] = {"coded": SideTeacher(), "dense": DenseTeacher()}
