@@ -1,0 +1,1 @@
+"""Spatial multimodal memory (M3): banks of principal scene components, and the queries that Gaussians ask them."""

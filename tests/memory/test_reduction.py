@@ -1,0 +1,109 @@
+"""Reductions of raw features: the published algorithm beside its transcription, and what a cover promises."""
+
+import numpy as np
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.memory import reduction
+from gsencoder.memory.reduction import CoverReduction, reduce_as_published, reduce_to_cover, unit_rows
+
+
+def redundant_rows(rng: np.random.Generator, count: int, channels: int = 16) -> np.ndarray:
+    """Rows between pairs of a few directions, most near one of them, of many lengths."""
+    centers = rng.normal(size=(12, channels))
+    one, other = centers[rng.integers(0, 12, (2, count))]
+    share = rng.random((count, 1)) ** 3
+    rows = one * (1 - share) + other * share + 0.08 * rng.normal(size=(count, channels))
+    return (rows * np.exp(rng.normal(size=(count, 1)))).astype(np.float32)
+
+
+def transcription(
+    features: np.ndarray, threshold: float, chunk: int, *, drop_last: bool
+) -> tuple[list[int], np.ndarray]:
+    """Algorithm 1, line by line; the code that M3's authors published does not drop the last chunk."""
+    unit = features / np.linalg.norm(features, axis=1, keepdims=True)
+    components, used = [], np.zeros(len(unit), bool)
+    for k in range(len(unit) // chunk if drop_last else -(-len(unit) // chunk)):
+        similarities = unit[k * chunk : (k + 1) * chunk] @ unit.T
+        for j, row in enumerate(similarities, start=k * chunk):
+            if not used[j]:
+                neighbors = np.flatnonzero(row >= threshold)
+                if not used[neighbors].any():
+                    components.append(j)
+                    used[neighbors] = True
+    return components, used
+
+
+@pytest.mark.parametrize("drop_last", [False, True])
+@pytest.mark.parametrize("threshold", [0.5, 0.7, 0.9, 0.98])
+def test_the_published_algorithm_gives_what_its_transcription_gives(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, threshold: float, drop_last: bool
+) -> None:
+    # Few witnesses and small products, so that rows are settled in all three ways.
+    monkeypatch.setattr(reduction, "WITNESSES", 20)
+    monkeypatch.setattr(reduction, "BLOCK", 100)
+    monkeypatch.setattr(reduction, "PRODUCT_VALUES", 30_000)
+    features = redundant_rows(rng, 1070)
+    components, used = transcription(features, threshold, 100, drop_last=drop_last)
+    chunk = 100 if drop_last else 0
+    made = reduce_as_published(features, threshold, drop_last=chunk)
+    assert 5 <= len(components) < 1000
+    assert made.rows.tolist() == components
+    np.testing.assert_array_equal(made.used, used)
+    assert made.coverage == used.mean()
+    # The order in which witnesses are searched does not matter.
+    assert (
+        reduce_as_published(features, threshold, drop_last=100 if drop_last else 0, seed=5).rows.tolist() == components
+    )
+
+
+@pytest.mark.parametrize("threshold", [0.3, 0.9, 0.99])
+def test_every_feature_is_within_the_threshold_of_a_component_of_a_cover(
+    rng: np.random.Generator, threshold: float
+) -> None:
+    features = redundant_rows(rng, 3000)
+    made = reduce_to_cover(features, threshold)
+    unit = features.astype(np.float64)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    cosines = unit @ unit[made.rows].T
+    assert cosines.max(axis=1).min() >= threshold
+    assert 1 < len(made.rows) < 3000
+    # No component stands for another one.
+    among = np.triu(cosines[made.rows], k=1)
+    assert among.max() < threshold + 2 * reduction.ROUNDING
+
+
+def test_a_cover_is_the_same_however_features_are_divided(rng: np.random.Generator) -> None:
+    features, whole = redundant_rows(rng, 3000), CoverReduction(16, 0.8)
+    whole.add(features)
+    parts = CoverReduction(16, 0.8)
+    for part in np.split(features, [1, 500, 501, 2600]):
+        parts.add(part)
+    assert parts.rows.tolist() == whole.rows.tolist()
+    np.testing.assert_array_equal(whole.components, features[whole.rows])
+    np.testing.assert_array_equal(whole.unit, unit_rows(features)[whole.rows])
+
+
+@pytest.mark.parametrize("reduce", [reduce_as_published, reduce_to_cover])
+@pytest.mark.parametrize("threshold", [0.5, 1.0])
+def test_equal_directions_are_one_component_whatever_their_length(reduce: object, threshold: float) -> None:
+    assert callable(reduce)
+    direction = np.linspace(-1, 2, 384, dtype=np.float32)
+    features = np.stack([direction * length for length in (1e-30, 1, 3e37, 7, 1e-3)]).astype(np.float32)
+    assert reduce(features, threshold).rows.tolist() == [0]
+    assert reduce(features[:1], threshold).rows.tolist() == [0]
+    assert reduce(features, threshold).coverage == 1
+
+
+@pytest.mark.parametrize("reduce", [reduce_as_published, reduce_to_cover])
+def test_what_has_no_direction_and_thresholds_that_are_no_cosines_are_refused(reduce: object) -> None:
+    assert callable(reduce)
+    features = np.ones((4, 3), np.float32)
+    for threshold in (0.0, -0.5, 1.01, float("nan")):
+        with pytest.raises(InputError, match=r"threshold: expected a cosine above 0 and up to 1, got"):
+            reduce(features, threshold)
+    for value, what in ((0.0, "zero"), (np.nan, "not finite"), (np.inf, "not finite")):
+        broken = features.copy()
+        broken[2] = value
+        with pytest.raises(InputError, match=f"1 of 4 rows have no direction: row 2 is {what}"):
+            reduce(broken, 0.5)
