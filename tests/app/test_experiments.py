@@ -1,5 +1,7 @@
 """Experiments that choose several teachers: the command line adds options to theirs, and replaces none silently."""
 
+from pathlib import Path
+
 import pytest
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
@@ -33,11 +35,11 @@ def test_teachers_of_an_experiment_cannot_be_given_again(teachers: str) -> None:
         composed("experiment=house", teachers)
 
 
-def test_an_experiment_is_listed_once_and_exists_with_several_runs_too() -> None:
+def test_an_experiment_is_listed_once_and_exists_with_several_runs_too(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^experiment: house is given twice in \[house,house\]"):
         composed("experiment=[house,house]")
     with pytest.raises(InputError, match="^experiment: expected one of house, .*got 'nope'"):
-        run_many("train", TrainCommandConfig, ["ROOMS", "experiment=house,nope", "out=runs"], lambda config: "")
+        run_many("train", TrainCommandConfig, ["ROOMS", "experiment=house,nope", f"out={tmp_path}"], lambda config: "")
 
 
 def test_an_empty_list_of_scenes_to_hold_out_replaces_that_of_the_experiment() -> None:
