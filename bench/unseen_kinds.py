@@ -42,7 +42,7 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import aabb_iou, queryable_objects
 from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error, names_of
-from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, with_features
+from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, table_beside, with_features
 from gsencoder.fusion.teachers.build import text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.load_encoder import load_encoder
@@ -277,7 +277,7 @@ def main() -> None:
             parser.error(f"--space {arguments.space}: the encoder has the spaces {listed(list(encoder.spaces))}")
         source = encoder_source(encoder, space=arguments.space)
         words = encoder.tables.get(arguments.space or "", words)
-        words = stating_trained(words, encoder.tables.get(arguments.space) if arguments.space else encoder.words)
+        words = stating_trained(words, table_beside(encoder, arguments.space))
     score(rooms, arguments.rooms, source, words, kinds)
 
 

@@ -17,6 +17,7 @@ from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder
 from gsencoder.text.build import Words
+from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 
 FeatureSource = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
@@ -80,6 +81,11 @@ def space_of_words(encoder: Encoder, words: Words) -> str | None:
             "those of one: give its words (teacher.words= or text=), or name it with space="
         )
     return fitting[0]
+
+
+def table_beside(encoder: Encoder, space: str | None) -> TextTable | None:
+    """The text table beside an encoder: that of a teacher, or without a name that of the first that has one."""
+    return encoder.tables.get(space) if space else encoder.words
 
 
 def head_source(source: FeatureSource, heads: HeadSet, head: MeasuredHead, text_encoder: str) -> FeatureSource:

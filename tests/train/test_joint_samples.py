@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from joint_training import Datasets, batch_of, joint, prepared_by_both
+from joint_training import Datasets, batch_of, joint
 from training_scenes import LOSSES, small_encoder
 
 from gsencoder.train import samples as module
@@ -11,11 +11,6 @@ from gsencoder.train.distill import Distillation
 from gsencoder.train.losses import AdapterHead, render_loss
 from gsencoder.train.samples import SampleDataset
 from gsencoder.train.training_scene import TrainingScene
-
-
-@pytest.fixture(scope="module")
-def datasets(tmp_path_factory: pytest.TempPathFactory) -> Datasets:
-    return prepared_by_both(tmp_path_factory.mktemp("prepared"))
 
 
 def test_heads_of_a_teacher_are_in_its_render_loss_and_in_no_other_term(datasets: Datasets) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from joint_training import Datasets, HeightTeacher, batch_of, joint, prepared_by_both
+from joint_training import Datasets, HeightTeacher, batch_of, joint
 from training_scenes import (
     LOSSES,
     PREPARE,
@@ -42,11 +42,6 @@ from gsencoder.train.run import TrainConfig, resume_settings, train
 from gsencoder.train.samples import SampleDataset
 from gsencoder.train.trainer import Trainer
 from gsencoder.train.training_scene import TrainingScene
-
-
-@pytest.fixture(scope="module")
-def datasets(tmp_path_factory: pytest.TempPathFactory) -> Datasets:
-    return prepared_by_both(tmp_path_factory.mktemp("prepared"))
 
 
 def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alone(datasets: Datasets) -> None:

@@ -41,6 +41,7 @@ from gsencoder.evaluate.sources import (
     head_source,
     load_scenes,
     space_of_words,
+    table_beside,
 )
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.heads.of_teacher import heads_of
@@ -132,14 +133,14 @@ def _source(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     if config.weights:
         retain_freed_memory()
         encoder = load_encoder(config.weights, config.encode.device)
-        table = encoder.tables.get(config.space) if config.space else encoder.words
+        table = table_beside(encoder, config.space)
         if table is not None and config.teacher == LabelsConfig() and config.text == TableTextConfig():
             words: Words = words_of_table(table)
         else:
             words = _given_words(config)
         space = config.space or space_of_words(encoder, words)
-        beside = encoder.tables.get(space) if space else encoder.words
-        return encoder_source(encoder, config.encode, space), stating_trained(words, beside)
+        words = stating_trained(words, table_beside(encoder, space))
+        return encoder_source(encoder, config.encode, space), words
     words = _given_words(config)
     return fusion_source(config.teacher, words, config.fusion), words
 

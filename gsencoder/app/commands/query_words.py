@@ -91,18 +91,18 @@ def load_words(folder: Path, space: FeatureSpace, given: str, text: TextConfig =
         InputError: there are no words, or the tower is another than the one that made them.
     """
     if given:
-        return stating_trained(
-            words_of_table(load_text_table(find_file(given, "words")), text), _table_beside(folder, space)
-        )
-    if not isinstance(text, TableTextConfig) and _table_beside(folder, space) is None:
-        return vocabulary_of(text)
+        words = words_of_table(load_text_table(find_file(given, "words")), text)
+        return stating_trained(words, _table_beside(folder, space))
+    if not isinstance(text, TableTextConfig):
+        table = _table_beside(folder, space)
+        return vocabulary_of(text) if table is None else words_of_table(table, text)
     path = table_path(folder, space.text_encoder)
     if path is None:
         raise InputError(
             f"{folder}: there is no {WORDS_FILE} beside these features: no words lead into them, or the file was lost; "
             "fuse with a teacher that has words, or give words= or text="
         )
-    return words_of_table(load_text_table(path), text)
+    return words_of_table(load_text_table(path))
 
 
 def _table_beside(folder: Path, space: FeatureSpace) -> TextTable | None:
