@@ -1,5 +1,6 @@
 """Models of transformers in folders on disk: loaded without a network, without pickles, and without a folder's code."""
 
+import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,6 +11,8 @@ from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.model_files import check_fetched
 
 EXTRA = "pip install 'gsencoder[teachers]'"
+INDEX_FILE = "model.safetensors.index.json"
+"""States which file holds which weight where there are several files."""
 UNREADABLE = (ImportError, OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError)
 """What transformers raises about a folder; an ImportError where the code of a model is in another library."""
 VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
@@ -104,8 +107,22 @@ def weight_files(folder: Path, what: str) -> list[Path]:
     """The safetensors files of a folder.
 
     Raises:
-        InputError: there are none.
+        InputError: there are none, or not all that the index names.
     """
+    index = folder / INDEX_FILE
+    if index.is_file():
+        try:
+            stated = json.loads(index.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{what}: {index} cannot be read: {error}") from error
+        shards = stated.get("weight_map") if isinstance(stated, dict) else None
+        names = sorted({str(name) for name in shards.values()}) if isinstance(shards, dict) else []
+        missing = [name for name in names if not (folder / name).is_file()]
+        if missing:
+            raise InputError(
+                f"{what}: {folder}: {len(missing)} of {len(names)} files of weights that {INDEX_FILE} names are "
+                f"missing: {listed(missing, 3)}; fetch the complete folder"
+            )
     files = sorted(folder.glob("*.safetensors"))
     if not files:
         raise InputError(f"{what}: {folder} has no weights as safetensors, and files of pickles are not opened")

@@ -311,6 +311,15 @@ def test_weights_that_are_not_finite_are_refused_by_name(copied: Any, kind: str,
 
 
 @pytest.mark.parametrize("kind", ["dinov2", "llava"])
+def test_files_of_weights_that_the_index_names_and_the_folder_lacks_are_named(copied: Any, kind: str) -> None:
+    folder = copied(kind)
+    files = {"a": "model.safetensors", "b": "model-00002-of-00002.safetensors"}
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": files}))
+    with pytest.raises(InputError, match=r"1 of 2 files of weights .* are missing: model-00002-of-00002\.safetensors"):
+        teacher(folder)
+
+
+@pytest.mark.parametrize("kind", ["dinov2", "llava"])
 def test_a_folder_without_weights_or_with_damaged_ones_is_refused(copied: Any, kind: str) -> None:
     path = copied(kind) / "model.safetensors"
     path.write_bytes(path.read_bytes()[:1000])

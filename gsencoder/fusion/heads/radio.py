@@ -30,8 +30,6 @@ SECTIONS: Mapping[Part, str] = {"summary": "summary", "features": "feature"}
 SIZES = ("input_dim", "hidden_dim", "output_dim", "num_inner")
 VERSIONS = ("v1", "v2")
 MAX_SIZE = 1 << 16
-INDEX_FILE = "model.safetensors.index.json"
-"""States which file holds which weight where there are several files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,7 +76,7 @@ def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[
         InputError: no such head, no file of weights, weights that are missing or surplus or of another shape, a head of
             another backbone, or a form of head that is not known.
     """
-    files = _weight_files(folder)
+    files = weight_files(folder, WHAT)
     with about(f"heads of {folder}"):
         config = _read_config(folder)
         heads: dict[str, Head] = {}
@@ -87,29 +85,6 @@ def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[
                 head = _read_head(weights, config, name, channels)
                 heads[head.name] = head
         return list(heads.values())
-
-
-def _weight_files(folder: Path) -> list[Path]:
-    """The safetensors files of a folder.
-
-    Raises:
-        InputError: there are none, or not all that the index names.
-    """
-    index = folder / INDEX_FILE
-    if index.is_file():
-        try:
-            stated = json.loads(index.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"{WHAT}: {index} cannot be read: {error}") from error
-        shards = stated.get("weight_map") if isinstance(stated, dict) else None
-        names = sorted({str(name) for name in shards.values()}) if isinstance(shards, dict) else []
-        missing = [name for name in names if not (folder / name).is_file()]
-        if missing:
-            raise InputError(
-                f"{WHAT}: {folder}: {len(missing)} of {len(names)} files of weights that {INDEX_FILE} names are "
-                f"missing: {listed(missing, 3)}; fetch the complete folder"
-            )
-    return weight_files(folder, WHAT)
 
 
 def _read_config(folder: Path) -> dict[str, Any]:
