@@ -44,8 +44,9 @@ def endless(status: int, framing: str, sent: list[int], part: bytes = PART, tota
         elif framing == "chunked":
             handler.send_header("Transfer-Encoding", "chunked")
         handler.send_header("Connection", "close")
-        handler.end_headers()
+        # Before the client has the header, after which it may have refused the reply and looked at `sent`.
         sent.append(0)
+        handler.end_headers()
         for _ in range(total // len(part)):
             handler.wfile.write(b"%x\r\n%s\r\n" % (len(part), part) if framing == "chunked" else part)
             sent[-1] += len(part)
