@@ -1,0 +1,127 @@
+"""Reductions of raw features to principal scene components, beside a transcription of M3's Algorithm 1.
+
+    python bench/reduction.py SCENE [--rows 100000] [--thresholds 0.8 0.9] [--teacher teacher=dinov2_s14] [--maps FOLDER]
+        [--repeats 2]
+
+Raw features are those of the teacher's maps of all views, evenly thinned to --rows. The transcription compares chunks
+of 5,000 rows with all others by float32 matrix products on all cores. Each figure of a reduction is the fastest of
+--repeats. --maps keeps the teacher's maps for the next time. With --replicas K the cover is made of K noisy copies
+of the features that are given view by view, and its peak memory is printed.
+"""
+
+import argparse
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.app.commands.fuse import FuseCommandConfig
+from gsencoder.app.settings.compose import compose
+from gsencoder.core.even_indices import even_indices
+from gsencoder.data.scenes import load_scene
+from gsencoder.fusion.lift import map_rows
+from gsencoder.fusion.teacher_maps import CachedTeacher
+from gsencoder.fusion.teachers.build import build_teacher, words_of
+from gsencoder.memory.reduction import CoverReduction, Reduction, reduce_as_published, reduce_to_cover
+
+CHUNK = 5000
+
+
+def raw_features(scene_path: Path, teacher_words: list[str], maps: Path | None) -> np.ndarray:
+    """The vectors of all cells of all views, in order."""
+    config = compose("fuse", FuseCommandConfig, ["-", *teacher_words])
+    scene = load_scene(scene_path)
+    teacher = build_teacher(config.teacher, scene, words_of(config.teacher, config.text))
+    views = scene.views
+    assert views is not None
+    source = teacher if maps is None else CachedTeacher(teacher, maps)
+    if maps is not None:
+        maps.mkdir(parents=True, exist_ok=True)
+    rows = [map_rows(source.feature_map(views, view)) for view in range(len(views))]
+    return np.concatenate([each[np.isfinite(each[:, 0])] for each in rows])
+
+
+def transcription(features: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Algorithm 1, line by line, with the last chunk."""
+    unit = features / np.linalg.norm(features, axis=1, keepdims=True)
+    components, used = [], np.zeros(len(unit), bool)
+    for start in range(0, len(unit), CHUNK):
+        similarities = unit[start : start + CHUNK] @ unit.T
+        for j, row in enumerate(similarities, start=start):
+            if not used[j]:
+                neighbors = np.flatnonzero(row >= threshold)
+                if not used[neighbors].any():
+                    components.append(j)
+                    used[neighbors] = True
+    return np.array(components, np.int64), used
+
+
+def nearest_cosines(features: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """For each feature the cosine with the nearest component."""
+    unit = features / np.linalg.norm(features, axis=1, keepdims=True)
+    parts = [unit[start : start + CHUNK] @ unit[rows].T for start in range(0, len(unit), CHUNK)]
+    return np.concatenate([part.max(axis=1) for part in parts])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--rows", type=int, default=100_000)
+    parser.add_argument("--thresholds", type=float, nargs="*", default=[0.8, 0.9])
+    parser.add_argument("--teacher", nargs="*", default=["teacher=dinov2_s14"], help="settings of the teacher")
+    parser.add_argument("--maps", type=Path)
+    parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--replicas", type=int, default=0)
+    arguments = parser.parse_args()
+    features = raw_features(arguments.scene, arguments.teacher, arguments.maps)
+    features = features[even_indices(len(features), arguments.rows)]
+    print(f"{len(features):,} features of {features.shape[1]} channels")
+    if arguments.replicas:
+        of_many(features, arguments.thresholds, arguments.replicas)
+        return
+    print("| θ | algorithm | seconds | × | components | coverage | mean cosine | same set |\n|---|---|---|---|---|---|---|---|")
+    for threshold in arguments.thresholds:
+        start = time.perf_counter()
+        published, used = transcription(features, threshold)
+        reference = time.perf_counter() - start
+        rows: list[tuple[str, float, Reduction]] = [("transcription", reference, Reduction(rows=published, used=used))]
+        for name, reduce in (("paper", reduce_as_published), ("cover", reduce_to_cover)):
+            seconds = []
+            for _ in range(arguments.repeats):
+                start = time.perf_counter()
+                made = reduce(features, threshold)
+                seconds.append(time.perf_counter() - start)
+            rows.append((name, min(seconds), made))
+        for name, each, made in rows:
+            best = nearest_cosines(features, made.rows)
+            print(
+                f"| {threshold} | {name} | {each:.2f} | {reference / each:.1f} | {len(made.rows):,} | "
+                f"{(best >= threshold - 1e-6).mean():.3f} | {best.mean():.3f} | "
+                f"{'yes' if np.array_equal(made.rows, published) else 'no'} |",
+                flush=True,
+            )
+
+
+def of_many(features: np.ndarray, thresholds: list[float], replicas: int) -> None:
+    """Covers of many features that are never all in memory."""
+    for threshold in thresholds:
+        rng, start, before = np.random.default_rng(0), time.perf_counter(), peak_memory()
+        cover = CoverReduction(features.shape[1], threshold)
+        deviation = 0.1 * features.std(axis=0)
+        for _ in range(replicas):
+            for part in np.array_split(features, 50):
+                noise = rng.standard_normal(part.shape, np.float32)
+                cover.add(part + noise * deviation)
+        print(
+            f"θ = {threshold}: {replicas * len(features):,} features to {len(cover):,} components in "
+            f"{time.perf_counter() - start:.1f} s; peak {peak_memory():.0f} MB, {before:.0f} MB before"
+        )
+
+
+def peak_memory() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+if __name__ == "__main__":
+    main()
