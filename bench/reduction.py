@@ -80,7 +80,9 @@ def main() -> None:
     if arguments.replicas:
         of_many(features, arguments.thresholds, arguments.replicas)
         return
-    print("| θ | algorithm | seconds | × | components | coverage | mean cosine | same set |\n|---|---|---|---|---|---|---|---|")
+    print(
+        "| θ | algorithm | seconds | × | components | coverage | mean cosine | same set |\n|---|---|---|---|---|---|---|---|"
+    )
     for threshold in arguments.thresholds:
         start = time.perf_counter()
         published, used = transcription(features, threshold)

@@ -25,8 +25,9 @@ from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import load_heads, save_heads
 from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
-from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_package
+from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
 from gsencoder.fusion.teacher_maps import read_map, write_map
+from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.reconstruct.anchor import anchor_at
@@ -60,6 +61,11 @@ def features(folder: Path, name: str) -> Made:
 def package(folder: Path, name: str) -> Made:
     save_package(folder, a_scene(), make_features(n=60), error=0.05)
     return folder / name, lambda: load_features(folder)
+
+
+def index_package(folder: Path) -> Made:
+    save_index_package(folder, a_scene(), index_features(make_features(n=60)).features, error=0.05)
+    return folder / PACKAGE_FILE, lambda: load_features(folder)
 
 
 def words(folder: Path) -> Made:
@@ -171,6 +177,7 @@ KINDS: dict[str, Callable[[Path], Made]] = {
     "features": lambda folder: features(folder, FEATURES_FILE),
     "scene of features": lambda folder: features(folder, SCENE_FILE),
     "package": lambda folder: package(folder, PACKAGE_FILE),
+    "package of an index": index_package,
     "splat of a package": lambda folder: package(folder, SPLAT_FILE),
     "words": words,
     "words of another program": words_of_numpy,

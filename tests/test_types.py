@@ -212,6 +212,22 @@ def test_features_and_their_mean_are_arrays_of_the_space_with_finite_weights(no_
             GaussianFeatures(**{**good, name: value}, space=GRID["space"])
 
 
+def test_an_index_numbers_the_rows_of_a_table_where_gaussians_were_seen(no_jaxtyping: None) -> None:
+    table = np.arange(6, dtype=np.float32).reshape(3, 2)
+    weights = np.array([1, 0, 2, 3], np.float32)
+    good = {"features": table, "weights": weights, "mean": np.zeros(2, np.float32), "space": GRID["space"]}
+    features = GaussianFeatures(**good, index=np.array([2, -1, 0, 2], np.int32))
+    assert len(features) == 4
+    np.testing.assert_array_equal(features.stored(), [[4, 5], [0, 0], [0, 1], [4, 5]])
+    np.testing.assert_array_equal(features.decode(np.array([3, 1])), [[4, 5], [0, 0]])
+    np.testing.assert_array_equal(table, np.arange(6).reshape(3, 2))
+    for index in ([3, -1, 0, 2], [2, 0, 0, 2], [-1, -1, 0, 2], [2, -2, 0, 2], [2, -1, 0]):
+        with pytest.raises(InputError, match=r"GaussianFeatures\.(index|weights)"):
+            GaussianFeatures(**good, index=np.array(index, np.int32))
+    with pytest.raises(InputError, match=r"GaussianFeatures\.index"):
+        GaussianFeatures(**good, index=np.array([2, -1, 0, 2], np.int64))
+
+
 def test_a_basis_keeps_between_nothing_and_all_of_the_energy() -> None:
     def basis(energy: float) -> FeatureBasis:
         rows, mean = np.eye(1, 2, dtype=np.float32), np.zeros(2, np.float32)

@@ -4,6 +4,7 @@ Both take rows of any length and compare directions: the cosine of two rows is t
 Products are made block by block, so that memory is that of the features, the components and a block.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ BLOCK = 1024
 """Rows that are compared at once."""
 PRODUCT_VALUES = 1 << 25
 """Cosines that are kept at once, 128 MiB."""
+THRESHOLD_STEPS = 12
+"""Halvings of the interval in which a threshold is searched: to 1/4,096 of a cosine."""
 WITNESSES = 4096
 """Rows in use that a row is compared with before it is compared with all."""
 
@@ -171,13 +174,20 @@ class CoverReduction:
         """The directions of the components."""
         return self._unit[: len(self)]
 
-    def add(self, features: Float32[np.ndarray, "n D"], where: str = "features") -> None:
+    def add(self, features: Float32[np.ndarray, "n D"], where: str = "features", *, limit: int | None = None) -> None:
         """Takes more rows.
+
+        Args:
+            features: the rows.
+            where: what they are, for the error.
+            limit: rows are no longer taken once there are more components than this, which is for the caller to see.
 
         Raises:
             InputError: rows without a direction.
         """
         for start in range(0, len(features), BLOCK):
+            if limit is not None and len(self) > limit:
+                return
             raw = features[start : start + BLOCK]
             unit = unit_rows(raw, where)
             far = self._far_from_components(unit, np.arange(len(unit)))
@@ -214,6 +224,19 @@ class CoverReduction:
             self._unit = np.concatenate([self._unit, np.zeros_like(self._unit)])
             self._raw = np.concatenate([self._raw, np.zeros_like(self._raw)])
         self._unit[first:last], self._raw[first:last] = unit, raw
+
+
+def largest_threshold(fits: Callable[[float], bool]) -> float:
+    """The largest threshold at which a cover fits, to 1/4,096; the smallest one even if it does not fit.
+
+    Args:
+        fits: whether the cover of a threshold has few enough components; covers of larger thresholds have more.
+    """
+    low, high = 0.0, 1.0
+    for _ in range(THRESHOLD_STEPS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low or high
 
 
 def reduce_to_cover(features: Float32[np.ndarray, "n D"], threshold: float) -> Reduction:

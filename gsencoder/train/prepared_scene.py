@@ -237,7 +237,7 @@ def write_prepared(
             f"prepare: expected features of ({outputs.space.describe()}), got ({features.space.describe()})"
         )
     gaussians = scene.gaussians
-    targets = [np.where(features.seen[:, None], outputs.standardize(features.features), 0)]
+    targets = [np.where(features.seen[:, None], outputs.standardize(features.stored()), 0)]
     targets += [view.targets for view in views]
     largest = max(float(np.abs(values).max(initial=0)) for values in targets)
     if not largest <= np.finfo(np.float16).max:

@@ -132,26 +132,30 @@ class FeatureBasis:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GaussianFeatures:
-    """Features on Gaussians, fused or predicted.
+    """Features on Gaussians, fused or predicted: a row each, or, with `index`, rows of a table that many share.
 
     Attributes:
-        features: vectors, or coordinates in `basis`; rows with weight 0 are zero and mean nothing.
-        weights: how much each row was seen, in summed blending weight (pixels); 0 = never.
+        features: vectors, or coordinates in `basis`: of each Gaussian, where rows with weight 0 are zero and mean
+            nothing; with `index` of each row of the table.
+        weights: how much each Gaussian was seen, in summed blending weight (pixels); 0 = never.
         mean: the space's mean, which centered cosines remove; it equals `basis.mean` where there is a basis.
         space: what the (decoded) vectors are.
         basis: what the coordinates stand for, or None where `features` holds the vectors themselves.
+        index: for each Gaussian its row of the table, −1 where it was never seen; None where each has a row of its own.
     """
 
-    features: Float32[np.ndarray, "N channels"]
+    features: Float32[np.ndarray, "rows channels"]
     weights: Float32[np.ndarray, " N"]
     mean: Float32[np.ndarray, " D"]
     space: FeatureSpace
     basis: FeatureBasis | None = None
+    index: Int32[np.ndarray, " N"] | None = None
 
     def __post_init__(self) -> None:
         columns = self.basis.rank if self.basis is not None else self.space.channels
         check_array("GaussianFeatures", "features", self.features, "float32", ("N", columns))
-        check_array("GaussianFeatures", "weights", self.weights, "float32", (len(self.features),))
+        count = len(self.features) if self.index is None else len(self.index)
+        check_array("GaussianFeatures", "weights", self.weights, "float32", (count,))
         check_array("GaussianFeatures", "mean", self.mean, "float32", (self.space.channels,))
         check_finite("GaussianFeatures", "features", self.features)
         check_finite("GaussianFeatures", "mean", self.mean)
@@ -159,16 +163,30 @@ class GaussianFeatures:
         check_rows("GaussianFeatures", "weights", good, "finite weights from 0", self.weights)
         if self.basis is not None and self.basis.space != self.space:
             fail("GaussianFeatures", "basis", self.space.describe(), self.basis.space.describe())
+        if self.index is not None:
+            check_array("GaussianFeatures", "index", self.index, "int32", (count,))
+            last = len(self.features) - 1
+            good = np.where(self.seen, (self.index >= 0) & (self.index <= last), self.index == -1)
+            check_rows("GaussianFeatures", "index", good, f"0 to {last} where seen, else -1", self.index)
 
     def __len__(self) -> int:
-        return len(self.features)
+        return len(self.weights)
 
     @property
     def seen(self) -> Bool[np.ndarray, " N"]:
         """True where some view saw the Gaussian."""
         return self.weights > 0
 
+    def stored(self, rows: np.ndarray | slice = slice(None)) -> Float32[np.ndarray, "n channels"]:
+        """The vectors, or coordinates in the basis, of some Gaussians; those never seen have zeros."""
+        if self.index is None:
+            return self.features[rows]
+        index = self.index[rows]
+        values = self.features[index]
+        values[index < 0] = 0
+        return values
+
     def decode(self, rows: np.ndarray | slice = slice(None)) -> Float32[np.ndarray, "n D"]:
-        """The vectors of `rows` in the full space (all of them unless told)."""
-        chosen = self.features[rows]
+        """The vectors of some Gaussians, by default of all, in the full space."""
+        chosen = self.stored(rows)
         return chosen if self.basis is None else chosen @ self.basis.components + self.basis.mean

@@ -131,7 +131,7 @@ def _views(
         depths.append(depth_picture(depth_image(b)))
         alpha = b.alpha.reshape(b.shape).numpy()
         for one, scale, pictures in zip(results, colors, fields, strict=True):
-            values = b.render(torch.from_numpy(one.features.features)).reshape(*b.shape, -1).numpy()
+            values = b.render(torch.from_numpy(one.features.stored())).reshape(*b.shape, -1).numpy()
             pictures.append(pca_picture(values, scale, alpha))
     captions = [f"view {view}" for view in shown]
     if views.images is not None:
@@ -148,7 +148,7 @@ def _views(
 
 
 def _colors_of(features: GaussianFeatures) -> PcaColors:
-    return fit_pca_colors(features.features[features.seen])
+    return fit_pca_colors(features.stored(features.seen))
 
 
 def _answers(report: HtmlReport, scene: Scene, one: TeacherResult) -> None:

@@ -11,12 +11,23 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
 from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads
-from gsencoder.fusion.store.package import PACKAGE_FILE, Form, save_arrays, save_package, save_ply
+from gsencoder.fusion.store.package import (
+    PACKAGE_FILE,
+    Form,
+    save_arrays,
+    save_index_package,
+    save_package,
+    save_ply,
+)
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features
+from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene
+
+CODED = ("compact", "index")
+"""Forms whose features are codes, which gsencoder alone reads; their words are float16."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,9 +50,8 @@ class PackConfig(CommonConfig):
     form: Form = field(
         default="compact",
         metadata={
-            "help": "compact = a few bytes a Gaussian, for gsencoder; npz, safetensors = arrays; ply = a splat "
-            "with the "
-            "properties feature_0 …"
+            "help": "compact = a few bytes a Gaussian, for gsencoder; index = one or two bytes, the number of a row in "
+            "a table; npz, safetensors = arrays; ply = a splat with the properties feature_0 …"
         },
     )
     error: float = field(
@@ -50,6 +60,7 @@ class PackConfig(CommonConfig):
             "help": "largest mean loss of centered cosine, over Gaussians and over kinds of features, for form=compact"
         },
     )
+    index: IndexConfig = field(default_factory=IndexConfig)
     decoded: bool = field(
         default=False,
         metadata={
@@ -63,8 +74,8 @@ class PackConfig(CommonConfig):
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
         if not 0 < self.error < 1:
             raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
-        if self.decoded and self.form == "compact":
-            raise InputError("decoded=true: form=compact holds codes; use form=npz, safetensors or ply")
+        if self.decoded and self.form in ("compact", "index"):
+            raise InputError(f"decoded=true: form={self.form} holds codes; use form=npz, safetensors or ply")
 
 
 def run(config: PackConfig, summary: Summary) -> None:
@@ -88,7 +99,7 @@ def run(config: PackConfig, summary: Summary) -> None:
             message = _write(folder, scene, features, config, summary)
         if config.head:
             if words is not None:
-                save_text_table(folder / WORDS_FILE, words, dtype="float16" if config.form == "compact" else "float32")
+                save_text_table(folder / WORDS_FILE, words, dtype="float16" if config.form in CODED else "float32")
         else:
             _write_beside(folder, source, scene, features, config.form)
     console(config.quiet).print(f"{out}: {message}")
@@ -97,7 +108,7 @@ def run(config: PackConfig, summary: Summary) -> None:
 def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFeatures, form: Form) -> None:
     """Writes the words and the adapter heads of the features that lie beside them."""
     words = table_path(source, features.space.text_encoder)
-    if words is not None and form == "compact":
+    if words is not None and form in CODED:
         save_text_table(folder / WORDS_FILE, load_text_table(words), dtype="float16")
     elif words is not None:
         copyfile(words, folder / WORDS_FILE)
@@ -111,6 +122,8 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
     summary.results.update(form=config.form, gaussians=len(features), seen=seen, space=features.space.describe())
     if config.form == "ply":
         save_ply(folder, scene, features, decoded=config.decoded)
+    elif config.form == "index":
+        return _write_index(folder, scene, features, config, summary)
     elif config.form != "compact":
         save_arrays(folder, scene, features, config.form, decoded=config.decoded)
     if config.form != "compact":
@@ -130,6 +143,26 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
     return (
         f"features of {seen:,} of {len(features):,} Gaussians in {size / 1e6:.3g} MB, {_ratio(share)} of float16 "
         f"vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centered cosines lose "
+        f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
+    )
+
+
+def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
+    made = index_features(features, config.index)
+    save_index_package(folder, scene, made.features, error=made.error)
+    rows, size = len(made.features.features), (folder / PACKAGE_FILE).stat().st_size
+    summary.results.update(
+        bytes=size,
+        rows=rows,
+        row_bytes=1 if rows < 256 else 2,
+        threshold=made.threshold,
+        error=made.error,
+        lowest=made.lowest,
+        share_of_float16=size / (2 * features.space.channels * len(features)),
+    )
+    return (
+        f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / 1e6:.3g} MB: the number "
+        f"of one of {rows:,} rows in {'one byte' if rows < 256 else 'two bytes'}; centered cosines lose "
         f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
     )
 

@@ -28,7 +28,15 @@ RESERVED_KEYS = ("version", "checksums", "digest")
 """Keys of the header that callers may not use: version, checksums of the blocks by array, and the digest of the rest.
 """
 LARGEST_NUMBER = 2.0**63
-DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I32": "int32", "I64": "int64", "U8": "uint8"}
+DTYPES = {
+    "F16": "float16",
+    "F32": "float32",
+    "F64": "float64",
+    "I32": "int32",
+    "I64": "int64",
+    "U8": "uint8",
+    "U16": "uint16",
+}
 """The types of arrays that archives may hold, by their names in safetensors."""
 DAMAGED = "the file is damaged"
 

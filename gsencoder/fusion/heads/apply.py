@@ -57,7 +57,7 @@ def head_features(
     with about(head.name):
         check_heads_space(backbone, features.space)
     seen = np.flatnonzero(features.seen)
-    first, inverse = equal_rows(features.features[seen])
+    first, inverse = equal_rows(features.stored(seen))
     # Ordered by group, so that the outputs of a few groups at a time are written to all their rows.
     order = np.argsort(inverse, kind="stable")
     rows, group = seen[order], inverse[order]

@@ -89,7 +89,7 @@ def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any])
     blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
     largest, bad = np.zeros(features.features.shape[1], np.float32), 0
     for block in blocks:
-        vectors = features.features[block]
+        vectors = features.stored(block)
         bad += int((~np.isfinite(vectors).all(axis=1)).sum())
         largest = np.maximum(largest, np.abs(vectors).max(axis=0))
     if bad:
@@ -97,7 +97,7 @@ def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any])
     channel_scale = np.where(largest > 0, largest, 1).astype(np.float32)
     halves = np.empty((len(rows), len(largest)), np.float16)
     for number, block in enumerate(blocks):
-        halves[number * BLOCK : number * BLOCK + len(block)] = features.features[block] / channel_scale
+        halves[number * BLOCK : number * BLOCK + len(block)] = features.stored(block) / channel_scale
     arrays, header = space_parts(features.space, features.mean, features.basis)
     arrays |= {
         "rows": rows.astype(np.int32),

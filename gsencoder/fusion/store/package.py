@@ -2,6 +2,7 @@
 
 Three forms are for other programs: an .npz, a safetensors file, or properties of the .ply itself. The compact one is
 for gsencoder: codes of a few bytes (`compact`), memory-mapped, checked by a sum, bound to its splat by a fingerprint.
+So is the smallest one, where Gaussians share the rows of a table (`index_file`).
 """
 
 import json
@@ -18,10 +19,11 @@ from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.mapped_arrays import MappedArrays
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.splats import fingerprint, load_splat, save_splat
+from gsencoder.fusion.store.index_file import INDEX_FORM, read_index, write_index
 from gsencoder.fusion.store.quantize import CompactFeatures, compact
 from gsencoder.types import GaussianFeatures, Scene
 
-Form = Literal["compact", "npz", "safetensors", "ply"]
+Form = Literal["compact", "index", "npz", "safetensors", "ply"]
 SPLAT_FILE, PACKAGE_FILE = "splat.ply", "features.gsf"
 NPZ_FILE, SAFETENSORS_FILE, BASIS_FILE = "features.npz", "features.safetensors", "basis.npz"
 FORMAT = 1
@@ -66,6 +68,22 @@ def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, erro
     return made
 
 
+def save_index_package(folder: Path, scene: Scene, features: GaussianFeatures, *, error: float) -> None:
+    """Writes splat and features that share the rows of a table into an existing folder, as `save_package` does.
+
+    Args:
+        folder: where.
+        scene: of the features.
+        features: with an index (`gsencoder.memory.index.index_features`).
+        error: 1 − mean centered cosine with the features that the table was made from.
+
+    Raises:
+        InputError: no Gaussians, or more rows than two bytes can number.
+    """
+    written = _save_splat(folder, scene)
+    write_index(folder / PACKAGE_FILE, scene, features, fingerprint=written, error=error)
+
+
 def open_package(file: Path) -> CompactFeatures:
     """The features of a package, its codes memory-mapped.
 
@@ -75,7 +93,9 @@ def open_package(file: Path) -> CompactFeatures:
     with open_archive(file) as archive:
         form = archive.value("form", int)
         if form != FORMAT:
-            raise InputError(f"expected form {FORMAT} of a package, got {form}; pack the features again")
+            raise InputError(
+                f"expected form {FORMAT} or {INDEX_FORM} of a package, got {form}; pack the features again"
+            )
         archive.verify()
         _, _, basis = read_space(archive)
         if basis is None:
@@ -100,20 +120,20 @@ def open_package(file: Path) -> CompactFeatures:
 
 
 def load_package(folder: Path) -> Scene:
-    """The scene and its features from a folder of `save_package`.
+    """The scene and its features from a folder of `save_package` or `save_index_package`.
 
     Raises:
         InputError: damaged, of another version, or features of another splat.
     """
     file = folder / PACKAGE_FILE
-    packed = open_package(file)
     with open_archive(file) as archive:
+        indexed = archive.value("form", int) == INDEX_FORM
+        features = read_index(archive) if indexed else open_package(file).features()
         gaussians = load_splat(folder / SPLAT_FILE, origin=archive.array("origin", "float64", (3,)))
         check_splat(archive, gaussians, "pack this splat's own features")
-        if len(gaussians) != len(packed):
-            raise InputError(f"expected features of {len(gaussians):,} Gaussians, got {len(packed):,}")
+        if len(gaussians) != len(features):
+            raise InputError(f"expected features of {len(gaussians):,} Gaussians, got {len(features):,}")
         scene = read_scene(archive, gaussians)
-    features = packed.features()
     return replace(scene, features={features.space.name: features})
 
 
@@ -164,7 +184,7 @@ def _plain(features: GaussianFeatures, *, decoded: str) -> dict[str, np.ndarray]
     arrays = {"weights": features.weights, "mean": features.mean}
     if not decoded:
         components = {} if features.basis is None else {"components": features.basis.components}
-        return {"features": features.features, **arrays, **components}
+        return {"features": features.stored(), **arrays, **components}
     vectors = np.zeros((len(features), features.space.channels), decoded)
     seen = np.flatnonzero(features.seen)
     for rows in np.array_split(seen, max(1, len(seen) // 65536)):

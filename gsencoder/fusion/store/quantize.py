@@ -184,7 +184,7 @@ def _within(
 
 
 def _centered(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray, "n R"]:
-    values = features.features[rows].astype(np.float64)
+    values = features.stored(rows).astype(np.float64)
     return values if features.basis is not None else values - features.mean
 
 

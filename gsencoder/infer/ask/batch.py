@@ -225,6 +225,8 @@ def _depends_on(asker: Asker, dry_run: bool, made_from: Mapping[str, Any]) -> di
         digest.update(fingerprint(scene.gaussians).encode())
     for name, features in sorted(scene.features.items()):
         digest.update(name.encode() + features.features.tobytes() + features.mean.tobytes())
+        if features.index is not None:
+            digest.update(features.index.tobytes())
     if scene.views is not None:
         digest.update(scene.views.cameras.cam_from_world.tobytes())
     if table is not None:

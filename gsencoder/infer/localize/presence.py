@@ -145,7 +145,7 @@ class Presence:
             rows = each.rows
             weights = self._features.weights[rows].astype(np.float64)
             # Cosines are linear in the directions, so that those of a cluster's mean direction are the mean cosines.
-            mean_direction = (weights / weights.sum()) @ self._axes.directions_of(self._features.features[rows])
+            mean_direction = (weights / weights.sum()) @ self._axes.directions_of(self._features.stored(rows))
             mean = min(float(target @ mean_direction) / attainable, 1.0)
             margin = None
             if rivals is not None and len(rivals):

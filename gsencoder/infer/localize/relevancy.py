@@ -120,15 +120,17 @@ def relevancy(
     directions = word_directions(words, text_mean, mode)
     axes = feature_axes(features, mode)
     targets = axes.project(directions)
-    scores = np.full((len(words), len(features)), np.nan, np.float32)
-    rows = np.flatnonzero(features.seen)
+    shared = features.index is not None
+    rows = np.arange(len(features.features)) if shared else np.flatnonzero(features.seen)
+    scores = np.full((len(words), len(features.features) + shared), np.nan, np.float32)
     step = max(1, CHUNK_BYTES // (8 * (len(axes.offset) + len(words))))
     for start in range(0, len(rows), step):
         chunk = rows[start : start + step]
         scores[:, chunk] = np.clip(axes.directions_of(features.features[chunk]) @ targets.T, -1, 1).T
-    if negatives is None:
-        return scores
-    return _contrast(scores, directions, len(text), temperature)
+    if negatives is not None:
+        scores = _contrast(scores, directions, len(text), temperature)
+    # The score behind that of the last row of a table is what Gaussians without a row take.
+    return scores if features.index is None else scores[:, features.index]
 
 
 def _contrast(

@@ -206,7 +206,7 @@ def check_parity(
     for name, cloud, unit in track(clouds, "comparing"):
         theirs = encoder.encode_spaces(cloud, ON_CPU, metres_per_unit=unit)
         ours = runtime.encode_spaces(cloud, ON_CPU, metres_per_unit=unit)
-        errors[name] = max(_largest_error(ours[space].features, theirs[space].features) for space in theirs)
+        errors[name] = max(_largest_error(ours[space].stored(), theirs[space].stored()) for space in theirs)
         if not errors[name] <= tolerance:
             raise InputError(
                 f"export: on {name} onnxruntime and torch differ by {errors[name]:.2g} of the largest output, more "

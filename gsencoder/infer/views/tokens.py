@@ -104,7 +104,7 @@ def feature_tokens(blends: Sequence[Blend], features: GaussianFeatures) -> Float
         raise InputError(f"tokens: expected blends on one grid, got {sorted({each.shape for each in blends})}")
     if any(each.gaussians != len(features) for each in blends):
         raise InputError(f"tokens: features of {len(features):,} Gaussians, blends of {blends[0].gaussians:,}")
-    values = torch.from_numpy(features.features)
+    values = torch.from_numpy(features.stored())
     if features.basis is None:
         values = values - torch.from_numpy(features.mean)
     values = values * torch.from_numpy(features.seen)[:, None]

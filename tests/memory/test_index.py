@@ -1,0 +1,168 @@
+"""Index memory: features that share the rows of a table stand for those that it was made from, here and on disk."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from feature_fields import SPACE, make_features
+from splats import random_gaussians
+
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError
+from gsencoder.data.splats import load_splat, save_splat
+from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_index_package
+from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.memory import index as index_module
+from gsencoder.memory.index import IndexConfig, index_features
+from gsencoder.text.table import make_text_table, save_text_table
+from gsencoder.types import GaussianFeatures, Scene
+
+
+def centered_cosines(one: GaussianFeatures, other: GaussianFeatures) -> np.ndarray:
+    """Of decoded features that were seen, in float64."""
+    a, b = (each.decode(one.seen).astype(np.float64) - each.mean for each in (one, other))
+    return np.asarray((a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1))
+
+
+@pytest.mark.parametrize("basis", [True, False])
+def test_the_stated_error_is_that_of_the_rows_that_gaussians_have(basis: bool) -> None:
+    features = make_features(basis=basis)
+    coarse, fine = (index_features(features, IndexConfig(threshold=threshold)) for threshold in (0.7, 0.95))
+    assert 5 < len(coarse.features.features) < len(fine.features.features) < 1500
+    assert coarse.error > 3 * fine.error > 0
+    for made in (coarse, fine):
+        assert len(made.features) == len(features)
+        np.testing.assert_array_equal(made.features.seen, features.seen)
+        np.testing.assert_array_equal(made.features.stored(~features.seen), 0)
+        cosines = centered_cosines(features, made.features)
+        assert made.error == pytest.approx(1 - cosines.mean(), abs=1e-6)
+        assert made.lowest == pytest.approx(np.quantile(cosines, 0.001), abs=1e-6)
+    assert fine.lowest > coarse.lowest
+
+
+def test_a_few_kinds_of_features_have_a_row_each() -> None:
+    features = make_features(kinds=7)
+    made = index_features(features, IndexConfig(threshold=0.99))
+    assert len(made.features.features) == 7
+    assert made.error < 1e-6
+    np.testing.assert_allclose(made.features.stored(), features.features, atol=1e-6)
+
+
+def test_a_rare_kind_among_many_gaussians_keeps_its_row() -> None:
+    features = make_features(n=20_000, kinds=3)
+    values = features.features.copy()
+    rare = np.flatnonzero(features.seen)[1234]
+    values[rare] = -4 * values[0 if features.seen[0] else 1]
+    features = replace(features, features=values)
+    made = index_features(features, IndexConfig(threshold=0.0, rows=5))
+    np.testing.assert_allclose(made.features.stored(np.array([rare])), values[[rare]], rtol=1e-5)
+
+
+def test_features_at_the_mean_have_a_row_of_their_own_and_no_cosine() -> None:
+    features = make_features(kinds=4)
+    values = features.features.copy()
+    at_mean = np.flatnonzero(features.seen)[:50]
+    values[at_mean] = 0
+    made = index_features(replace(features, features=values), IndexConfig(threshold=0.99))
+    assert len(made.features.features) == 5
+    np.testing.assert_array_equal(made.features.stored(at_mean), 0)
+    assert made.error < 1e-6
+    nothing = index_features(replace(features, features=np.zeros_like(values)))
+    assert len(nothing.features.features) == 1
+    assert nothing.error == 0
+
+
+def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    features = make_features()
+    for rows in (30, 300):
+        made = index_features(features, IndexConfig(threshold=0.0, rows=rows))
+        assert rows / 3 <= len(made.features.features) <= rows
+    with pytest.raises(InputError, match=r"rows=2: the features point in more directions than that even at"):
+        index_features(features, IndexConfig(threshold=0.0, rows=2))
+    monkeypatch.setattr(index_module, "MAX_ROWS", 40)
+    with pytest.raises(InputError, match=r"more than 39 rows; give threshold=0\.\d+, or rows="):
+        index_features(features, IndexConfig(threshold=0.99))
+    with pytest.raises(InputError, match="no Gaussian has features"):
+        index_features(replace(features, weights=np.zeros_like(features.weights)))
+    for config in ({"threshold": 0.0}, {"rows": 9}, {"threshold": 1.5}, {"threshold": 0.0, "rows": 1}):
+        with pytest.raises(InputError, match="threshold|rows"):
+            IndexConfig(**config)  # type: ignore[arg-type]
+
+
+def test_words_score_an_index_as_they_score_what_it_stands_for(rng: np.random.Generator) -> None:
+    made = index_features(make_features()).features
+    expanded = replace(made, features=made.stored(), index=None)
+    words = rng.normal(size=(3, 12)).astype(np.float32)
+    negatives = rng.normal(size=(2, 12)).astype(np.float32)
+    mean = rng.normal(size=12).astype(np.float32)
+    for further in (None, negatives):
+        scores, expected = (relevancy(each, words, mean, negatives=further) for each in (made, expanded))
+        np.testing.assert_allclose(scores, expected, atol=1e-6)
+        assert np.isnan(scores[:, ~made.seen]).all()
+
+
+@pytest.mark.parametrize(("rows", "row_bytes"), [(40, 1), (255, 1), (256, 2), (900, 2)])
+def test_a_package_of_an_index_is_read_back(tmp_path: Path, rows: int, row_bytes: int) -> None:
+    source = make_features()
+    table = make_features(n=rows).features
+    index = np.where(source.seen, np.arange(len(source)) % rows, -1).astype(np.int32)
+    features = replace(source, features=table, index=index)
+    scene = Scene(name="room", gaussians=random_gaussians(len(source)))
+    save_index_package(tmp_path, scene, features, error=0.01)
+    read = load_features(tmp_path).features["s"]
+    np.testing.assert_array_equal(read.index, index)
+    np.testing.assert_allclose(read.features, table, rtol=2e-3, atol=1e-3)
+    np.testing.assert_array_equal(read.weights, source.seen)
+    assert read.space == SPACE
+    beyond = (tmp_path / PACKAGE_FILE).stat().st_size - row_bytes * len(source)
+    assert rows * 12 < beyond < rows * 12 + 4000
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    scene = Scene(name="room", gaussians=random_gaussians(3000))
+    save_features(tmp_path / "features", scene, make_features())
+    vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(12, 2)))[0].T
+    save_text_table(tmp_path / "features" / WORDS_FILE, make_text_table(["mug", "chair"], vectors, "words"))
+    return tmp_path / "features"
+
+
+def test_pack_writes_an_index_that_localize_and_pack_read(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert cli.main(["pack", str(folder), "form=index", "index.threshold=0.8", f"out={out}"]) == 0
+    results = json.loads((out / "summary.json").read_text())["results"]
+    assert f"one of {results['rows']} rows in one byte; centered cosines lose" in capsys.readouterr().out
+    assert results["bytes"] == (out / PACKAGE_FILE).stat().st_size
+    assert results["threshold"] == 0.8
+    assert 0 < results["error"] < 0.2
+    assert cli.main(["localize", str(out), "query=mug", f"out={tmp_path / 'boxes'}", "pictures=0"]) == 0
+    for form in ("compact", "npz", "index"):
+        assert cli.main(["pack", str(out), f"form={form}", f"out={tmp_path / form}", "quiet=true"]) == 0
+    stored = np.load(tmp_path / "npz" / "features.npz")["features"]
+    np.testing.assert_array_equal(stored, load_features(out).features["s"].stored())
+
+
+def test_settings_of_an_index_and_another_splat_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for words, message in (
+        (["index.threshold=1.2"], "index.threshold: expected a cosine above 0 and up to 1, got 1.2"),
+        (["index.threshold=0"], "index: threshold, rows: expected one of the two, and 0 for the other, got 0.0 and 0"),
+        (["decoded=true"], "form=index holds codes"),
+    ):
+        assert cli.main(["pack", str(folder), "form=index", f"out={out}", *words]) == 2
+        assert message in capsys.readouterr().err
+        assert not out.exists()
+    assert cli.main(["pack", str(folder), "form=index", f"out={out}"]) == 0
+    splat = load_splat(out / SPLAT_FILE)
+    save_splat(out / SPLAT_FILE, replace(splat, opacities=splat.opacities[::-1].copy()))
+    with pytest.raises(InputError, match="the features belong to splat"):
+        load_features(out)
