@@ -11,6 +11,7 @@ from gsencoder.types.checks import UNIT_TOLERANCE, check_unit
 from gsencoder.types.features import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
 from gsencoder.types.gaussians import SH_C0, Gaussians, sh_from_colors
 from gsencoder.types.localization import Box, Localization
+from gsencoder.types.memory import MemoryBank, QueryMemory
 from gsencoder.types.scene import Scene, SceneObject, Views
 
 __all__ = [
@@ -24,6 +25,8 @@ __all__ = [
     "GaussianFeatures",
     "Gaussians",
     "Localization",
+    "MemoryBank",
+    "QueryMemory",
     "Scene",
     "SceneObject",
     "Views",

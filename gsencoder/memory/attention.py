@@ -1,0 +1,69 @@
+"""Gaussian memory attention in torch, for training and rendering (M3 Eq. 2)."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import scaled_dot_product_attention
+
+from gsencoder.types import MemoryBank
+from gsencoder.types.memory import EPS, Scoring, attention_keys
+
+BLOCK_SCORES = 1 << 24
+"""Scores of queries and components that are computed at once where gradients are not needed; 64 MiB."""
+
+
+class MemoryAttention(nn.Module):
+    """Features for principal queries: R̂ = softmax(score(Q_p W_m, PSC) / τ) PSC.
+
+    The projection is applied to the components, not to the queries: (q W)·k = q·(W k), and |q W|² = q (W Wᵀ) qᵀ, so
+    that scores cost s products a pair instead of D. Attention over M components is one call of
+    `scaled_dot_product_attention`, which never holds all scores where it has a fused kernel. Without gradients, queries
+    go in blocks, so that no more than `BLOCK_SCORES` scores are held in any case.
+    """
+
+    def __init__(
+        self, bank: MemoryBank, projection: Float[Tensor, "s D"], *, scoring: Scoring, temperature: float
+    ) -> None:
+        """Args:
+        bank: the components.
+        projection: initial W_m.
+        scoring: how queries are compared with components.
+        temperature: τ.
+        """
+        super().__init__()
+        self.scoring, self.temperature = scoring, temperature
+        self.projection = nn.Parameter(projection)
+        keys = attention_keys(bank.components, bank.mean, scoring)
+        self.register_buffer("keys", torch.from_numpy(keys), persistent=False)
+        self.register_buffer("components", torch.from_numpy(bank.components), persistent=False)
+        self.keys: Tensor
+        self.components: Tensor
+
+    def forward(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n D"]:
+        """The features that queries stand for; with cosines their length does not matter."""
+        if torch.is_grad_enabled():
+            return self._attend(queries)
+        step = max(1, BLOCK_SCORES // len(self.components))
+        return torch.cat([self._attend(part) for part in queries.split(step)])
+
+    def _attend(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n D"]:
+        keys = self.keys @ self.projection.T
+        if self.scoring != "dot":
+            queries = queries / self._lengths(queries)
+        scaled = (queries / self.temperature)[None]
+        return scaled_dot_product_attention(scaled, keys[None], self.components[None], scale=1.0)[0]
+
+    def _lengths(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n 1"]:
+        """|q W|, at least `EPS`. The largest entry is taken out of the root, so that squares neither overflow nor
+        vanish, and a gradient exists for a query of zeros."""
+        largest = queries.detach().abs().amax(dim=1, keepdim=True).clamp(min=EPS)
+        unit = queries / largest
+        squares = ((unit @ (self.projection @ self.projection.T)) * unit).sum(dim=1, keepdim=True)
+        return largest * squares.clamp(min=EPS**2).sqrt()
+
+
+def random_projection(channels: int, width: int, generator: torch.Generator) -> Float[Tensor, "s D"]:
+    """A random W_m, with rows of length 1 on average."""
+    return torch.randn(channels, width, generator=generator) / math.sqrt(width)

@@ -1,0 +1,316 @@
+"""Building a memory bank: the principal scene components of a scene's feature maps (M3 sec. 3.3, Algorithm 1)."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, Int64
+
+from gsencoder.core.errors import InputError, about
+from gsencoder.core.even_indices import even_indices
+from gsencoder.core.runtime.free_memory import free_memory
+from gsencoder.fusion.lift import map_rows
+from gsencoder.memory.reduction import (
+    ROUNDING,
+    CoverReduction,
+    check_threshold,
+    largest_threshold,
+    reduce_as_published,
+    unit_rows,
+)
+from gsencoder.types import FeatureMap, FeatureSpace, MemoryBank
+
+BLOCK = 4096
+"""Features that are compared with the components at once."""
+SAMPLE = 20_000
+"""Features among which a threshold is searched for a mean cosine."""
+MIN_RELATIVE_NORM = 1e-3
+"""Share of the mean's length below which a centered feature is rounding, not direction."""
+COPIES = 6
+"""How many times a bank is in memory while it is made."""
+
+MapStream = Callable[[], Iterator[tuple[int, FeatureMap]]]
+"""Gives the maps of a scene with the numbers of their views, any number of times."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BankConfig:
+    """How raw features are reduced to principal scene components."""
+
+    method: Literal["cover", "paper"] = field(
+        default="cover",
+        metadata={
+            "help": "cover = every feature is within the threshold of a component; paper = M3's Algorithm 1, which "
+            "skips features near one that is in use, though no component may be near them"
+        },
+    )
+    center: bool = field(
+        default=True,
+        metadata={"help": "compare features by the cosine after their mean has been subtracted; false = as the paper"},
+    )
+    cosine: float = field(
+        default=0.9,
+        metadata={
+            "help": "mean cosine of features with their nearest component that the threshold is chosen for, unless "
+            "threshold= or components= is given"
+        },
+    )
+    threshold: float = field(
+        default=0.0, metadata={"help": "cosine θ within which a component stands for a feature; 0 = chosen"}
+    )
+    components: int = field(
+        default=0, metadata={"help": "largest number of components, for which the threshold is chosen; 0 = any"}
+    )
+    coverage: float = field(
+        default=1.0,
+        metadata={
+            "help": "share of the features that must be within the threshold of a component; the components that stand "
+            "for the fewest features are left out"
+        },
+    )
+    drop_last: int = field(
+        default=0,
+        metadata={"help": "method=paper: a chunk size whose last, incomplete chunk gives no components, as printed"},
+    )
+
+    def __post_init__(self) -> None:
+        if self.threshold and self.components:
+            raise InputError(
+                f"threshold, components: expected one of the two, got {self.threshold} and {self.components}"
+            )
+        if self.threshold:
+            check_threshold(self.threshold)
+        if not 0 < self.cosine <= 1:
+            raise InputError(f"cosine: expected a cosine above 0 and up to 1, got {self.cosine}")
+        if not 0 < self.coverage <= 1:
+            raise InputError(f"coverage: expected a share above 0 and up to 1, got {self.coverage}")
+        for name in ("components", "drop_last"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if self.method == "paper" and self.coverage < 1:
+            raise InputError("coverage: expected 1 with method=paper, whose components need not cover all features")
+        if self.method == "cover" and self.drop_last:
+            raise InputError("drop_last: expected 0 with method=cover, which has no chunks")
+
+
+def build_bank(
+    maps: MapStream, space: FeatureSpace, mean: Float32[np.ndarray, " D"], config: BankConfig = BankConfig()
+) -> MemoryBank:
+    """Reduces the raw features of all maps to a bank.
+
+    A cover reads the maps view by view and holds nothing but the bank. The published algorithm compares each feature
+    with all others, and holds all of them.
+
+    Args:
+        maps: of the scene.
+        space: of the maps.
+        mean: of the space, which is subtracted where the configuration asks for centered cosines.
+        config: method and threshold.
+
+    Raises:
+        InputError: no features; features that are infinite; more components than memory holds; or fewer components
+            asked for than the features have directions.
+    """
+    builder = _Builder(maps, space, mean if config.center else np.zeros_like(mean), config)
+    return builder.build()
+
+
+class _Builder:
+    """The maps of a scene as rows, less a mean; features without a direction have one component for all of them."""
+
+    def __init__(
+        self, maps: MapStream, space: FeatureSpace, mean: Float32[np.ndarray, " D"], config: BankConfig
+    ) -> None:
+        self._maps, self._space, self._mean, self._config = maps, space, mean, config
+        self._floor = MIN_RELATIVE_NORM * float(np.linalg.norm(mean.astype(np.float64)))
+        self._limit = free_memory() // 2 // (COPIES * 4 * space.channels)
+        if config.components > self._limit:
+            raise InputError(f"components={config.components:,}: {self._too_large()}; give at most {self._limit:,}")
+
+    def build(self) -> MemoryBank:
+        threshold = self._threshold()
+        if self._config.method == "cover":
+            components, sources = self._cover_all(threshold)
+        else:
+            components, sources = self._published(threshold)
+        counts, coverage, cosine = self._score(components, threshold)
+        if self._config.coverage < coverage:
+            chosen = _most_used(counts, self._config.coverage)
+            components, sources = components[chosen], sources[chosen]
+            _, coverage, cosine = self._score(components, threshold)
+        return MemoryBank(
+            components=components,
+            sources=sources,
+            mean=self._mean,
+            threshold=threshold,
+            coverage=coverage,
+            cosine=cosine,
+            space=self._space,
+        )
+
+    def _rows(self) -> Iterator[tuple[Float32[np.ndarray, "n D"], Int32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]]:
+        """For each view its raw features less the mean, where they are, and which of them have a direction."""
+        for view, feature_map in self._maps():
+            rows, sources = raw_features(view, feature_map)
+            with about(f"view {view}"):
+                centered = rows - self._mean
+                lengths = np.abs(centered).max(axis=1, initial=0)
+                if not np.isfinite(lengths).all():
+                    bad = int((~np.isfinite(lengths)).sum())
+                    raise InputError(f"{bad:,} of {len(rows):,} features of {self._space.name} are not finite")
+            # A vector whose largest entry is above the floor has a direction; squares might overflow.
+            yield centered, sources, lengths * np.sqrt(self._space.channels) > self._floor
+
+    def _threshold(self) -> float:
+        config = self._config
+        if config.threshold:
+            return config.threshold
+        if config.components:
+            # One component is for features without a direction.
+            most = max(1, config.components - self._has_undirected())
+            threshold = largest_threshold(lambda each: len(self._cover(each, most)) <= most)
+            if len(self._cover(threshold, most)) > most:
+                raise InputError(
+                    f"components={config.components}: the features point in more directions than that even at a "
+                    f"threshold of {threshold:.4f}; give more components"
+                )
+            return threshold
+        sample = self._sample()
+        if not len(sample):
+            return 1.0
+        return 1 - largest_threshold(lambda each: _mean_cosine(sample, 1 - each) >= config.cosine)
+
+    def _has_undirected(self) -> bool:
+        return any(not directed.all() for _, _, directed in self._rows())
+
+    def _sample(self) -> Float32[np.ndarray, "n D"]:
+        """Features with a direction, evenly from all views."""
+        counts = [int(directed.sum()) for _, _, directed in self._rows()]
+        wanted = even_indices(sum(counts), SAMPLE)
+        parts, start = [np.zeros((0, self._space.channels), np.float32)], 0
+        for rows, _, directed in self._rows():
+            count = int(directed.sum())
+            chosen = wanted[(wanted >= start) & (wanted < start + count)] - start
+            parts.append(rows[directed][chosen])
+            start += count
+        return np.concatenate(parts)
+
+    def _cover(self, threshold: float, limit: int) -> CoverReduction:
+        cover = CoverReduction(self._space.channels, threshold)
+        for rows, _, directed in self._rows():
+            cover.add(rows[directed], limit=limit)
+            if len(cover) > limit:
+                break
+        return cover
+
+    def _cover_all(self, threshold: float) -> tuple[Float32[np.ndarray, "M D"], Int32[np.ndarray, "M 3"]]:
+        """The cover of all features, and where its components come from.
+
+        Raises:
+            InputError: no features, or more components than memory holds.
+        """
+        cover = CoverReduction(self._space.channels, threshold)
+        sources: list[np.ndarray] = []
+        without_direction: list[tuple[np.ndarray, np.ndarray]] = []
+        before = 0
+        for rows, cells, directed in self._rows():
+            cover.add(rows[directed], limit=self._limit)
+            if len(cover) > self._limit:
+                raise InputError(
+                    f"threshold={threshold:.4g}: {self._too_large()}; {self._limit:,} fit: give components="
+                    f"{self._limit} or less, or a smaller threshold"
+                )
+            new = cover.rows[len(sources) :] - before
+            sources.extend(cells[directed][new])
+            before += int(directed.sum())
+            if not directed.all() and not without_direction:
+                without_direction = [(rows[~directed][:1], cells[~directed][0])]
+        components = cover.components
+        for rows, cell in without_direction:
+            components, sources = np.concatenate([components, rows]), [*sources, cell]
+        if not len(components):
+            raise self._no_features()
+        return components + self._mean, np.stack(sources).astype(np.int32)
+
+    def _published(self, threshold: float) -> tuple[Float32[np.ndarray, "M D"], Int32[np.ndarray, "M 3"]]:
+        parts = [(rows[directed], cells[directed]) for rows, cells, directed in self._rows()]
+        rows = np.concatenate([np.zeros((0, self._space.channels), np.float32), *(part[0] for part in parts)])
+        sources = np.concatenate([np.zeros((0, 3), np.int32), *(part[1] for part in parts)])
+        if not len(rows):
+            raise self._no_features()
+        chosen = reduce_as_published(rows, threshold, drop_last=self._config.drop_last).rows
+        if not len(chosen):
+            raise InputError(
+                f"drop_last={self._config.drop_last}: all {len(rows):,} features are in the last, incomplete chunk"
+            )
+        return rows[chosen] + self._mean, sources[chosen]
+
+    def _score(
+        self, components: Float32[np.ndarray, "M D"], threshold: float
+    ) -> tuple[Int64[np.ndarray, " M"], float, float]:
+        """For each component the number of features that it is nearest to; the share of features with a component
+        within the threshold; and the mean cosine with the nearest one. Features without a direction count as covered
+        where the bank has a component without one."""
+        keys = components - self._mean
+        directed_keys = np.abs(keys).max(axis=1) * np.sqrt(keys.shape[1]) > self._floor
+        unit, numbers = unit_rows(keys[directed_keys]), np.flatnonzero(directed_keys)
+        counts, covered, total, count = np.zeros(len(keys), np.int64), 0, 0.0, 0
+        for rows, _, directed in self._rows():
+            count += len(rows)
+            undirected = int((~directed).sum())
+            if undirected and not directed_keys.all():
+                counts[~directed_keys] += undirected
+                covered, total = covered + undirected, total + undirected
+            chosen = rows[directed] if len(unit) else rows[:0]
+            for start in range(0, len(chosen), BLOCK):
+                cosines = unit_rows(chosen[start : start + BLOCK]) @ unit.T
+                nearest = cosines.argmax(axis=1)
+                best = cosines[np.arange(len(nearest)), nearest]
+                counts += np.bincount(numbers[nearest], minlength=len(keys))
+                # A feature is its own component at a threshold of 1, whatever its product with itself rounds to.
+                covered += int((best >= min(threshold, 1 - ROUNDING)).sum())
+                total += float(best.sum(dtype=np.float64))
+        return counts, covered / count, total / count
+
+    def _too_large(self) -> str:
+        gigabytes = self._limit * COPIES * 4 * self._space.channels / 1e9
+        return (
+            f"the bank would have more than {self._limit:,} components of {self._space.channels} channels, which "
+            f"take the {gigabytes:.1f} GB that may be used of this machine's free memory"
+        )
+
+    def _no_features(self) -> InputError:
+        return InputError(f"memory: no view has a cell with a feature of {self._space.name}")
+
+
+def raw_features(view: int, feature_map: FeatureMap) -> tuple[Float32[np.ndarray, "n D"], Int32[np.ndarray, "n 3"]]:
+    """The features of a map, and the view, row and column of their cells: of every cell that has a feature; of a coded
+    map each vector that occurs, once, in the first cell that has it."""
+    if feature_map.codes is not None:
+        assert feature_map.table is not None
+        codes, cells = np.unique(feature_map.codes.ravel(), return_index=True)
+        rows, cells = feature_map.table[codes[codes >= 0]], cells[codes >= 0]
+    else:
+        rows = map_rows(feature_map)
+        cells = np.flatnonzero(~np.isnan(rows[:, 0]))
+        rows = rows[cells]
+    line, column = np.divmod(cells, feature_map.width)
+    return rows, np.stack([np.full(len(cells), view), line, column], axis=1).astype(np.int32)
+
+
+def _mean_cosine(sample: Float32[np.ndarray, "n D"], threshold: float) -> float:
+    """The mean cosine of a sample's features with the nearest component of its cover."""
+    cover = CoverReduction(sample.shape[1], threshold)
+    cover.add(sample)
+    parts = [
+        (unit_rows(sample[start : start + BLOCK]) @ cover.unit.T).max(axis=1) for start in range(0, len(sample), BLOCK)
+    ]
+    return float(np.concatenate(parts).mean(dtype=np.float64))
+
+
+def _most_used(counts: Int64[np.ndarray, " M"], share: float) -> Int64[np.ndarray, " m"]:
+    """The fewest components that stand for a share of the features, ascending."""
+    order = np.argsort(-counts, kind="stable")
+    enough = int(np.searchsorted(counts[order].cumsum(), share * counts.sum() - 0.5)) + 1
+    return np.sort(order[:enough])
