@@ -1,13 +1,17 @@
 """Distillation: the terms of an encoder's loss on a batch (SplatDistill Eq. 5), for one teacher or several."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.losses import AdapterHead, LossConfig, contrast_loss, field_loss, render_loss
-from gsencoder.train.samples import Batch, TeacherRecipe, TeacherTargets
+from gsencoder.train.samples import Batch, SampleDataset, TeacherRecipe, TeacherTargets, join_samples
+from gsencoder.train.trainer import Trainer, TrainerConfig
 
 Heads = Sequence[tuple[AdapterHead, nn.Module]]
 """Adapter heads of a teacher, each with a decoder from standard units to its input."""
@@ -24,7 +28,7 @@ class Distillation:
 
     def __init__(
         self,
-        encoder: nn.Module,
+        network: nn.Module,
         config: LossConfig,
         teachers: Sequence[TeacherRecipe],
         *,
@@ -32,13 +36,13 @@ class Distillation:
         device: torch.device = torch.device("cpu"),
     ) -> None:
         """Args:
-        encoder: a `GaussianEncoder`, possibly compiled or wrapped for several processes.
+        network: a `GaussianEncoder`, possibly compiled or wrapped for several processes.
         config: weights and parameters of the terms.
         teachers: the teachers, in the order of the encoder's output columns.
         heads: adapter heads of teachers, by name.
         device: the device of the losses.
         """
-        self.encoder, self.config = encoder, config
+        self.network, self.config = network, config
         self._teachers = list(teachers)
         self._codebooks = [torch.from_numpy(each.class_balance.codebook).to(device) for each in teachers]
         self._heads = {
@@ -61,6 +65,11 @@ class Distillation:
     def _term(self, teacher: TeacherRecipe, name: str) -> str:
         return name if len(self._teachers) == 1 else f"{teacher.name}/{name}"
 
+    @property
+    def advice(self) -> str:
+        """Settings that leave nothing to compare."""
+        return "loss.min_alpha, loss.min_kept and loss.rarity"
+
     def divisors(self, batch: Batch) -> dict[str, float]:
         """The sum of the weights of a batch's Gaussians or rows, for each term."""
         divisors = {}
@@ -73,7 +82,7 @@ class Distillation:
 
     def __call__(self, batch: Batch) -> dict[str, Tensor]:
         """Totals of the terms whose weight is not 0, for the encoder's predictions."""
-        return self.terms(self.encoder(batch.attributes, batch.opacities, batch.plan), batch)
+        return self.terms(self.network(batch.attributes, batch.opacities, batch.plan), batch)
 
     def terms(self, predicted: Float[Tensor, "N C"], batch: Batch) -> dict[str, Tensor]:
         """Totals of the terms whose weight is not 0; the terms of a teacher that the batch's scenes lack are 0."""
@@ -103,3 +112,38 @@ class Distillation:
             codebook = self._codebooks[number]
             terms["contrast"] = contrast_loss(predicted, targets.codes, targets.loss_weights, codebook, config)
         return terms
+
+
+def encoder_trainer(
+    encoder: GaussianEncoder,
+    dataset: SampleDataset,
+    losses: LossConfig,
+    config: TrainerConfig,
+    *,
+    heads: Mapping[str, Heads] = {},
+    device: torch.device = torch.device("cpu"),
+    **settings: Any,
+) -> Trainer:
+    """A trainer that distills the teachers of a dataset into an encoder.
+
+    Args:
+        encoder: the encoder, trained in place and moved to `device`.
+        dataset: the training samples.
+        losses: weights and parameters of the loss terms.
+        config: settings of the loop.
+        heads: adapter heads of teachers, by name.
+        device: device of this process.
+        settings: the other arguments of `Trainer`.
+
+    Raises:
+        InputError: see `Trainer`.
+    """
+    return Trainer(
+        encoder,
+        dataset,
+        partial(Distillation, config=losses, teachers=dataset.recipe.teachers, heads=heads, device=device),
+        config,
+        collate=partial(join_samples, patch=encoder.config.transformer.patch),
+        device=device,
+        **settings,
+    )

@@ -24,13 +24,14 @@ from gsencoder.train.adapter_heads import asked_heads, dataset_heads, render_hea
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, check_same_teachers
 from gsencoder.train.crops import SamplingConfig
+from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
-from gsencoder.train.trainer import EncoderValidator, Trainer, TrainerConfig, ValidationResult
+from gsencoder.train.trainer import TrainerConfig, ValidationResult
 from gsencoder.train.training_scene import TrainingScene
 
 SceneValidator = Callable[
@@ -222,7 +223,7 @@ def fit(
         seed=config.train.seed,
         step_samples=config.train.samples_per_step(process.world_size),
     )
-    score_encoder: EncoderValidator = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
+    score_encoder: Callable[[GaussianEncoder], ValidationResult] = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
     if validate is not None and held_out:
         held_out_parts = [_parts(datasets, name) for name in held_out]
         scenes = [TrainingScene(parts) for parts in held_out_parts if any(part is not None for part in parts)]
@@ -230,8 +231,9 @@ def fit(
         score_encoder = lambda encoder: validate(scenes, encoder, outputs, codebooks)  # noqa: E731
     scenes_to_train_on = [TrainingScene(_parts(datasets, name)) for name in training]
     torch.manual_seed(config.train.seed)
-    trainer = Trainer(
-        GaussianEncoder(config.model, outputs.widths),
+    encoder = GaussianEncoder(config.model, outputs.widths)
+    trainer = encoder_trainer(
+        encoder,
         SampleDataset(scenes_to_train_on, recipe),
         config.loss,
         config.train,
@@ -246,10 +248,10 @@ def fit(
     state = trainer.run(track)
     # A run that is resumed after its last step and validation has not validated in this process.
     if trainer.last_validation is None and process.is_first:
-        trainer.last_validation = score_encoder(trainer.encoder)
+        trainer.last_validation = score_encoder(encoder)
     scores = dict(trainer.last_validation.scores) if trainer.last_validation is not None else {}
     tables = {name: _table_of(each, datasets[name]) for name, each in words.items()}
-    return Training(encoder=trainer.encoder, outputs=outputs, tables=tables, state=state, scores=scores)
+    return Training(encoder=encoder, outputs=outputs, tables=tables, state=state, scores=scores)
 
 
 def _check_trained(losses: LossConfig, weights: Sequence[float], with_contrast: Mapping[str, bool]) -> None:

@@ -4,19 +4,18 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import Log
@@ -24,12 +23,9 @@ from gsencoder.core.runtime.device import autocast_dtype
 from gsencoder.core.runtime.device_names import Precision
 from gsencoder.core.runtime.signals import defer_signals, stop_of
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.distill import Distillation, Heads
 from gsencoder.train.distributed import STOPPED_ELSEWHERE, ProcessRank, fail_together, sum_over_processes
-from gsencoder.train.losses import LossConfig
-from gsencoder.train.samples import Batch, SampleDataset, StepSampler, join_samples
+from gsencoder.train.samples import StepSampler
 
 NO_WEIGHT = 1e-12
 """Divisor of a term that nothing in a step has a weight for."""
@@ -51,7 +47,7 @@ class TrainerConfig:
     clip: float = field(default=1.0, metadata={"help": "norm to which the gradient is clipped; 0 = no clipping"})
     precision: Precision = field(
         default="auto",
-        metadata={"help": "floating-point type of the encoder; auto = bfloat16 on devices with hardware support"},
+        metadata={"help": "floating-point type of the network; auto = bfloat16 on devices with hardware support"},
     )
     workers: int = field(
         default=0, metadata={"help": "number of processes that make samples; 0 = make them in the training process"}
@@ -60,7 +56,7 @@ class TrainerConfig:
     log_every: int = field(default=10, metadata={"help": "steps per row of the log, over which losses are averaged"})
     validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = only at the end"})
     checkpoint_every: float = field(default=300.0, metadata={"help": "seconds between checkpoints"})
-    compile: bool = field(default=False, metadata={"help": "compile the encoder with torch.compile"})
+    compile: bool = field(default=False, metadata={"help": "compile the network with torch.compile"})
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "accumulate", "log_every"):
@@ -93,55 +89,94 @@ class ValidationResult(NamedTuple):
     pictures: Mapping[str, np.ndarray] = {}
 
 
-EncoderValidator = Callable[[GaussianEncoder], ValidationResult]
+@runtime_checkable
+class TrainingBatch(Protocol):
+    """A batch of samples.
+
+    Attributes:
+        names: of the samples, for messages.
+    """
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+    def to(self, device: torch.device) -> "TrainingBatch": ...
+
+
+@runtime_checkable
+class Objective(Protocol):
+    """The loss of a network as weighted terms. Each is, in a step, Σ total / Σ divisor over all micro-batches of all
+    processes.
+
+    Attributes:
+        network: that is called, possibly compiled or wrapped for several processes.
+        lambdas: the weights of the terms that are not 0, by name.
+        advice: what to check where no term has a divisor above 0, for the error.
+    """
+
+    network: nn.Module
+
+    @property
+    def lambdas(self) -> dict[str, float]: ...
+
+    @property
+    def advice(self) -> str: ...
+
+    def divisors(self, batch: Any) -> dict[str, float]:
+        """The sum of the weights of a batch's rows, for each term."""
+        ...
+
+    def __call__(self, batch: Any) -> dict[str, Tensor]:
+        """The totals of the terms whose weight is not 0."""
+        ...
 
 
 class Trainer:
-    """Trains an encoder on samples; its checkpoint and log, from which a killed run is resumed, are in one folder."""
+    """Trains a network on samples; its checkpoint and log, from which a killed run is resumed, are in one folder."""
 
     def __init__(
         self,
-        encoder: GaussianEncoder,
-        dataset: SampleDataset,
-        losses: LossConfig,
+        network: nn.Module,
+        dataset: Dataset[Any],
+        objective: Callable[[nn.Module], Objective],
         config: TrainerConfig,
         *,
+        collate: Callable[[Any], TrainingBatch | InputError],
         folder: Path,
         settings: Mapping[str, Any],
-        heads: Mapping[str, Heads] = {},
         process: ProcessRank = ProcessRank(),
         device: torch.device = torch.device("cpu"),
         tensorboard: bool = False,
-        validate: EncoderValidator = lambda encoder: ValidationResult({}),  # noqa: ARG005
+        validate: Callable[[Any], ValidationResult] = lambda network: ValidationResult({}),  # noqa: ARG005
     ) -> None:
         """Sets up training, and resumes from the checkpoint in `folder` if there is one.
 
         Args:
-            encoder: the encoder, trained in place and moved to `device`.
-            dataset: the training samples.
-            losses: weights and parameters of the loss terms.
+            network: the network, trained in place and moved to `device`.
+            dataset: the training samples, by number; an error of a sample is a value.
+            objective: gives the loss of the network once it is compiled or wrapped for several processes.
             config: settings of the loop.
+            collate: joins samples to a batch, or returns the error of one of them.
             folder: existing folder for checkpoint and log.
             settings: the settings that a run must share with the one that it resumes, as JSON values.
-            heads: adapter heads of teachers, by name.
             process: rank of this process.
             device: device of this process.
             tensorboard: whether to write TensorBoard events.
-            validate: validates the encoder; called on the first process only.
+            validate: validates the network, which is given in evaluation mode; called on the first process only.
 
         Raises:
             InputError: the folder holds a run with other settings.
         """
         self.config, self.dataset, self.process, self.device = config, dataset, process, device
         self.folder, self.settings, self.validate = folder, dict(settings), validate
-        self.encoder = encoder.to(device)
+        self.network, self._collate = network.to(device), collate
         self.optimizer = torch.optim.AdamW(
-            _parameter_groups(encoder, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
+            _parameter_groups(network, config), lr=config.learning_rate, betas=(0.9, 0.98), fused=True
         )
         self.state = TrainingState()
         self.last_validation: ValidationResult | None = None
         if (folder / TRAINING_CHECKPOINT_FILE).is_file():
-            self.state = load_checkpoint(folder / TRAINING_CHECKPOINT_FILE, encoder, self.optimizer, self.settings)
+            self.state = load_checkpoint(folder / TRAINING_CHECKPOINT_FILE, network, self.optimizer, self.settings)
             if self.state.step > config.steps:
                 raise InputError(
                     f"{folder / TRAINING_CHECKPOINT_FILE}: is at step {self.state.step}, beyond the last step "
@@ -151,12 +186,12 @@ class Trainer:
         closed_steps = self.state.step - (not self.state.closed)
         has_log = self.state.step > len(self.state.unlogged)
         self._log = Log(folder, done=closed_steps, events=tensorboard, begun=has_log) if process.is_first else None
-        network: nn.Module = torch.compile(encoder, dynamic=True) if config.compile else encoder  # type: ignore[assignment]
+        called: nn.Module = torch.compile(network, dynamic=True) if config.compile else network  # type: ignore[assignment]
         self._parallel: nn.parallel.DistributedDataParallel | None = None
         if process.world_size > 1:
             device_ids = [device.index] if device.type == "cuda" else None
-            network = self._parallel = nn.parallel.DistributedDataParallel(network, device_ids=device_ids)
-        self.distillation = Distillation(network, losses, dataset.recipe.teachers, heads=heads, device=device)
+            called = self._parallel = nn.parallel.DistributedDataParallel(called, device_ids=device_ids)
+        self.objective = objective(called)
         self._autocast = autocast_dtype(config.precision, device)
 
     def run(self, track: Track = untracked) -> TrainingState:
@@ -184,7 +219,7 @@ class Trainer:
             if self._log is not None:
                 self._log.close()
         # DistributedDataParallel holds the process group, whose threads must end before the interpreter exits.
-        self.distillation.encoder, self._parallel = self.encoder, None
+        self.objective.network, self._parallel = self.network, None
         return self.state
 
     def _run(self, track: Track) -> None:
@@ -226,7 +261,7 @@ class Trainer:
         """Writes the checkpoint, on the first process only."""
         if self.process.is_first:
             save_checkpoint(
-                self.folder / TRAINING_CHECKPOINT_FILE, self.encoder, self.optimizer, self.state, self.settings
+                self.folder / TRAINING_CHECKPOINT_FILE, self.network, self.optimizer, self.state, self.settings
             )
 
     def _loader(self, first: int) -> "DataLoader[Any]":
@@ -243,14 +278,14 @@ class Trainer:
         return DataLoader(
             self.dataset,
             batch_sampler=sampler,
-            collate_fn=partial(join_samples, patch=self.encoder.config.transformer.patch),
+            collate_fn=self._collate,
             num_workers=config.workers,
             multiprocessing_context="spawn" if config.workers else None,
             worker_init_fn=_init_worker if config.workers else None,
             prefetch_factor=4 if config.workers else None,
         )
 
-    def _gradients(self, step: int, items: list[Batch | InputError]) -> dict[str, float]:
+    def _gradients(self, step: int, items: list[Any]) -> dict[str, float]:
         """Computes the gradients of one optimizer step; returns the losses over all processes.
 
         Args:
@@ -261,37 +296,37 @@ class Trainer:
         rate = self.rate_at(step)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        self.encoder.train()
+        self.network.train()
         batches, divisors = self._sum_divisors(items)
-        lambdas = self.distillation.lambdas
+        lambdas = self.objective.lambdas
         micro_losses = []
         for micro, batch in enumerate(batches):
             self._seed((step * len(batches) + micro) * self.process.world_size + self.process.rank)
             if self._parallel is not None:
                 self._parallel.require_backward_grad_sync = micro + 1 == len(batches)
             with torch.autocast(self.device.type, self._autocast, enabled=self._autocast is not None):
-                terms = self.distillation(batch.to(self.device))
+                terms = self.objective(batch.to(self.device))
             shares = torch.stack([terms[name] / divisors[name] for name in lambdas])
             loss = (shares * shares.new_tensor(list(lambdas.values()))).sum()
             # DistributedDataParallel averages gradients over processes; the step needs their sum.
             (loss * self.process.world_size).backward()
             micro_losses.append(shares.detach().double())
-        norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), self.config.clip or math.inf).item()
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip or math.inf).item()
         totals = self._finite_totals(step, batches, torch.stack(micro_losses), norm)
         losses = dict(zip(lambdas, totals, strict=True))
         total = sum(lambdas[name] * loss for name, loss in losses.items())
         losses = {name: loss for name, loss in losses.items() if divisors[name] > NO_WEIGHT}
         return {"loss": total, **losses, "gradient": norm, "learning_rate": rate}
 
-    def _sum_divisors(self, items: list[Batch | InputError]) -> tuple[list[Batch], dict[str, float]]:
+    def _sum_divisors(self, items: list[Any]) -> tuple[list[TrainingBatch], dict[str, float]]:
         """Separates the batches of a step from errors, and sums the divisors of its loss terms over all processes.
 
         Raises:
             InputError: a sample could not be made, here or on another process, or no term has a weight.
         """
-        batches = [item for item in items if isinstance(item, Batch)]
-        lambdas = self.distillation.lambdas
-        batch_divisors = [self.distillation.divisors(batch) for batch in batches]
+        batches = [item for item in items if not isinstance(item, InputError)]
+        lambdas = self.objective.lambdas
+        batch_divisors = [self.objective.divisors(batch) for batch in batches]
         sums = [sum(divisors[name] for divisors in batch_divisors) for name in lambdas]
         failed = len(items) - len(batches)
         totals = sum_over_processes(torch.tensor([*sums, failed], dtype=torch.float64, device=self.device)).tolist()
@@ -304,8 +339,7 @@ class Trainer:
             names = "; ".join(name for batch in batches for name in batch.names)
             raise InputError(
                 f"training: there is nothing to compare in {names}: no Gaussian has a target with a weight, and no "
-                "cell of the teacher passes the thresholds; check loss.min_alpha, loss.min_kept and loss.rarity, and "
-                "these scenes"
+                f"cell of the teacher passes the thresholds; check {self.objective.advice}, and these scenes"
             )
         return batches, {name: max(total, NO_WEIGHT) for name, total in zip(lambdas, totals, strict=False)}
 
@@ -316,7 +350,7 @@ class Trainer:
         torch.manual_seed(int(state[0] >> np.uint64(1)))
 
     def _finite_totals(
-        self, step: int, batches: list[Batch], micro_losses: Float64[Tensor, "micro terms"], norm: float
+        self, step: int, batches: list[TrainingBatch], micro_losses: Float64[Tensor, "micro terms"], norm: float
     ) -> list[float]:
         """The loss terms of the step over all processes.
 
@@ -325,7 +359,7 @@ class Trainer:
         """
         bad_loss = bad_gradient = ""
         for batch, row in zip(batches, micro_losses.tolist(), strict=True):
-            for name, value in zip(self.distillation.lambdas, row, strict=True):
+            for name, value in zip(self.objective.lambdas, row, strict=True):
                 if not math.isfinite(value):
                     bad_loss = bad_loss or f"the {name} loss of {'; '.join(batch.names)}"
         if not bad_loss and not math.isfinite(norm):
@@ -358,18 +392,18 @@ class Trainer:
         """Validates on the first process; returns the columns of the log, which are empty on the others."""
         scores: dict[str, float] = {}
         if self._log is not None:
-            self.encoder.eval()
-            self.last_validation = result = self.validate(self.encoder)
+            self.network.eval()
+            self.last_validation = result = self.validate(self.network)
             scores = {f"validation/{name}": float(value) for name, value in result.scores.items()}
             for name, pixels in result.pictures.items():
                 self._log.picture(step, f"validation/{name}", pixels)
         return scores
 
 
-def _parameter_groups(encoder: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
+def _parameter_groups(network: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
     """Parameters with weight decay (matrices) and without (norms and biases)."""
-    matrices = [value for value in encoder.parameters() if value.ndim > 1]
-    vectors = [value for value in encoder.parameters() if value.ndim <= 1]
+    matrices = [value for value in network.parameters() if value.ndim > 1]
+    vectors = [value for value in network.parameters() if value.ndim <= 1]
     return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
 
 

@@ -65,7 +65,7 @@ def begin(
         given.update(validated=[scene.name for scene in scenes])
         return ValidationResult({})
 
-    monkeypatch.setattr(run, "Trainer", trainer)
+    monkeypatch.setattr(run, "encoder_trainer", trainer)
     # Nothing of the teachers is read here but which of them has heads.
     teachers = {name: RadioConfig() if name == "dense" else PaletteConfig() for name in datasets}
     config = TrainConfig(teachers=teachers, model=SMALL, loss=replace(LOSSES, **losses), heads=heads)

@@ -34,13 +34,12 @@ from gsencoder.train.checkpoint import (
     save_checkpoint,
 )
 from gsencoder.train.dataset_space import dataset_space
-from gsencoder.train.distill import Distillation
+from gsencoder.train.distill import Distillation, encoder_trainer
 from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
 from gsencoder.train.run import TrainConfig, resume_settings, train
 from gsencoder.train.samples import SampleDataset
-from gsencoder.train.trainer import Trainer
 from gsencoder.train.training_scene import TrainingScene
 
 
@@ -106,14 +105,14 @@ def test_a_scene_that_lacks_a_teacher_has_no_weight_in_its_terms(datasets: Datas
 def test_the_log_averages_a_teachers_losses_over_the_steps_that_have_it(datasets: Datasets, tmp_path: Path) -> None:
     config = replace(SHORT, steps=6, log_every=3)
     data = joint(datasets)
-    each = Trainer(
+    each = encoder_trainer(
         small_encoder(8), data, LOSSES, replace(config, log_every=1), folder=_made(tmp_path / "1"), settings={}
     )
     each.run()
     single = read_log(tmp_path / "1" / LOG_FILE)
     lacking = [row for row in single if not row.get("heights/field")]
     assert len(lacking) == 2  # One wall of three.
-    Trainer(small_encoder(8), data, LOSSES, config, folder=_made(tmp_path / "3"), settings={}).run()
+    encoder_trainer(small_encoder(8), data, LOSSES, config, folder=_made(tmp_path / "3"), settings={}).run()
     rows = read_log(tmp_path / "3" / LOG_FILE)
     assert len(rows) == 2
     for row, group in zip(rows, (single[:3], single[3:]), strict=True):
@@ -125,7 +124,7 @@ def test_the_log_averages_a_teachers_losses_over_the_steps_that_have_it(datasets
 def test_a_resumed_run_has_the_same_bits(datasets: Datasets, tmp_path: Path) -> None:
     def run(folder: Path, steps: range | None = None) -> torch.Tensor:
         encoder = small_encoder(8)
-        trainer = Trainer(encoder, joint(datasets), LOSSES, SHORT, folder=folder, settings={"run": 1})
+        trainer = encoder_trainer(encoder, joint(datasets), LOSSES, SHORT, folder=folder, settings={"run": 1})
         if steps is None:
             trainer.run()
         else:
@@ -149,7 +148,7 @@ def test_training_lowers_the_losses_of_both_teachers(datasets: Datasets, tmp_pat
         return {name: terms[name].item() / divisors[name] for name in ("sides/field", "heights/field")}
 
     before = field_losses()
-    Trainer(encoder, data, LOSSES, replace(SHORT, steps=25), folder=tmp_path, settings={}).run()
+    encoder_trainer(encoder, data, LOSSES, replace(SHORT, steps=25), folder=tmp_path, settings={}).run()
     after = field_losses()
     for name, loss in before.items():
         assert after[name] < 0.8 * loss, name
@@ -181,7 +180,7 @@ def test_a_teacher_of_weight_zero_changes_nothing_but_its_own_columns(datasets: 
     own = encoder.head.of_teacher[1]  # type: ignore[index, union-attr]
     before = [parameter.detach().clone() for parameter in own.parameters()]
     config = replace(SHORT, steps=2, weight_decay=0.0)
-    Trainer(encoder, weightless, LOSSES, config, folder=tmp_path, settings={}).run()
+    encoder_trainer(encoder, weightless, LOSSES, config, folder=tmp_path, settings={}).run()
     assert all(torch.equal(old, new) for old, new in zip(before, own.parameters(), strict=True))
 
 

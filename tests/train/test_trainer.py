@@ -21,6 +21,7 @@ from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.step_log import LOG_FILE, read_log
 from gsencoder.core.runtime.signals import Stopped
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
+from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
@@ -44,7 +45,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
 
 def trainer(dataset: Prepared, folder: Path, config: TrainerConfig = SHORT, **changes: object) -> Trainer:
     folder.mkdir(exist_ok=True)
-    return Trainer(small_encoder(), samples(*dataset), LOSSES, config, folder=folder, settings={"run": 1}, **changes)
+    return encoder_trainer(
+        small_encoder(), samples(*dataset), LOSSES, config, folder=folder, settings={"run": 1}, **changes
+    )
 
 
 def losses(folder: Path, column: str = "loss") -> list[float]:
@@ -201,10 +204,12 @@ def test_rows_of_steps_that_are_done_again_are_taken_out_of_the_log(dataset: Pre
 def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, tmp_path: Path) -> None:
     trainer(dataset, tmp_path).run()
     with pytest.raises(InputError, match=r"was made with run=1, and this run asks run=2"):
-        Trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
+        encoder_trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
     for key, message in (("samples_per_step", "a step had None samples, and this run has 4"), ("space", "changed")):
         with pytest.raises(InputError, match=message):
-            Trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 1, key: 4})
+            encoder_trainer(
+                small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 1, key: 4}
+            )
 
 
 @pytest.mark.parametrize(
@@ -250,7 +255,7 @@ def test_a_training_that_compares_nothing_is_refused(dataset: Prepared, tmp_path
     strict = LossConfig(field_weight=0.0, render_weight=1.0, min_alpha=1.0, min_kept=1.0)
     nothing = samples(*dataset, losses=strict)
     with pytest.raises(InputError, match=r"there is nothing to compare in wall_\d"):
-        Trainer(small_encoder(), nothing, strict, SHORT, folder=tmp_path, settings={}).run()
+        encoder_trainer(small_encoder(), nothing, strict, SHORT, folder=tmp_path, settings={}).run()
 
 
 def test_micro_batches_add_up_to_the_batch(dataset: Prepared, tmp_path: Path) -> None:
@@ -261,7 +266,7 @@ def test_micro_batches_add_up_to_the_batch(dataset: Prepared, tmp_path: Path) ->
         for module in encoder.modules():
             if hasattr(module, "share"):
                 module.share = 0.0  # What is dropped at random is drawn by micro-batch.
-        one = Trainer(
+        one = encoder_trainer(
             encoder,
             samples(*dataset),
             LOSSES,
@@ -295,21 +300,21 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
     data = samples(*dataset)
     for number in range(len(data.scenes)):
         data[number]  # Kinds of targets are looked up once, and here before they are spoiled.
-    one = Trainer(small_encoder(), data, LOSSES, SHORT, folder=tmp_path, settings={})
-    before = {name: value.clone() for name, value in one.encoder.state_dict().items()}
+    one = encoder_trainer(small_encoder(), data, LOSSES, SHORT, folder=tmp_path, settings={})
+    before = {name: value.clone() for name, value in one.network.state_dict().items()}
     spoiled = lambda scene, rows: np.full((len(rows), scene.channels), np.inf, np.float32)  # noqa: E731
     monkeypatch.setattr(PreparedScene, "targets", spoiled)
     with pytest.raises(
         InputError, match=r"the field loss of wall_\d \((near, far|far, near)\) is not finite at step 0"
     ):
         one.run()
-    assert all(torch.equal(value, before[name]) for name, value in one.encoder.state_dict().items())
+    assert all(torch.equal(value, before[name]) for name, value in one.network.state_dict().items())
     assert not (tmp_path / TRAINING_CHECKPOINT_FILE).exists()
 
 
 def test_a_gradient_that_is_not_finite_stops_the_run_too(dataset: Prepared, tmp_path: Path) -> None:
     one = trainer(dataset, tmp_path)
-    one.encoder.head_norm.weight.register_hook(lambda gradient: gradient * float("inf"))
+    one.network.head_norm.weight.register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(InputError, match="the gradient of wall_"):
         one.run()
 
@@ -322,7 +327,7 @@ def test_what_was_done_before_a_step_that_is_not_finite_is_kept(dataset: Prepare
         calls.append(1)
         return gradient * (float("nan") if len(calls) == 4 else 1.0)
 
-    one.encoder.head_norm.weight.register_hook(spoil)
+    one.network.head_norm.weight.register_hook(spoil)
     with pytest.raises(InputError, match="not finite at step 3; parameters were not changed"):
         one.run()
     assert steps_in(tmp_path) == 3
@@ -386,14 +391,14 @@ from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.train.distributed import join_processes
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.trainer import Trainer
+from gsencoder.train.distill import encoder_trainer
 
 if __name__ == "__main__":
     dataset = PreparedDataset(Path({prepared!r}), {{"made": "for a test"}})
     names = {names!r}
     with join_processes("cpu") as (process, device):
         config = replace(SHORT, steps={steps}, accumulate={accumulate})
-        trainer = Trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
+        trainer = encoder_trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
                           settings={{}}, process=process, device=device)
         trainer.run()
     threads = [(task / "comm").read_text() for task in Path("/proc/self/task").glob("*")]
