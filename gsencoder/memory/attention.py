@@ -24,36 +24,46 @@ class MemoryAttention(nn.Module):
     """
 
     def __init__(
-        self, bank: MemoryBank, projection: Float[Tensor, "s D"], *, scoring: Scoring, temperature: float
+        self,
+        bank: MemoryBank,
+        projection: Float[Tensor, "s D"],
+        *,
+        scoring: Scoring,
+        temperature: float,
+        values: Float[Tensor, "M C"] | None = None,
     ) -> None:
         """Args:
         bank: the components.
         projection: initial W_m.
         scoring: how queries are compared with components.
         temperature: τ.
+        values: what is averaged, such as the components in a basis; None = the components.
         """
         super().__init__()
         self.scoring, self.temperature = scoring, temperature
         self.projection = nn.Parameter(projection)
         keys = attention_keys(bank.components, bank.mean, scoring)
         self.register_buffer("keys", torch.from_numpy(keys), persistent=False)
-        self.register_buffer("components", torch.from_numpy(bank.components), persistent=False)
+        values = torch.from_numpy(bank.components) if values is None else values
+        self.register_buffer("values", values, persistent=False)
         self.keys: Tensor
-        self.components: Tensor
+        self.values: Tensor
 
-    def forward(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n D"]:
+    def forward(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n C"]:
         """The features that queries stand for; with cosines their length does not matter."""
         if torch.is_grad_enabled():
             return self._attend(queries)
-        step = max(1, BLOCK_SCORES // len(self.components))
-        return torch.cat([self._attend(part) for part in queries.split(step)])
+        step = max(1, BLOCK_SCORES // len(self.values))
+        return (
+            torch.cat([self._attend(part) for part in queries.split(step)]) if len(queries) else self._attend(queries)
+        )
 
-    def _attend(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n D"]:
+    def _attend(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n C"]:
         keys = self.keys @ self.projection.T
         if self.scoring != "dot":
             queries = queries / self._lengths(queries)
         scaled = (queries / self.temperature)[None]
-        return scaled_dot_product_attention(scaled, keys[None], self.components[None], scale=1.0)[0]
+        return scaled_dot_product_attention(scaled, keys[None], self.values[None], scale=1.0)[0]
 
     def _lengths(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n 1"]:
         """|q W|, at least `EPS`. The largest entry is taken out of the root, so that squares neither overflow nor

@@ -331,6 +331,15 @@ def prepare_scene(
     assert scene.views is not None
     fusion = replace(config.fusion, basis=outputs.basis is not None)
     fused = fuse(scene, teacher, fusion, basis=outputs.basis)
+    rows = view_rows(scene, teacher, outputs, config)
+    write_prepared(path, scene, fused.features, outputs, rows, source=source, projections=fused.projections)
+
+
+def view_rows(scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig) -> list[ViewRows]:
+    """The matrix B of every view on the teacher's grid, pooled to cells of `config.render_cell` pixels, with the
+    teacher's vectors; arguments are those of `prepare_scene`."""
+    assert scene.gaussians is not None
+    assert scene.views is not None
     blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
     rows = []
     for view in range(len(scene.views)):
@@ -340,7 +349,7 @@ def prepare_scene(
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
         arrays = (b.crow.numpy(), b.col.numpy(), b.weight.numpy())
         rows.append(ViewRows(crow=arrays[0], col=arrays[1], weight=arrays[2], targets=targets, valid=valid))
-    write_prepared(path, scene, fused.features, outputs, rows, source=source, projections=fused.projections)
+    return rows
 
 
 def _pool_map(

@@ -87,6 +87,29 @@ def _row_sums(values: np.ndarray, crow: np.ndarray) -> np.ndarray:
     return np.where(np.diff(crow) > 0, total, 0)
 
 
+def sample_rows(view: ViewRows, count: int, min_alpha: float, rng: np.random.Generator) -> RenderRows:
+    """Draws rows of a view at random, all with the weight 1, among those with a vector and an alpha of `min_alpha`.
+
+    Args:
+        view: rows over all Gaussians.
+        count: largest number of rows.
+        min_alpha: smallest opacity of a row.
+        rng: source of random numbers.
+    """
+    usable = np.flatnonzero(view.valid & (_row_sums(view.weight, view.crow) >= min_alpha))
+    chosen = usable if len(usable) <= count else np.sort(rng.choice(usable, count, replace=False))
+    counts = np.diff(view.crow)[chosen]
+    crow = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
+    entries = np.arange(crow[-1]) + np.repeat(view.crow[:-1][chosen] - crow[:-1], counts)
+    return RenderRows(
+        crow=torch.from_numpy(crow),
+        col=torch.from_numpy(view.col[entries]),
+        weight=torch.from_numpy(view.weight[entries]),
+        targets=torch.from_numpy(view.targets[chosen]),
+        row_weights=torch.ones(len(chosen)),
+    )
+
+
 def make_render_rows(view: ViewRows, class_balance: ClassBalance, power: float) -> RenderRows:
     """Converts rows of one view to tensors; the weight of each in the loss is n^−power of its target's class."""
     return RenderRows(

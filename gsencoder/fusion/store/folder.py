@@ -1,6 +1,7 @@
 """Features on disk: a folder that holds the Gaussians, the cameras and their features.
 
 Features of one teacher are in `features.safetensors`, those of several in a file each, `features.TEACHER.safetensors`.
+Memories, which are decoded to features when they are read, are in `memory.safetensors` or `memory.TEACHER.safetensors`.
 Arrays are safetensors files, memory-mapped on load; features are float16 for seen rows only. The folder is all that
 localization needs: no photographs, no teacher.
 """
@@ -18,8 +19,9 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import Archive, open_archive, write_archive
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.splats import fingerprint
+from gsencoder.fusion.store.memory_file import MEMORY_FILE, read_memory, write_memory
 from gsencoder.fusion.store.package import PACKAGE_FILE, load_package
-from gsencoder.types import GaussianFeatures, Gaussians, Scene
+from gsencoder.types import GaussianFeatures, Gaussians, QueryMemory, Scene
 
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 BLOCK = 16_384
@@ -71,6 +73,35 @@ def save_features(
     wrong = [len(each) for each in by_file.values() if gaussians is None or len(gaussians) != len(each)]
     if gaussians is None or wrong:
         raise InputError(f"save_features: {wrong[0]} features need as many Gaussians in scene {scene.name}")
+    _write_scene(folder, scene, gaussians)
+    for name, each in by_file.items():
+        _write_rows(folder / name, each, {"settings": dict(settings), "fingerprint": fingerprint(gaussians)})
+
+
+def save_memories(
+    folder: str | Path, scene: Scene, memories: Mapping[str, QueryMemory], settings: Mapping[str, Any] = {}
+) -> None:
+    """Writes a scene and its memories, which every command that takes features reads as features.
+
+    Args:
+        folder: made if it does not exist, as in `save_features`.
+        scene: with the Gaussians that the queries belong to.
+        memories: by teacher.
+        settings: what made them, as JSON values.
+
+    Raises:
+        InputError: queries of another number of Gaussians, or a folder that cannot be written.
+    """
+    folder, gaussians = Path(folder), scene.gaussians
+    if gaussians is None:
+        raise InputError(f"save_memories: scene {scene.name} has no Gaussians")
+    _write_scene(folder, scene, gaussians)
+    for name, memory in memories.items():
+        file = file_of_teacher(MEMORY_FILE, None if len(memories) == 1 else name)
+        write_memory(folder / file, memory, gaussians, {"settings": dict(settings)})
+
+
+def _write_scene(folder: Path, scene: Scene, gaussians: Gaussians) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -78,8 +109,6 @@ def save_features(
     around, header = scene_parts(scene)
     arrays = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     write_archive(folder / SCENE_FILE, arrays | around, header)
-    for name, each in by_file.items():
-        _write_rows(folder / name, each, {"settings": dict(settings), "fingerprint": fingerprint(gaussians)})
 
 
 def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any]) -> None:
@@ -109,19 +138,64 @@ def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any])
 
 
 def load_features(folder: str | Path) -> Scene:
-    """The scene and its features from a folder that `save_features` or `save_package` wrote: by the name of their
-    space, or, where there are those of several teachers, by teacher.
+    """The scene and its features from a folder that `save_features`, `save_memories` or `save_package` wrote: by the
+    name of their space, or, where there are those of several teachers, by teacher.
 
     Raises:
         InputError: not such a folder, damaged, of another version, or features of another splat.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of features made by `gsencoder fuse`, `encode` or `pack`")
+        raise InputError(
+            f"{folder}: expected a folder of features made by `gsencoder fuse`, `encode`, `memory` or `pack`"
+        )
     if (folder / PACKAGE_FILE).is_file():
         if (folder / SCENE_FILE).is_file():
             raise InputError(f"{folder}: holds {SCENE_FILE} and {PACKAGE_FILE}, two kinds of features; keep one")
         return load_package(folder)
+    scene, gaussians = _load_scene(folder)
+    files = _files_of_teachers(folder, FEATURES_FILE)
+    if _files_of_teachers(folder, MEMORY_FILE):
+        if files:
+            raise InputError(f"{folder}: holds features and memories, two kinds of features; keep one")
+        features = {name: each.features() for name, each in load_memories(folder).items()}
+    else:
+        files = files or {None: FEATURES_FILE}
+        features = {name: _load_rows(folder, file, gaussians) for name, file in files.items()}
+    return replace(scene, features={name or each.space.name: each for name, each in features.items()})
+
+
+def load_memories(folder: str | Path) -> dict[str | None, QueryMemory]:
+    """The memories of a folder that `save_memories` wrote, by teacher; the name of a single one is None.
+
+    Raises:
+        InputError: not such a folder, damaged, of another version, or memories of another splat.
+    """
+    folder = Path(folder)
+    _, gaussians = _load_scene(folder)
+    memories = {}
+    for name, file in (_files_of_teachers(folder, MEMORY_FILE) or {None: MEMORY_FILE}).items():
+        with _open(folder, file) as archive:
+            memories[name] = read_memory(archive, gaussians)
+    return memories
+
+
+def _files_of_teachers(folder: Path, file: str) -> dict[str | None, str]:
+    """The files of a kind in a folder by teacher; the name of a single one is None.
+
+    Raises:
+        InputError: there are those of one teacher and of several.
+    """
+    teachers = teachers_in(folder, file)
+    if not (folder / file).is_file():
+        return {name: file_of_teacher(file, name) for name in teachers}
+    if teachers:
+        raise InputError(f"{folder}: holds {file} and those of {', '.join(teachers)}, of two runs; keep one")
+    return {None: file}
+
+
+def _load_scene(folder: Path) -> tuple[Scene, Gaussians]:
+    """The scene of a folder, and its Gaussians."""
     with _open(folder, SCENE_FILE) as file:
         gaussians = Gaussians(
             means=file.array("means", "float32", ("N", 3)),
@@ -130,17 +204,7 @@ def load_features(folder: str | Path) -> Scene:
             opacities=file.array("opacities", "float32", ("N",)),
             sh=file.array("sh", "float32", ("N", "K", 3)),
         )
-        scene = read_scene(file, gaussians)
-    teachers = teachers_in(folder, FEATURES_FILE)
-    if not teachers or (folder / FEATURES_FILE).is_file():
-        if teachers:
-            raise InputError(
-                f"{folder}: holds {FEATURES_FILE} and features of {', '.join(teachers)}, of two runs; keep one"
-            )
-        features = _load_rows(folder, FEATURES_FILE, gaussians)
-        return replace(scene, features={features.space.name: features})
-    by_teacher = {name: _load_rows(folder, file_of_teacher(FEATURES_FILE, name), gaussians) for name in teachers}
-    return replace(scene, features=by_teacher)
+        return read_scene(file, gaussians), gaussians
 
 
 def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:

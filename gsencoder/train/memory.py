@@ -1,0 +1,225 @@
+"""Training of a scene's memory: first queries, the loop, and what comes out (M3 sec. 3.3)."""
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import nn
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.json_values import plain
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.memory.attention import MemoryAttention, random_projection
+from gsencoder.memory.decoders import Decoder, make_decoder
+from gsencoder.train.checkpoint import TrainingState
+from gsencoder.train.distributed import ProcessRank
+from gsencoder.train.memory_network import MemoryConfig, MemoryNetwork, MemoryObjective, ViewSamples, join_views
+from gsencoder.train.memory_scene import MemoryScene
+from gsencoder.train.trainer import Trainer, TrainerConfig
+from gsencoder.types import QueryMemory
+
+CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
+"""Settings of the loop that a resumed run may change, since they do not change the result of a step."""
+
+
+def memory_training() -> TrainerConfig:
+    """The training loop's settings for memories."""
+    return TrainerConfig(steps=600, learning_rate=0.005, warmup=50, weight_decay=0.0, validate_every=0, log_every=10)
+
+
+def first_queries(
+    scene: MemoryScene, config: MemoryConfig, seed: int
+) -> tuple[Float32[np.ndarray, "N s"], Float32[np.ndarray, "s D"]]:
+    """Queries and projection before the training: the fused features in their s principal directions, or random ones.
+
+    A cosine that is not centered depends on the mean as well, whose coordinate is 1 for every Gaussian.
+    """
+    prepared, outputs, width = scene.prepared, scene.outputs, config.channels
+    rng = np.random.default_rng([seed, 2])
+    channels = outputs.space.channels
+    unit = 1.0 if config.scoring == "dot" else math.sqrt(channels)
+    if config.init == "random":
+        generator = torch.Generator().manual_seed(int(rng.integers(1 << 62)))
+        queries = rng.standard_normal((len(prepared), width), np.float32)
+        return queries, (unit * random_projection(width, channels, generator)).numpy()
+    seen = np.flatnonzero(prepared.weights)
+    standard = prepared.targets(seen)
+    values, vectors = np.linalg.eigh(standard.T.astype(np.float64) @ standard)
+    constant = int(config.scoring != "centered")
+    rank = min(width - constant, len(values))
+    directions = vectors[:, ::-1][:, :rank].astype(np.float32)
+    queries = np.zeros((len(prepared), width), np.float32)
+    queries[seen, constant : constant + rank] = standard @ directions * np.float32(outputs.unit)
+    projection = np.zeros((width, channels), np.float32)
+    in_space = directions.T if outputs.basis is None else directions.T @ outputs.basis.components
+    projection[constant : constant + rank] = in_space
+    if constant:
+        queries[seen, 0], projection[0] = 1, outputs.mean
+    if config.scoring == "dot":
+        return queries, projection
+    # With cosines the length of a query does not matter. These units let one learning rate serve both.
+    spread = float(queries[seen].std()) or 1.0
+    return queries / np.float32(spread), (projection * np.float32(unit)).astype(np.float32)
+
+
+def untrained_memory(scene: MemoryScene, config: MemoryConfig, seed: int = 0) -> QueryMemory:
+    """The memory of fused features without any training."""
+    queries, projection = first_queries(scene, config, seed)
+    return _memory_of(scene, config, queries, projection)
+
+
+def train_memory(
+    scenes: Mapping[str, MemoryScene],
+    config: MemoryConfig = MemoryConfig(),
+    training: TrainerConfig | None = None,
+    *,
+    work: Path,
+    process: ProcessRank = ProcessRank(),
+    device: torch.device = torch.device("cpu"),
+    track: Track = untracked,
+) -> tuple[dict[str, QueryMemory], TrainingState]:
+    """Optimizes the queries of a scene for one teacher or several at once. Interrupted, it is resumed by the next call
+    with the same `work`.
+
+    Args:
+        scenes: the scene as it was prepared for each teacher.
+        config: queries, attention and loss.
+        training: settings of the loop; None = those of `memory_training`.
+        work: existing folder for the checkpoint and the log.
+        process: rank of this process.
+        device: of this process.
+        track: wraps the loop to show progress.
+
+    Raises:
+        InputError: the scenes are of different Gaussians or views, `work` holds a run with other settings, or a loss or
+            gradient is not finite.
+    """
+    training = memory_training() if training is None else training
+    network, state = _train(scenes, config, training, None, work, process, device, track)
+    memories = {}
+    for number, (name, scene) in enumerate(scenes.items()):
+        attention = network.decoders[number]
+        assert isinstance(attention, MemoryAttention)
+        queries, projection = (each.detach().cpu().numpy() for each in (network.queries[number], attention.projection))
+        memories[name] = _memory_of(scene, config, queries, projection)
+    return memories, state
+
+
+def train_decoder(
+    scene: MemoryScene,
+    kind: Decoder,
+    config: MemoryConfig,
+    training: TrainerConfig,
+    *,
+    work: Path,
+    track: Track = untracked,
+) -> MemoryNetwork:
+    """The same training with a decoder in place of the attention, to compare with; its outputs are in standard units.
+
+    Args:
+        scene: prepared for one teacher.
+        kind: of the decoder.
+        config: queries and loss; what is said of attention is not used.
+        training: settings of the loop.
+        work: existing folder for the checkpoint and the log.
+        track: wraps the loop to show progress.
+
+    Raises:
+        InputError: see `train_memory`.
+    """
+    network, _ = _train({"": scene}, config, training, kind, work, ProcessRank(), torch.device("cpu"), track)
+    return network
+
+
+def _train(
+    scenes: Mapping[str, MemoryScene],
+    config: MemoryConfig,
+    training: TrainerConfig,
+    kind: Decoder | None,
+    work: Path,
+    process: ProcessRank,
+    device: torch.device,
+    track: Track,
+) -> tuple[MemoryNetwork, TrainingState]:
+    _check_same_scene(scenes)
+    queries, decoders = {}, {}
+    for name, scene in scenes.items():
+        first, projection = first_queries(scene, config, training.seed)
+        queries[name] = torch.from_numpy(first)
+        decoders[name] = _decoder_of(scene, config, kind, projection, training.seed)
+    settings = {
+        "memory": plain(config),
+        "train": {name: value for name, value in plain(training).items() if name not in CHANGEABLE_ON_RESUME},
+        "decoder": kind or "attention",
+        "teachers": list(scenes),
+        "spaces": {name: scene.bank.space.describe() for name, scene in scenes.items()},
+        "components": {name: len(scene.bank) for name, scene in scenes.items()},
+        "samples_per_step": training.samples_per_step(process.world_size),
+    }
+    trainer = Trainer(
+        MemoryNetwork(queries, decoders),
+        ViewSamples(scenes, config, training.seed),
+        partial(MemoryObjective, config=config, teachers=list(scenes)),
+        training,
+        collate=join_views,
+        folder=work,
+        settings=settings,
+        process=process,
+        device=device,
+    )
+    state = trainer.run(track)
+    assert isinstance(trainer.network, MemoryNetwork)
+    return trainer.network, state
+
+
+def _decoder_of(
+    scene: MemoryScene, config: MemoryConfig, kind: Decoder | None, projection: np.ndarray, seed: int
+) -> nn.Module:
+    values = torch.from_numpy(scene.values)
+    if kind is None:
+        return MemoryAttention(
+            scene.bank,
+            torch.from_numpy(projection),
+            scoring=config.scoring,
+            temperature=config.temperature,
+            values=values,
+        )
+    outputs = scene.outputs
+    in_columns = projection if outputs.basis is None else projection @ outputs.basis.components.T
+    generator = torch.Generator().manual_seed(seed)
+    return make_decoder(kind, torch.from_numpy(in_columns), generator=generator)
+
+
+def _memory_of(
+    scene: MemoryScene,
+    config: MemoryConfig,
+    queries: Float32[np.ndarray, "N s"],
+    projection: Float32[np.ndarray, "s D"],
+) -> QueryMemory:
+    weights = np.array(scene.prepared.weights)
+    return QueryMemory(
+        queries=np.where(weights[:, None] > 0, queries, np.float32(0)),
+        weights=weights,
+        projection=projection,
+        bank=scene.bank,
+        scoring=config.scoring,
+        temperature=config.temperature,
+        mean=scene.outputs.mean,
+        basis=scene.outputs.basis,
+    )
+
+
+def _check_same_scene(scenes: Mapping[str, MemoryScene]) -> None:
+    """Raises:
+    InputError: the scenes are of different Gaussians or views."""
+    first_name, first = next(iter(scenes.items()))
+    for name, scene in scenes.items():
+        if len(scene.prepared) != len(first.prepared) or scene.prepared.view_names != first.prepared.view_names:
+            raise InputError(
+                f"memory: {first_name} and {name} were prepared for different scenes, of {len(first.prepared):,} and "
+                f"{len(scene.prepared):,} Gaussians"
+            )

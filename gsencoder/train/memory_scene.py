@@ -1,0 +1,165 @@
+"""Preparation of a scene for the training of its memory: fused features, a bank, and the rows of B of every view.
+
+The files of each teacher are in a folder of their own, and appear when they are complete; an interrupted preparation
+continues with the maps and sums of its fusion.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsencoder.core.errors import InputError, advised
+from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.files.json_values import plain
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.data.splats import fingerprint
+from gsencoder.fusion.basis import to_coordinates
+from gsencoder.fusion.fuse import fuse
+from gsencoder.fusion.teacher_maps import CachedTeacher
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.memory.bank import BankConfig, build_bank
+from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
+from gsencoder.train.prepare import PrepareConfig, view_rows
+from gsencoder.train.prepared_scene import PreparedScene, write_prepared
+from gsencoder.types import FeatureMap, GaussianFeatures, MemoryBank, Scene
+
+BANK_FILE, SCENE_FILE, MAPS_FOLDER = "bank.safetensors", "scene.safetensors", "maps"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MemorySourceConfig:
+    """What a memory is made from."""
+
+    bank: BankConfig = field(default_factory=BankConfig)
+    prepare: PrepareConfig = field(default_factory=PrepareConfig)
+
+    def __post_init__(self) -> None:
+        if not (self.prepare.center and self.prepare.scale):
+            raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MemoryScene:
+    """A scene that is prepared for one teacher.
+
+    Attributes:
+        prepared: its Gaussians, fused features, and rows of B.
+        outputs: the units of these features.
+        bank: the components.
+    """
+
+    prepared: PreparedScene
+    outputs: OutputSpace
+    bank: MemoryBank
+
+    @property
+    def values(self) -> Float32[np.ndarray, "M channels"]:
+        """The components in the units of the outputs."""
+        basis = self.outputs.basis
+        rows = self.bank.components if basis is None else to_coordinates(basis, self.bank.components)
+        return self.outputs.standardize(rows)
+
+
+def prepare_memory(
+    scene: Scene, teacher: Teacher, config: MemorySourceConfig, folder: Path, *, track: Track = untracked
+) -> MemoryScene:
+    """Prepares a scene for one teacher, or opens what was prepared in this folder before.
+
+    Args:
+        scene: with Gaussians and views.
+        teacher: whose features are remembered.
+        config: of the bank, the fusion and the rows.
+        folder: created if it does not exist.
+        track: wraps loops to show progress.
+
+    Raises:
+        InputError: the scene cannot be fused, the bank cannot be made, or the folder was prepared with other settings.
+    """
+    made_with = _made_with(scene, teacher, config)
+    if (folder / BANK_FILE).is_file():
+        return open_memory_scene(folder, made_with)
+    assert scene.views is not None
+    maps = folder / MAPS_FOLDER
+    with advised(f"remove {folder} to prepare the scene again"):
+        fusion = replace(config.prepare.fusion, views=0)
+        fused = fuse(scene, teacher, fusion, work=None if teacher.cheap else maps, track=track)
+        features = fused.features
+        outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
+        source: Teacher = teacher if teacher.cheap else CachedTeacher(teacher, maps)
+        views, count = scene.views, len(scene.views)
+
+        def stream() -> Iterator[tuple[int, FeatureMap]]:
+            for view in range(count):
+                yield view, source.feature_map(views, view)
+
+        bank = build_bank(stream, features.space, features.mean, config.bank)
+        rows = view_rows(scene, source, outputs, config.prepare)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())
+    _write_bank(folder / BANK_FILE, bank, outputs, made_with)
+    return open_memory_scene(folder, made_with)
+
+
+def open_memory_scene(folder: Path, made_with: Mapping[str, Any] | None = None) -> MemoryScene:
+    """Opens a prepared scene.
+
+    Args:
+        folder: of `prepare_memory`.
+        made_with: what the preparation depends on; None = anything.
+
+    Raises:
+        InputError: missing, damaged, or prepared with other settings.
+    """
+    advice = advised(f"remove {folder} to prepare the scene again")
+    with advice, open_archive(folder / BANK_FILE) as file:
+        stored = file.value("made_with", dict)
+        if made_with is not None and stored != made_with:
+            raise InputError(f"was prepared with {first_difference(stored, dict(made_with))}")
+        outputs = read_output_space(file)
+        components = file.array("bank", "float32", ("M", outputs.space.channels))
+        bank = MemoryBank(
+            components=components,
+            sources=file.array("sources", "int32", (len(components), 3)),
+            mean=file.array("bank_mean", "float32", (outputs.space.channels,)),
+            **{name: file.value(name, float, int) for name in ("threshold", "coverage", "cosine")},
+            space=outputs.space,
+        )
+    return MemoryScene(prepared=PreparedScene(folder / SCENE_FILE), outputs=outputs, bank=bank)
+
+
+def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, made_with: Mapping[str, Any]) -> None:
+    arrays, header = output_space_parts(outputs)
+    arrays |= {"bank": bank.components, "sources": bank.sources, "bank_mean": bank.mean}
+    figures = {name: getattr(bank, name) for name in ("threshold", "coverage", "cosine")}
+    write_archive(path, arrays, {**header, **figures, "made_with": dict(made_with)})
+
+
+def _made_with(scene: Scene, teacher: Teacher, config: MemorySourceConfig) -> dict[str, Any]:
+    """What a preparation depends on, as JSON values."""
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    made_with = {
+        "gaussians": fingerprint(scene.gaussians)[:16],
+        "views": list(scene.views.names),
+        "teacher": teacher.settings(),
+        "bank": plain(config.bank),
+        "prepare": plain(config.prepare),
+    }
+    return dict(json.loads(json.dumps(made_with, default=str)))
+
+
+def _spread(features: GaussianFeatures) -> float:
+    """The root mean square distance of seen features from the mean."""
+    seen = np.flatnonzero(features.seen)
+    total = 0.0
+    for start in range(0, len(seen), 1 << 14):
+        rows = features.stored(seen[start : start + (1 << 14)])
+        centered = rows if features.basis is not None else rows - features.mean
+        total += float(np.einsum("nc,nc->", centered, centered, dtype=np.float64))
+    # Equal features have no spread; any unit does for them.
+    return float(np.sqrt(total / len(seen))) or 1.0
