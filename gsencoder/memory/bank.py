@@ -27,6 +27,8 @@ SAMPLE = 20_000
 """Features among which a threshold is searched for a mean cosine."""
 MIN_RELATIVE_NORM = 1e-3
 """Share of the mean's length below which a centered feature is rounding, not direction."""
+SAME_KIND_COSINE = 0.95
+"""Features within this of another one are of its kind."""
 COPIES = 6
 """How many times a bank is in memory while it is made."""
 
@@ -52,8 +54,8 @@ class BankConfig:
     cosine: float = field(
         default=0.9,
         metadata={
-            "help": "mean cosine of features with their nearest component that the threshold is chosen for, unless "
-            "threshold= or components= is given"
+            "help": "mean cosine with the nearest component that the threshold is chosen for, over features and over "
+            "kinds of features, unless threshold= or components= is given"
         },
     )
     threshold: float = field(
@@ -179,7 +181,11 @@ class _Builder:
         sample = self._sample()
         if not len(sample):
             return 1.0
-        return 1 - largest_threshold(lambda each: _mean_cosine(sample, 1 - each) >= config.cosine)
+        # A feature that few cells have counts little in a mean over all of them, and as much as others among kinds.
+        kinds = sample[_cover_of(sample, SAME_KIND_COSINE).rows]
+        return 1 - largest_threshold(
+            lambda each: _mean_cosine(sample, _cover_of(sample, 1 - each), kinds) >= config.cosine
+        )
 
     def _has_undirected(self) -> bool:
         return any(not directed.all() for _, _, directed in self._rows())
@@ -299,14 +305,20 @@ def raw_features(view: int, feature_map: FeatureMap) -> tuple[Float32[np.ndarray
     return rows, np.stack([np.full(len(cells), view), line, column], axis=1).astype(np.int32)
 
 
-def _mean_cosine(sample: Float32[np.ndarray, "n D"], threshold: float) -> float:
-    """The mean cosine of a sample's features with the nearest component of its cover."""
-    cover = CoverReduction(sample.shape[1], threshold)
-    cover.add(sample)
-    parts = [
-        (unit_rows(sample[start : start + BLOCK]) @ cover.unit.T).max(axis=1) for start in range(0, len(sample), BLOCK)
-    ]
-    return float(np.concatenate(parts).mean(dtype=np.float64))
+def _cover_of(rows: Float32[np.ndarray, "n D"], threshold: float) -> CoverReduction:
+    cover = CoverReduction(rows.shape[1], threshold)
+    cover.add(rows)
+    return cover
+
+
+def _mean_cosine(sample: Float32[np.ndarray, "n D"], cover: CoverReduction, kinds: Float32[np.ndarray, "k D"]) -> float:
+    """The mean cosine with the nearest component, over a sample of features or over their kinds: the smaller one."""
+
+    def mean(rows: Float32[np.ndarray, "n D"]) -> float:
+        blocks = [unit_rows(rows[start : start + BLOCK]) for start in range(0, len(rows), BLOCK)]
+        return float(np.concatenate([(block @ cover.unit.T).max(axis=1) for block in blocks]).mean(dtype=np.float64))
+
+    return min(mean(sample), mean(kinds))
 
 
 def _most_used(counts: Int64[np.ndarray, " M"], share: float) -> Int64[np.ndarray, " m"]:

@@ -95,8 +95,9 @@ class ViewSamples(Dataset[MemoryBatch]):
             rows = tuple(
                 sample_rows(
                     scene.view(view),
-                    config.points,
+                    scene.weights > 0,
                     config.min_alpha,
+                    config.points,
                     np.random.default_rng([self._seed, 1, number]),
                 )
                 for scene in self._scenes.values()

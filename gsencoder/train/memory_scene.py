@@ -6,7 +6,7 @@ continues with the maps and sums of its fusion.
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +29,6 @@ from gsencoder.train.prepared_scene import PreparedScene, write_prepared
 from gsencoder.types import FeatureMap, GaussianFeatures, MemoryBank, Scene
 
 BANK_FILE, SCENE_FILE, MAPS_FOLDER = "bank.safetensors", "scene.safetensors", "maps"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MemorySourceConfig:
-    """What a memory is made from."""
-
-    bank: BankConfig = field(default_factory=BankConfig)
-    prepare: PrepareConfig = field(default_factory=PrepareConfig)
-
-    def __post_init__(self) -> None:
-        if not (self.prepare.center and self.prepare.scale):
-            raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,27 +54,37 @@ class MemoryScene:
 
 
 def prepare_memory(
-    scene: Scene, teacher: Teacher, config: MemorySourceConfig, folder: Path, *, track: Track = untracked
+    scene: Scene,
+    teacher: Teacher,
+    folder: Path,
+    bank: BankConfig = BankConfig(),
+    prepare: PrepareConfig = PrepareConfig(),
+    *,
+    track: Track = untracked,
 ) -> MemoryScene:
     """Prepares a scene for one teacher, or opens what was prepared in this folder before.
 
     Args:
         scene: with Gaussians and views.
         teacher: whose features are remembered.
-        config: of the bank, the fusion and the rows.
         folder: created if it does not exist.
+        bank: how the bank is made.
+        prepare: settings of the fusion and of the rows.
         track: wraps loops to show progress.
 
     Raises:
-        InputError: the scene cannot be fused, the bank cannot be made, or the folder was prepared with other settings.
+        InputError: features that are not standardized, a scene that cannot be fused, a bank that cannot be made, or a
+            folder that was prepared with other settings.
     """
-    made_with = _made_with(scene, teacher, config)
+    if not (prepare.center and prepare.scale):
+        raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
+    made_with = _made_with(scene, teacher, bank, prepare)
     if (folder / BANK_FILE).is_file():
         return open_memory_scene(folder, made_with)
     assert scene.views is not None
     maps = folder / MAPS_FOLDER
     with advised(f"remove {folder} to prepare the scene again"):
-        fusion = replace(config.prepare.fusion, views=0)
+        fusion = replace(prepare.fusion, views=0)
         fused = fuse(scene, teacher, fusion, work=None if teacher.cheap else maps, track=track)
         features = fused.features
         outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
@@ -97,11 +95,11 @@ def prepare_memory(
             for view in range(count):
                 yield view, source.feature_map(views, view)
 
-        bank = build_bank(stream, features.space, features.mean, config.bank)
-        rows = view_rows(scene, source, outputs, config.prepare)
+        components = build_bank(stream, features.space, features.mean, bank)
+        rows = view_rows(scene, source, outputs, prepare)
     folder.mkdir(parents=True, exist_ok=True)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())
-    _write_bank(folder / BANK_FILE, bank, outputs, made_with)
+    _write_bank(folder / BANK_FILE, components, outputs, made_with)
     return open_memory_scene(folder, made_with)
 
 
@@ -139,7 +137,7 @@ def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, made_with: M
     write_archive(path, arrays, {**header, **figures, "made_with": dict(made_with)})
 
 
-def _made_with(scene: Scene, teacher: Teacher, config: MemorySourceConfig) -> dict[str, Any]:
+def _made_with(scene: Scene, teacher: Teacher, bank: BankConfig, prepare: PrepareConfig) -> dict[str, Any]:
     """What a preparation depends on, as JSON values."""
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -147,8 +145,8 @@ def _made_with(scene: Scene, teacher: Teacher, config: MemorySourceConfig) -> di
         "gaussians": fingerprint(scene.gaussians)[:16],
         "views": list(scene.views.names),
         "teacher": teacher.settings(),
-        "bank": plain(config.bank),
-        "prepare": plain(config.prepare),
+        "bank": plain(bank),
+        "prepare": plain(prepare),
     }
     return dict(json.loads(json.dumps(made_with, default=str)))
 

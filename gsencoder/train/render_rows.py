@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from gsencoder.render import Blend, BlendConfig
@@ -87,24 +87,34 @@ def _row_sums(values: np.ndarray, crow: np.ndarray) -> np.ndarray:
     return np.where(np.diff(crow) > 0, total, 0)
 
 
-def sample_rows(view: ViewRows, count: int, min_alpha: float, rng: np.random.Generator) -> RenderRows:
-    """Draws rows of a view at random, all with the weight 1, among those with a vector and an alpha of `min_alpha`.
+def sample_rows(
+    view: ViewRows,
+    seen: Bool[np.ndarray, " N"],
+    min_alpha: float,
+    count: int = 0,
+    rng: np.random.Generator | None = None,
+) -> RenderRows:
+    """Rows of a view over the Gaussians that were seen, all with the weight 1: those with a vector and an alpha of
+    `min_alpha` or more.
 
     Args:
         view: rows over all Gaussians.
-        count: largest number of rows.
-        min_alpha: smallest opacity of a row.
+        seen: the Gaussians that take part.
+        min_alpha: smallest sum of the weights of a row.
+        count: number of rows that are drawn at random; 0 = all of them.
         rng: source of random numbers.
     """
-    usable = np.flatnonzero(view.valid & (_row_sums(view.weight, view.crow) >= min_alpha))
-    chosen = usable if len(usable) <= count else np.sort(rng.choice(usable, count, replace=False))
+    weight = np.where(seen[view.col], view.weight, np.float32(0))
+    chosen = np.flatnonzero(view.valid & (_row_sums(weight, view.crow) >= min_alpha))
+    if rng is not None and 0 < count < len(chosen):
+        chosen = np.sort(rng.choice(chosen, count, replace=False))
     counts = np.diff(view.crow)[chosen]
     crow = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
     entries = np.arange(crow[-1]) + np.repeat(view.crow[:-1][chosen] - crow[:-1], counts)
     return RenderRows(
         crow=torch.from_numpy(crow),
         col=torch.from_numpy(view.col[entries]),
-        weight=torch.from_numpy(view.weight[entries]),
+        weight=torch.from_numpy(weight[entries]),
         targets=torch.from_numpy(view.targets[chosen]),
         row_weights=torch.ones(len(chosen)),
     )

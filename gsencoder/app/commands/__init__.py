@@ -42,6 +42,11 @@ COMMANDS = {
         Command(
             name="fuse", config="FuseCommandConfig", help="lift a teacher's feature maps onto the Gaussians of a scene"
         ),
+        Command(
+            name="memory",
+            config="MemoryCommandConfig",
+            help="remember the features of several teachers in a few channels a Gaussian, and a bank",
+        ),
         Command(name="train", config="TrainCommandConfig", help="distil a teacher into an encoder of splats"),
         Command(
             name="encode", config="EncodeCommandConfig", help="compute features of a splat with an encoder, in one pass"

@@ -8,24 +8,23 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.app.commands.basis_figures import describe_basis
+from gsencoder.app.commands.fusable_scene import load_fusable
 from gsencoder.app.commands.head_figures import describe_heads, head_figures
-from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
-from gsencoder.data.check.scene_check import warn_of_faults
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
-from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.heads.measure import measure_heads
 from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import save_heads
-from gsencoder.fusion.orbit_views import INSIDE, CamerasOfSplat, check_orbits, with_views
+from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
 from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.teachers import Teacher
@@ -82,7 +81,18 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
 
     def run_one(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
-            scene = load_fusable(path, config, one)
+            scene = load_fusable(
+                path,
+                one,
+                splat=config.splat,
+                data=config.data,
+                seeds=config.seeds,
+                orbits=config.orbits,
+                cameras=config.cameras,
+                blend=config.fusion.blend,
+                labels=isinstance(config.teacher, LabelsConfig),
+                quiet=config.quiet,
+            )
             with one.step("teacher"):
                 teacher = build_teacher(config.teacher, scene, words)
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
@@ -135,32 +145,6 @@ def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> Featu
     if basis is None:
         raise InputError(f"basis: the encoder of {weights} gives all channels; leave basis= out, or give other weights")
     return basis
-
-
-def load_fusable(path: Path, config: FuseCommandConfig, summary: Summary) -> Scene:
-    """Loads a scene with Gaussians and views: seeds if it has no splat, orbit cameras if it has no views."""
-    with summary.step("load"):
-        scene = load_scene(path, splat=config.splat or None, options=config.data)
-    with summary.step("check"):
-        warn_of_faults(scene)
-    if scene.views is None and isinstance(config.teacher, LabelsConfig):
-        raise InputError(
-            f"{path}: a splat without views has no labels for teacher=labels; give a teacher that looks at pictures, "
-            "such as teacher=palette, or teacher=mosaic text=minilm"
-        )
-    if scene.gaussians is None:
-        with summary.step("seeds"):
-            scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
-    scene = with_reported_up(scene, summary, quiet=config.quiet)
-    if scene.views is not None:
-        return scene
-    with summary.step("cameras"):
-        scene = with_views(scene, config.orbits, config.fusion.blend, cameras=config.cameras)
-    assert scene.views is not None
-    where = "inside" if scene.views.names[0].startswith(INSIDE) else "around"
-    summary.results["cameras"] = where
-    console(config.quiet).print(f"{scene.name}: a bare splat; rendered from {len(scene.views)} cameras {where} it")
-    return scene
 
 
 def work_folder(out: Path) -> Path:

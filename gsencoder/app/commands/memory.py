@@ -1,0 +1,190 @@
+"""`gsencoder memory SCENE teacher=…`: principal queries of Gaussians and the banks that they attend to (M3)."""
+
+from collections.abc import Mapping
+from contextlib import ExitStack, nullcontext
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsencoder.app.commands.fusable_scene import load_fusable
+from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.core.errors import InputError, about
+from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.data.scenes import find_scenes
+from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
+from gsencoder.fusion.store.folder import file_of_teacher, save_memories
+from gsencoder.fusion.store.memory_file import MEMORY_FILE
+from gsencoder.fusion.store.words import save_tables
+from gsencoder.fusion.teachers.build import build_teacher, words_beside, words_by_teacher
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.memory.bank import BankConfig
+from gsencoder.models.output_space import check_distinct
+from gsencoder.text.table import TextTable
+from gsencoder.train.distributed import fail_together, join_processes
+from gsencoder.train.memory import memory_training, train_memory, untrained_memory
+from gsencoder.train.memory_network import MemoryConfig
+from gsencoder.train.memory_scene import MemoryScene, open_memory_scene, prepare_memory
+from gsencoder.train.prepare_scenes import SourceConfig
+from gsencoder.train.render_rows import sample_rows
+from gsencoder.train.trainer import TrainerConfig
+from gsencoder.types import QueryMemory, Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MemoryCommandConfig(SourceConfig, CommonConfig):
+    """Settings of `memory`."""
+
+    paths: tuple[str, ...] = field(
+        default=(), metadata={"help": "a scene: views, or a bare splat", "metavar": "SCENE", "required": True}
+    )
+    bank: BankConfig = field(default_factory=BankConfig)
+    memory: MemoryConfig = field(default_factory=MemoryConfig)
+    train: TrainerConfig = field(default_factory=memory_training)
+    optimize: bool = field(
+        default=True, metadata={"help": "optimize the queries; false = those of the fused features, without training"}
+    )
+    joint: bool = field(
+        default=True, metadata={"help": "optimize for all teachers at once; false = for one after the other"}
+    )
+    resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
+    device: Device = field(default="auto", metadata={"help": "where queries are optimized"})
+
+    def __post_init__(self) -> None:
+        SourceConfig.__post_init__(self)
+        if len(self.paths) > 1:
+            raise InputError(f"paths: expected one scene, got {len(self.paths)}")
+        if not self.optimize and self.memory.init == "random":
+            raise InputError("optimize=false: random queries mean nothing without training; give memory.init=fused")
+
+
+def run(config: MemoryCommandConfig, summary: Summary) -> None:
+    """Prepares a scene for each teacher, optimizes its queries, and writes memories that other commands take as
+    features."""
+    retain_freed_memory()
+    (path,) = find_scenes(config.paths)
+    out = config.out or Path("outputs") / path.name / "memory"
+    words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
+    with (
+        WorkFolder(out.with_name(f"{out.name}.training")) as state,
+        join_processes(config.device) as (process, device),
+        ExitStack() as results,
+    ):
+        track = Progress(quiet=config.quiet or not process.is_first)
+        tables: dict[str, TextTable] = {}
+        folder, scene = None, None
+        with fail_together():
+            if process.is_first:
+                folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
+                refuse_to_replace_inputs(state.path, settings(config))
+                state.take(anew=not config.resume)
+                scene = _load(path, config, summary)
+                tables = _prepare(scene, words, config, state.path, summary, track)
+        scenes = {name: open_memory_scene(state.path / name) for name in config.teachers_by_name}
+        with summary.step("train"):
+            memories: dict[str, QueryMemory] = {}
+            groups = [list(scenes)] if config.joint else [[name] for name in scenes]
+            for names in groups if config.optimize else []:
+                work = state.path / ("queries" if config.joint else f"queries.{names[0]}")
+                work.mkdir(exist_ok=True)
+                chosen = {name: scenes[name] for name in names}
+                made, done = train_memory(
+                    chosen, config.memory, config.train, work=work, process=process, device=device, track=track
+                )
+                memories |= made
+                summary.results["steps"] = done.step
+        if folder is None or scene is None:
+            return
+        if not config.optimize:
+            memories = {name: untrained_memory(each, config.memory, config.train.seed) for name, each in scenes.items()}
+        with summary.step("score"):
+            errors = {name: fit_errors(memories[name], each, config.memory.min_alpha) for name, each in scenes.items()}
+        with summary.step("write"):
+            save_memories(folder, scene, memories, settings(config))
+            save_tables(folder, tables, memories)
+        files = {name: file_of_teacher(MEMORY_FILE, name if len(memories) > 1 else None) for name in memories}
+        figures = {name: _figures(folder / files[name], each, errors[name]) for name, each in memories.items()}
+        summary.results.update(gaussians=len(next(iter(memories.values()))), teachers=figures)
+    screen = console(config.quiet)
+    for name, each in memories.items():
+        screen.print(f"{out}: {name}: {_describe(each, errors[name], figures[name]['bytes'])}")
+
+
+def _load(path: Path, config: MemoryCommandConfig, summary: Summary) -> Scene:
+    return load_fusable(
+        path,
+        summary,
+        splat=config.splat,
+        data=config.data,
+        seeds=config.seeds,
+        orbits=config.orbits,
+        cameras=config.cameras,
+        blend=config.prepare.fusion.blend,
+        labels=any(isinstance(each, LabelsConfig) for each in config.teachers_by_name.values()),
+        quiet=config.quiet,
+    )
+
+
+def _prepare(
+    scene: Scene, words: Mapping[str, Any], config: MemoryCommandConfig, work: Path, summary: Summary, track: Progress
+) -> dict[str, TextTable]:
+    """Prepares a scene for all teachers in folders of their own; the tables of words that lead into their features."""
+    tables, spaces = {}, {}
+    for name, teacher_config in config.teachers_by_name.items():
+        with about(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
+            with summary.step("teacher"):
+                teacher = build_teacher(teacher_config, scene, words.get(name))
+            spaces[name] = teacher.space
+            check_distinct(spaces)
+            with summary.step("prepare"):
+                prepare_memory(scene, teacher, work / name, config.bank, config.prepare, track=track)
+            if (table := words_beside(teacher, words.get(name))) is not None:
+                tables[name] = table
+    return tables
+
+
+def fit_errors(memory: QueryMemory, scene: MemoryScene, min_alpha: float) -> RenderedErrors:
+    """How far the features that a memory renders in the prepared views are from the teacher's there."""
+    prepared, outputs = scene.prepared, scene.outputs
+    tally, queries = RenderedTally(memory.mean), torch.from_numpy(memory.queries)
+    for view in range(len(prepared.view_names)):
+        rows = sample_rows(prepared.view(view), memory.weights > 0, min_alpha)
+        b = rows.blend(len(memory))
+        rendered = (b.render(queries) / b.alpha[:, None]).numpy()
+        target = outputs.restore(rows.targets.numpy())
+        if outputs.basis is not None:
+            target = target @ outputs.basis.components + outputs.basis.mean
+        tally.add(memory.attend(rendered), target)
+    return tally.errors()
+
+
+def _figures(file: Path, memory: QueryMemory, errors: RenderedErrors) -> dict[str, Any]:
+    bank, seen = memory.bank, int((memory.weights > 0).sum())
+    return {
+        "space": memory.space.describe(),
+        "seen": seen,
+        "channels": memory.channels,
+        "components": len(bank),
+        "threshold": bank.threshold,
+        "coverage": bank.coverage,
+        "bank_cosine": bank.cosine,
+        "fit": asdict(errors),
+        "bytes": file.stat().st_size,
+        "query_bytes": 2 * memory.channels,
+        "features": file.name,
+    }
+
+
+def _describe(memory: QueryMemory, errors: RenderedErrors, size: int) -> str:
+    bank = memory.bank
+    return (
+        f"{len(bank):,} components within {bank.threshold:.3f} of {bank.coverage:.3f} of the features, queries of "
+        f"{memory.channels} channels for {int((memory.weights > 0).sum()):,} Gaussians, {size / 1e6:.3g} MB; rendered "
+        f"features have a cosine of {errors.cosine:.3f} with the teacher's, centered {errors.centered:.3f}"
+    )
