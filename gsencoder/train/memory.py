@@ -150,7 +150,7 @@ def _train(
     for name, scene in scenes.items():
         first, projection = first_queries(scene, config, training.seed)
         queries[name] = torch.from_numpy(first)
-        decoders[name] = _decoder_of(scene, config, kind, projection, training.seed)
+        decoders[name] = _decoder_of(scene, config, kind, first, projection, training.seed)
     settings = {
         "memory": plain(config),
         "train": {name: value for name, value in plain(training).items() if name not in CHANGEABLE_ON_RESUME},
@@ -177,21 +177,27 @@ def _train(
 
 
 def _decoder_of(
-    scene: MemoryScene, config: MemoryConfig, kind: Decoder | None, projection: np.ndarray, seed: int
+    scene: MemoryScene,
+    config: MemoryConfig,
+    kind: Decoder | None,
+    queries: Float32[np.ndarray, "N s"],
+    projection: Float32[np.ndarray, "s D"],
+    seed: int,
 ) -> nn.Module:
-    values = torch.from_numpy(scene.values)
+    """What turns queries into features in standard units, before the training."""
     if kind is None:
         return MemoryAttention(
             scene.bank,
             torch.from_numpy(projection),
             scoring=config.scoring,
             temperature=config.temperature,
-            values=values,
+            values=torch.from_numpy(scene.values),
         )
-    outputs = scene.outputs
-    in_columns = projection if outputs.basis is None else projection @ outputs.basis.components.T
-    generator = torch.Generator().manual_seed(seed)
-    return make_decoder(kind, torch.from_numpy(in_columns), generator=generator)
+    # A linear decoder begins as the least squares from the first queries to the fused features.
+    seen = np.flatnonzero(scene.prepared.weights)
+    targets, chosen = scene.prepared.targets(seen), queries[seen].astype(np.float64)
+    weights = np.linalg.lstsq(chosen.T @ chosen, chosen.T @ targets, rcond=None)[0].astype(np.float32)
+    return make_decoder(kind, torch.from_numpy(weights), generator=torch.Generator().manual_seed(seed))
 
 
 def _memory_of(
