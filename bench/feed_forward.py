@@ -110,7 +110,8 @@ def main() -> None:
         scored = naming_scores([counts for counts, _ in rows])
         spent = f"{np.mean(seconds[key]):.2f}" if key in seconds else ""
         cosine = np.nanmean([counts.cosine for counts, _ in rows])
-        print(f"| {key} | {scored['accuracy_named']:.3f} | {cosine:.3f} | {np.mean([size for _, size in rows]):.0f} | {spent} |")
+        size = np.mean([size for _, size in rows])
+        print(f"| {key} | {scored['accuracy_named']:.3f} | {cosine:.3f} | {size:.0f} | {spent} |")
 
 
 if __name__ == "__main__":

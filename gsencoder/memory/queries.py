@@ -1,4 +1,4 @@
-"""Queries without training: the coordinates of features in their principal directions.
+"""Queries without training: the coordinates of features in the principal directions of a bank.
 
 The features may be fused, which gives queries to start an optimization from, or predicted by an encoder, which gives
 the memory of a scene that nothing was optimized for.
@@ -11,16 +11,20 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.types import GaussianFeatures, MemoryBank, QueryMemory
-from gsencoder.types.memory import Scoring
+from gsencoder.types.memory import Scoring, attention_keys
 
 BLOCK = 1 << 14
 """Rows that are taken at a time."""
 
 
 def principal_queries(
-    features: GaussianFeatures, channels: int, scoring: Scoring = "centered"
+    features: GaussianFeatures, bank: MemoryBank, channels: int, scoring: Scoring = "centered"
 ) -> tuple[Float32[np.ndarray, "N s"], Float32[np.ndarray, "s D"]]:
-    """Queries and a projection W_m whose product is nearest to features about their mean, in least squares.
+    """Queries and a projection W_m whose product is the features about their mean, in the s directions in which the
+    components of the bank differ most.
+
+    Each component counts once, by its direction about the mean: where many Gaussians are walls, the principal
+    directions of the Gaussians' features would leave out those that tell a mug from a cup.
 
     A cosine that is not centered depends on the mean as well, whose coordinate, the first one, is 1 for every Gaussian.
     With cosines queries have unit variance and rows of the projection the length √D, so that one learning rate serves
@@ -28,31 +32,33 @@ def principal_queries(
 
     Args:
         features: of the Gaussians; those never seen have queries of zero.
-        channels: s. Where the features have fewer directions, further channels are zero.
+        bank: that the queries will attend to.
+        channels: s. Where the components have fewer directions, further channels are zero.
         scoring: how queries will be compared with components.
 
     Raises:
-        InputError: no Gaussian has features.
+        InputError: features and bank are of different spaces, or no Gaussian has features.
     """
+    if features.space != bank.space:
+        raise InputError(
+            f"memory: the features are of ({features.space.describe()}), and the bank is of ({bank.space.describe()})"
+        )
     seen = np.flatnonzero(features.seen)
     if not len(seen):
         raise InputError("memory: no Gaussian has features")
     basis, space = features.basis, features.space
-    width = features.features.shape[1]
-    offset = features.mean if basis is None else np.zeros(width, np.float32)
-    moment = np.zeros((width, width))
-    for start in range(0, len(seen), BLOCK):
-        rows = features.stored(seen[start : start + BLOCK]) - offset
-        moment += rows.T @ rows
+    offset = features.mean if basis is None else np.zeros(basis.rank, np.float32)
     constant = int(scoring != "centered")
-    rank = max(0, min(channels - constant, width))
-    directions = np.linalg.eigh(moment)[1][:, ::-1][:, :rank].astype(np.float32)
+    keys = attention_keys(bank.components, features.mean, "centered").astype(np.float64)
+    if basis is not None:
+        keys = keys @ basis.components.T
+    directions = np.linalg.eigh(keys.T @ keys)[1][:, ::-1][:, : max(0, channels - constant)].astype(np.float32)
+    part = slice(constant, constant + directions.shape[1])
     queries = np.zeros((len(features), channels), np.float32)
-    projection = np.zeros((channels, space.channels), np.float32)
-    part = slice(constant, constant + rank)
     for start in range(0, len(seen), BLOCK):
         chunk = seen[start : start + BLOCK]
         queries[chunk, part] = (features.stored(chunk) - offset) @ directions
+    projection = np.zeros((channels, space.channels), np.float32)
     projection[part] = directions.T if basis is None else directions.T @ basis.components
     if constant:
         queries[seen, 0], projection[0] = 1, features.mean
@@ -82,11 +88,7 @@ def memory_of_features(
     Raises:
         InputError: features and bank are of different spaces, or no Gaussian has features.
     """
-    if features.space != bank.space:
-        raise InputError(
-            f"memory: the features are of ({features.space.describe()}), and the bank is of ({bank.space.describe()})"
-        )
-    queries, projection = principal_queries(features, channels, scoring)
+    queries, projection = principal_queries(features, bank, channels, scoring)
     return QueryMemory(
         queries=queries,
         weights=features.weights,

@@ -37,7 +37,7 @@ def first_queries(
 ) -> tuple[Float32[np.ndarray, "N s"], Float32[np.ndarray, "s D"]]:
     """Queries and projection before the training: those of the fused features, or random ones."""
     if config.init == "fused":
-        return principal_queries(scene.fused_features(), config.channels, config.scoring)
+        return principal_queries(scene.fused_features(), scene.bank, config.channels, config.scoring)
     channels, generator = scene.outputs.space.channels, torch.Generator().manual_seed(seed)
     projection = random_projection(config.channels, channels, generator)
     if config.scoring != "dot":

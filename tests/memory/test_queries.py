@@ -30,7 +30,7 @@ def bank_of(features: GaussianFeatures, scoring: Scoring = "centered") -> Memory
 @pytest.mark.parametrize("scoring", ["centered", "cosine", "dot"])
 def test_queries_of_all_directions_stand_for_the_features(basis: bool, scoring: Scoring) -> None:
     features = make_features(basis=basis)
-    queries, projection = principal_queries(features, 13, scoring)
+    queries, projection = principal_queries(features, bank_of(features), 13, scoring)
     seen = features.seen
     np.testing.assert_array_equal(queries[~seen], 0)
     products = queries[seen].astype(np.float64) @ projection
@@ -43,17 +43,32 @@ def test_queries_of_all_directions_stand_for_the_features(basis: bool, scoring: 
         assert queries[seen].std() == pytest.approx(1, abs=1e-5)
 
 
-def test_fewer_channels_keep_the_directions_with_the_most_energy() -> None:
+def test_fewer_channels_keep_the_directions_in_which_the_components_differ_most() -> None:
     features = make_features(basis=False)
-    seen = features.seen
-    centered = (features.features[seen] - features.mean).astype(np.float64)
-    values = np.linalg.eigvalsh(centered.T @ centered)[::-1]
+    bank = bank_of(features)
+    keys = (bank.components - features.mean).astype(np.float64)
+    keys /= np.linalg.norm(keys, axis=1, keepdims=True)
+    values = np.linalg.eigvalsh(keys.T @ keys)[::-1]
     for channels in (1, 3, 6):
-        queries, projection = principal_queries(features, channels)
+        queries, projection = principal_queries(features, bank, channels)
         unit = projection / np.linalg.norm(projection, axis=1, keepdims=True)
-        kept = ((centered @ unit.T) ** 2).sum()
-        assert kept == pytest.approx(values[:channels].sum(), rel=1e-5)
+        assert ((keys @ unit.T) ** 2).sum() == pytest.approx(values[:channels].sum(), rel=1e-5)
         assert queries.shape == (3000, channels)
+
+
+def test_rare_kinds_are_told_apart_where_most_gaussians_are_of_one_kind() -> None:
+    rng = np.random.default_rng(0)
+    kinds = np.linalg.qr(rng.normal(size=(12, 6)))[0].T.astype(np.float32)
+    features = make_features(basis=False)
+    number = np.where(rng.random(3000) < 0.99, 0, rng.integers(0, 6, 3000))
+    values = features.mean + kinds[number] + 0.3 * rng.normal(size=(3000, 1)).astype(np.float32) * kinds[0]
+    values[~features.seen] = 0
+    features = replace(features, features=values.astype(np.float32))
+    bank = replace(bank_of(features), components=features.mean + kinds, sources=np.zeros((6, 3), np.int32))
+    memory = memory_of_features(features, bank, channels=5)
+    seen = np.flatnonzero(features.seen)
+    nearest = memory.attention(memory.queries[seen]).argmax(axis=1)
+    assert (nearest == number[seen])[number[seen] > 0].mean() > 0.95
 
 
 @pytest.mark.parametrize("scoring", ["centered", "cosine"])
@@ -74,7 +89,7 @@ def test_an_index_is_taken_as_the_features_that_it_stands_for() -> None:
     full = np.full(len(features), -1, np.int32)
     full[seen] = index
     indexed = replace(features, features=table, index=full)
-    one, other = (principal_queries(each, 4) for each in (features, indexed))
+    one, other = (principal_queries(each, bank_of(features), 4) for each in (features, indexed))
     np.testing.assert_allclose(np.abs(one[0]), np.abs(other[0]), atol=1e-4)
 
 
@@ -82,7 +97,7 @@ def test_equal_features_have_finite_queries() -> None:
     features = make_features(basis=False)
     equal = replace(features, features=np.repeat(features.mean[None], len(features), axis=0))
     for scoring in ("centered", "cosine", "dot"):
-        queries, projection = principal_queries(equal, 4, scoring)  # type: ignore[arg-type]
+        queries, projection = principal_queries(equal, bank_of(features), 4, scoring)  # type: ignore[arg-type]
         assert np.isfinite(queries).all()
         assert np.isfinite(projection).all()
 
