@@ -215,7 +215,7 @@ def _sheet(
     write(
         (left, GAP), f"… attends most to these {len(tiles)} of {len(bank):,} {kinds}: {total:.1f} % together", room, 19
     )
-    write((left, GAP + 28), "outlined: the cell that the component is the feature of", room, 15, FAINT)
+    write((left, GAP + 28), "outlined: the cell whose feature the component is; enlarged in the corner", room, 15, FAINT)
     for number, (tile, where, cell) in enumerate(tiles):
         row, column = divmod(number, columns)
         at_x, at_y = left + column * (TILE_SIDE + GAP), HEAD + row * block

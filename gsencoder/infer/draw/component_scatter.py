@@ -19,6 +19,7 @@ RAW_COLOR, COMPONENT_COLOR = "#5b8db8", "#d62728"
 UMAP_LEAST = 10
 """Fewer features have no neighborhoods that UMAP could keep."""
 UMAP_NEIGHBORS = 15
+LONGEST_NAME = 60
 
 
 def check_umap() -> None:
@@ -167,10 +168,11 @@ def _dots(axes: "Axes", raw: Float[np.ndarray, "n 2"], components: Float[np.ndar
 
 
 def _title(bank: MemoryBank, sample: RawSample) -> list[str]:
-    drawn = len(sample.features)
-    shown = "" if drawn == sample.total else f" ({drawn:,} of them are drawn)"
+    name, drawn = bank.space.name, len(sample.features)
+    shown = "" if drawn == sample.total else f", of which {drawn:,} are drawn"
     return [
-        f"{bank.space.name}: {len(bank):,} {'component' if len(bank) == 1 else 'components'} for {sample.total:,} "
+        name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…",
+        f"{len(bank):,} {'component' if len(bank) == 1 else 'components'} for {sample.total:,} "
         f"raw {'feature' if sample.total == 1 else 'features'}{shown}",
         f"{100 * bank.coverage:.1f} % of the raw features have a component within the threshold, "
         f"a cosine of {bank.threshold:.3f}",
