@@ -54,6 +54,17 @@ class MemoryScene:
         rows = self.bank.components if basis is None else to_coordinates(basis, self.bank.components)
         return self.outputs.standardize(rows)
 
+    def fused_features(self) -> GaussianFeatures:
+        """The fused features, as they were stored."""
+        prepared, outputs = self.prepared, self.outputs
+        rows = np.arange(len(prepared))
+        restored = outputs.restore(prepared.targets(rows))
+        weights = np.array(prepared.weights)
+        restored[weights == 0] = 0
+        return GaussianFeatures(
+            features=restored, weights=weights, mean=outputs.mean, space=outputs.space, basis=outputs.basis
+        )
+
 
 def prepare_memory(
     scene: Scene,

@@ -215,7 +215,8 @@ def _sheet(
     write(
         (left, GAP), f"… attends most to these {len(tiles)} of {len(bank):,} {kinds}: {total:.1f} % together", room, 19
     )
-    write((left, GAP + 28), "outlined: the cell whose feature the component is; enlarged in the corner", room, 15, FAINT)
+    legend = "outlined: the cell whose feature the component is; enlarged in the corner"
+    write((left, GAP + 28), legend, room, 15, FAINT)
     for number, (tile, where, cell) in enumerate(tiles):
         row, column = divmod(number, columns)
         at_x, at_y = left + column * (TILE_SIDE + GAP), HEAD + row * block
