@@ -24,8 +24,8 @@ CLOSE_CELLS = 3.0
 LEAST_OUTLINE = 7.0
 """Cells smaller than this many pixels of the picture are outlined as if they were this large."""
 GAP, HEAD, CAPTION, BAR = 18, 74, 54, 8
-LEAST_RIGHT = 620
-"""Smallest width of the right part, in which its heading is."""
+LEAST_LEFT, LEAST_RIGHT = 520, 620
+"""Smallest widths of the two parts, which hold their headings."""
 EMPTY_BAR, FULL_BAR = (226, 228, 232), (230, 160, 0)
 
 
@@ -196,13 +196,14 @@ def _sheet(
     columns = min(3, len(tiles))
     block = max(tile.shape[0] for tile, _, _ in tiles) + BAR + CAPTION
     rows = -(-len(tiles) // columns)
-    left, view_width = 3 * GAP + view.shape[1], view.shape[1]
+    view_width = max(view.shape[1], LEAST_LEFT)
+    left = 3 * GAP + view_width
     width = left + max(columns * (TILE_SIDE + GAP), LEAST_RIGHT)
     height = HEAD + max(view.shape[0] + CAPTION, rows * block)
     sheet = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(sheet)
 
-    def write(at: tuple[float, float], text: str, room: int, size: int, color: tuple[int, int, int] = INK) -> None:
+    def write(at: tuple[int, int], text: str, room: int, size: int, color: tuple[int, int, int] = INK) -> None:
         draw.text(at, fit_text(draw, text, room, size), fill=color, font=label_font(size))
 
     (x, y), total = found.pixel, 100 * float(found.weights.sum())

@@ -53,7 +53,7 @@ def strongest_components(
         pixel: its column x and row y.
         count: at most so many components.
         config: accuracy of the rendering, where the blend must be made.
-        blended: the view's pixel blend where it has been made already; None = one of this pixel is made.
+        blended: the view's pixel blend, where it has been made already.
 
     Raises:
         InputError: no such pixel, nothing with a query is seen in it, a count below 1, or a memory of other Gaussians.
@@ -64,14 +64,9 @@ def strongest_components(
         raise InputError(f"pixel ({x}, {y}): expected a column from 0 to {width - 1} and a row from 0 to {height - 1}")
     if count < 1:
         raise InputError(f"count: expected 1 component or more, got {count}")
-    if blended is None:
-        # A camera of this pixel alone has its ray.
-        K = cameras.Ks[view] - np.array([[0, 0, x], [0, 0, y], [0, 0, 0]], np.float32)
-        one = np.ones(1, np.int32)
-        alone = Cameras(cam_from_world=cameras.cam_from_world[[view]], Ks=K[None], widths=one, heights=one)
-        queries, alpha = render_queries(memory, blend(gaussians, alone, 0, config=config))
-    else:
-        queries, alpha = (rows[[y * width + x]] for rows in render_queries(memory, blended))
+    # A camera of this pixel alone would see Gaussians at its rim linearized elsewhere.
+    b = blend(gaussians, cameras, view, config=config) if blended is None else blended
+    queries, alpha = (rows[[y * width + x]] for rows in render_queries(memory, b))
     if not alpha[0] > 0:
         raise InputError(
             f"pixel ({x}, {y}): no Gaussian with a query is seen in this pixel of view {view}; choose a pixel in which "
