@@ -14,7 +14,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, about, advised
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
@@ -131,7 +131,8 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
             save_memories(folder, scene, memories, settings(config))
             save_tables(folder, tables, memories)
         if config.pictures:
-            with summary.step("pictures"):
+            advice = "give pictures=0 to write the memory without pictures"
+            with summary.step("pictures"), advised(advice):
                 for name, memory in memories.items():
                     _draw(folder, scene, name, memory, open_raw_sample(state.path / name), config)
         files = {name: file_of_teacher(MEMORY_FILE, name if len(memories) > 1 else None) for name in memories}

@@ -1,14 +1,16 @@
-"""Pictures that `gsencoder memory` writes: of scenes with photographs, with labels alone, and of bare splats."""
+"""Pictures that `gsencoder memory` writes: of scenes with photographs and of bare splats."""
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
 from command_runs import refusal
 from PIL import Image
+from rooms import room as furnished_room
 
 from gsencoder.app import cli
+from gsencoder.core.errors import InputError
+from gsencoder.data.splats import save_splat
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 
@@ -60,22 +62,33 @@ def test_without_pictures_no_raw_features_are_kept_and_nothing_is_drawn(
     assert (out / "memory.safetensors").is_file()
 
 
-def test_labels_without_photographs_and_bare_splats_are_drawn(room: Path, tmp_path: Path) -> None:
-    labels = tmp_path / "labels"
-    shutil.copytree(room, labels)
-    listed = json.loads((labels / "transforms.json").read_text())
-    for frame in listed["frames"]:
-        (labels / frame.pop("file_path")).unlink()
-    (labels / "transforms.json").write_text(json.dumps(listed))
-    out = f"out={tmp_path / 'of_labels'}"
-    assert cli.main(["memory", str(labels), "teacher=labels", "pictures=1", out, *QUICK]) == 0
-    assert list(pictures_in(tmp_path / "of_labels")) == ["attention.labels.view000.png", "components.labels.png"]
+def test_a_bare_splat_is_drawn_by_its_renders(tmp_path: Path) -> None:
+    scene, _ = furnished_room()
+    assert scene.gaussians is not None
+    save_splat(tmp_path / "room.ply", scene.gaussians)
     out = f"out={tmp_path / 'of_splat'}"
-    splat = [str(room / "splat.ply"), "teacher=palette", "orbits=4", "pictures=2"]
+    splat = [str(tmp_path / "room.ply"), "teacher=palette", "orbits=3", "pictures=2"]
     assert cli.main(["memory", *splat, out, *QUICK]) == 0
-    drawn = list(pictures_in(tmp_path / "of_splat"))
-    assert "components.palette.png" in drawn
-    assert len(drawn) > 1
+    assert list(pictures_in(tmp_path / "of_splat")) == [
+        "attention.palette.view000.png",
+        "attention.palette.view002.png",
+        "components.palette.png",
+    ]
+
+
+def test_a_run_whose_pictures_cannot_be_drawn_says_how_to_go_on(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(*arguments: object, **settings: object) -> None:
+        raise InputError("000.png: cannot be decoded")
+
+    words = ["memory", str(room), "teacher=palette", f"out={tmp_path / 'out'}", *QUICK[1:]]
+    monkeypatch.setattr("gsencoder.infer.draw.attention_pictures.attention_picture", damaged)
+    line = refusal(capsys, *words)
+    assert line == "error: 000.png: cannot be decoded; give pictures=0 to write the memory without pictures"
+    monkeypatch.setattr("gsencoder.train.memory_scene.fuse", damaged)
+    assert cli.main([*words, "pictures=0", "quiet=true"]) == 0
+    assert (tmp_path / "out" / "memory.safetensors").is_file()
 
 
 def test_options_of_pictures_that_cannot_be_are_refused(
