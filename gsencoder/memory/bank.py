@@ -27,6 +27,8 @@ SAMPLE = 20_000
 """Features among which a threshold is searched for a mean cosine."""
 MIN_RELATIVE_NORM = 1e-3
 """Share of the mean's length below which a centered feature is rounding, not direction."""
+MAX_NAMES = 1000
+"""Up to so many vectors of coded maps are all components, unless another number or threshold is asked for."""
 SAME_KIND_COSINE = 0.95
 """Features within this of another one are of its kind."""
 COPIES = 6
@@ -55,7 +57,7 @@ class BankConfig:
         default=0.9,
         metadata={
             "help": "mean cosine with the nearest component that the threshold is chosen for, over features and over "
-            "kinds of features, unless threshold= or components= is given"
+            "kinds of features, unless threshold= or components= is given; names and captions are all components"
         },
     )
     threshold: float = field(
@@ -184,11 +186,17 @@ class _Builder:
         sample = self._sample()
         if not len(sample):
             return 1.0
+        if self._is_coded() and len(np.unique(sample, axis=0)) <= MAX_NAMES:
+            # The vectors are names or captions, and none of these may stand for another one.
+            return 1.0
         # A feature that few cells have counts little in a mean over all of them, and as much as others among kinds.
         kinds = sample[_cover_of(sample, SAME_KIND_COSINE).rows]
         return 1 - largest_threshold(
             lambda each: _mean_cosine(sample, _cover_of(sample, 1 - each), kinds) >= config.cosine
         )
+
+    def _is_coded(self) -> bool:
+        return all(feature_map.codes is not None for _, feature_map in self._maps())
 
     def _has_undirected(self) -> bool:
         return any(not directed.all() for _, _, directed in self._rows())

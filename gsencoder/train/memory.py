@@ -29,7 +29,7 @@ CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_ev
 
 def memory_training() -> TrainerConfig:
     """The training loop's settings for memories."""
-    return TrainerConfig(steps=600, learning_rate=0.005, warmup=50, weight_decay=0.0, validate_every=0, log_every=10)
+    return TrainerConfig(steps=600, learning_rate=0.04, warmup=50, weight_decay=0.0, validate_every=0, log_every=10)
 
 
 def first_queries(

@@ -7,6 +7,7 @@ continues with the maps and sums of its fusion.
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,7 @@ def prepare_memory(
     bank: BankConfig = BankConfig(),
     prepare: PrepareConfig = PrepareConfig(),
     *,
+    predicted: GaussianFeatures | None = None,
     sample: int = 0,
     track: Track = untracked,
 ) -> MemoryScene:
@@ -84,6 +86,7 @@ def prepare_memory(
         folder: created if it does not exist.
         bank: how the bank is made.
         prepare: settings of the fusion and of the rows.
+        predicted: features of the teacher's space that an encoder predicts for the scene; None = they are fused.
         sample: number of raw features that are stored beside the bank for `open_raw_sample`, or all if there are fewer.
         track: wraps loops to show progress.
 
@@ -93,7 +96,12 @@ def prepare_memory(
     """
     if not (prepare.center and prepare.scale):
         raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
-    made_with = _made_with(scene, teacher, bank, prepare)
+    if predicted is not None and predicted.space != teacher.space:
+        raise InputError(
+            f"memory: the predicted features are of ({predicted.space.describe()}), and the teacher's of "
+            f"({teacher.space.describe()})"
+        )
+    made_with = _made_with(scene, teacher, bank, prepare, predicted)
     stream = _map_stream(scene, teacher, folder)
     if (folder / BANK_FILE).is_file():
         made = open_memory_scene(folder, made_with)
@@ -102,10 +110,11 @@ def prepare_memory(
     maps = folder / MAPS_FOLDER
     with advised(f"remove {folder} to prepare the scene again"):
         fusion = replace(prepare.fusion, views=0)
-        fused = fuse(scene, teacher, fusion, work=None if teacher.cheap else maps, track=track)
-        features = fused.features
+        work = None if teacher.cheap else maps
+        features = predicted or fuse(scene, teacher, fusion, work=work, track=track).features
         outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
         source = _source(teacher, folder)
+        maps.mkdir(parents=True, exist_ok=True)
         components = build_bank(stream, features.space, features.mean, bank)
         rows = view_rows(scene, source, outputs, prepare)
     folder.mkdir(parents=True, exist_ok=True)
@@ -190,7 +199,9 @@ def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, made_with: M
     write_archive(path, arrays, {**header, **figures, "made_with": dict(made_with)})
 
 
-def _made_with(scene: Scene, teacher: Teacher, bank: BankConfig, prepare: PrepareConfig) -> dict[str, Any]:
+def _made_with(
+    scene: Scene, teacher: Teacher, bank: BankConfig, prepare: PrepareConfig, predicted: GaussianFeatures | None
+) -> dict[str, Any]:
     """What a preparation depends on, as JSON values."""
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -200,6 +211,7 @@ def _made_with(scene: Scene, teacher: Teacher, bank: BankConfig, prepare: Prepar
         "teacher": teacher.settings(),
         "bank": plain(bank),
         "prepare": plain(prepare),
+        "predicted": None if predicted is None else sha256(predicted.features.tobytes()).hexdigest()[:16],
     }
     return dict(json.loads(json.dumps(made_with, default=str)))
 

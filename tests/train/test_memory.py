@@ -21,6 +21,7 @@ from gsencoder.train.memory import first_queries, memory_training, train_decoder
 from gsencoder.train.memory_network import (
     MemoryBatch,
     MemoryConfig,
+    MemoryNetwork,
     MemoryObjective,
     ViewSamples,
     join_views,
@@ -164,7 +165,7 @@ def test_two_processes_follow_the_losses_of_one(prepared: MemoryScene, tmp_path:
 
 
 def test_the_loss_is_that_of_its_definition(prepared: MemoryScene) -> None:
-    samples = ViewSamples({"a": prepared}, MemoryConfig(points=30), seed=1)
+    samples = ViewSamples({"a": prepared}, MemoryConfig(points=30, gaussian_weight=0.0), seed=1)
     batch = join_views([samples[0], samples[1]])
     assert isinstance(batch, MemoryBatch)
     assert sorted(batch.names) == ["far", "near"]
@@ -188,7 +189,7 @@ def test_the_loss_is_that_of_its_definition(prepared: MemoryScene) -> None:
 
 
 def test_an_epoch_goes_through_all_views_and_rows_are_drawn_without_repeats(prepared: MemoryScene) -> None:
-    samples = ViewSamples({"a": prepared}, MemoryConfig(points=50), seed=0)
+    samples = ViewSamples({"a": prepared}, MemoryConfig(points=50, gaussian_weight=0.0), seed=0)
     names = [samples[number].names[0] for number in range(6)]  # type: ignore[union-attr]
     for epoch in range(3):
         assert sorted(names[2 * epoch : 2 * epoch + 2]) == ["far", "near"]
@@ -198,6 +199,42 @@ def test_an_epoch_goes_through_all_views_and_rows_are_drawn_without_repeats(prep
     torch.testing.assert_close(one.rows[0].targets, again.rows[0].targets)
     rows = {row.tobytes() for row in one.rows[0].targets.numpy()}
     assert len(rows) == 50
+
+
+def test_gaussians_are_rows_with_one_entry_and_a_weight_of_their_own(prepared: MemoryScene) -> None:
+    batch = ViewSamples({"a": prepared}, MemoryConfig(points=51, gaussian_weight=0.3), seed=0)[0]
+    assert isinstance(batch, MemoryBatch)
+    rows = batch.rows[0]
+    assert rows.row_weights.tolist() == pytest.approx([1.0] * 51 + [0.3] * 26)
+    assert rows.crow.diff()[51:].tolist() == [1] * 26
+    assert rows.weight[rows.crow[51] :].tolist() == [1.0] * 26
+    chosen = rows.col[rows.crow[51] :].numpy()
+    assert len(set(chosen.tolist())) == 26
+    assert (prepared.prepared.weights[chosen] > 0).all()
+    np.testing.assert_array_equal(rows.targets[51:].numpy(), prepared.prepared.targets(chosen))
+    objective = MemoryObjective(torch.nn.Identity(), MemoryConfig(), ["a"])
+    assert objective.divisors(batch)["cosine"] == pytest.approx(51 + 0.3 * 26)
+    network = MemoryNetwork({"a": torch.zeros(400, 3)}, {"a": torch.nn.Linear(3, prepared.outputs.channels)})
+    terms = MemoryObjective(network, MemoryConfig(), ["a"])(batch)
+    lone = MemoryBatch(names=("x",), rows=(type(rows)(*(part.clone() for part in rows)),))
+    lone.rows[0].row_weights[51:] = 0
+    without = MemoryObjective(network, MemoryConfig(), ["a"])(lone)
+    bias = network.decoders[0].bias
+    expected = (bias - rows.targets[51:]).square().mean(dim=1).sum() * 0.3
+    torch.testing.assert_close(terms["l2"] - without["l2"], expected, rtol=1e-3, atol=1e-3)
+
+
+def test_training_that_compares_gaussians_keeps_their_own_features(prepared: MemoryScene, tmp_path: Path) -> None:
+    cosines = []
+    fused = prepared.fused_features()
+    for weight in (0.0, 1.0):
+        config = MemoryConfig(channels=6, init="random", gaussian_weight=weight)
+        memory = train_memory({"a": prepared}, config, LONG, work=made(tmp_path / str(weight)))[0]["a"]
+        own, truth = (each.decode(fused.seen) - fused.mean for each in (memory.features(), fused))
+        products = (own * truth).sum(axis=1)
+        cosines.append((products / np.linalg.norm(own, axis=1) / np.linalg.norm(truth, axis=1)).mean())
+    assert cosines[0] < cosines[1] - 0.02
+    assert cosines[1] > 0.9
 
 
 def test_rows_are_those_of_gaussians_that_were_seen(prepared: MemoryScene) -> None:
@@ -291,6 +328,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(prepared: MemoryScene, tmp_path
         ({"temperature": 0.0}, "temperature: expected a positive number"),
         ({"min_alpha": 0.0}, "min_alpha: expected a number in"),
         ({"cosine": -1.0}, "cosine: expected 0 or more"),
+        ({"gaussian_weight": -1.0}, "gaussian_weight: expected 0 or more"),
         ({"cosine": 0.0, "l2": 0.0}, "there would be no loss"),
     ],
 )

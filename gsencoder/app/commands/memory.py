@@ -18,12 +18,15 @@ from gsencoder.core.errors import InputError, about, advised
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
+from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
 from gsencoder.fusion.store.folder import file_of_teacher, save_memories
 from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.fusion.store.words import save_tables
 from gsencoder.fusion.teachers.build import build_teacher, words_beside, words_by_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.memory.bank import BankConfig
 from gsencoder.memory.raw_sample import RawSample
 from gsencoder.models.output_space import check_distinct
@@ -35,7 +38,7 @@ from gsencoder.train.memory_scene import MemoryScene, open_memory_scene, open_ra
 from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.train.render_rows import sample_rows
 from gsencoder.train.trainer import TrainerConfig
-from gsencoder.types import QueryMemory, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 
 DRAWN_FEATURES = 20_000
 """Raw features in a scatter plot, at most."""
@@ -51,6 +54,13 @@ class MemoryCommandConfig(SourceConfig, CommonConfig):
     bank: BankConfig = field(default_factory=BankConfig)
     memory: MemoryConfig = field(default_factory=MemoryConfig)
     train: TrainerConfig = field(default_factory=memory_training)
+    weights: str = field(
+        default="",
+        metadata={
+            "help": "an encoder whose predictions take the place of fused features; with optimize=false the memory of "
+            "an unseen scene is made in one pass; empty = features are fused"
+        },
+    )
     optimize: bool = field(
         default=True, metadata={"help": "optimize the queries; false = those of the fused features, without training"}
     )
@@ -163,6 +173,8 @@ def _prepare(
 ) -> dict[str, TextTable]:
     """Prepares a scene for all teachers in folders of their own; the tables of words that lead into their features."""
     tables, spaces = {}, {}
+    with summary.step("encode"):
+        predicted = predicted_features(scene, config) if config.weights else {}
     for name, teacher_config in config.teachers_by_name.items():
         with about(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
             with summary.step("teacher"):
@@ -170,11 +182,44 @@ def _prepare(
             spaces[name] = teacher.space
             check_distinct(spaces)
             with summary.step("prepare"):
-                count = DRAWN_FEATURES if config.pictures else 0
-                prepare_memory(scene, teacher, work / name, config.bank, config.prepare, sample=count, track=track)
+                features = in_space(predicted, teacher.space, config.weights) if config.weights else None
+                prepare_memory(
+                    scene,
+                    teacher,
+                    work / name,
+                    config.bank,
+                    config.prepare,
+                    predicted=features,
+                    sample=DRAWN_FEATURES if config.pictures else 0,
+                    track=track,
+                )
             if (table := words_beside(teacher, words.get(name))) is not None:
                 tables[name] = table
     return tables
+
+
+def predicted_features(scene: Scene, config: MemoryCommandConfig) -> dict[str, GaussianFeatures]:
+    """The features that an encoder predicts for a scene, by its teachers."""
+    assert scene.gaussians is not None
+    encoder = load_encoder(config.weights, config.device)
+    encoding = EncodeConfig(device=config.device)
+    return encoder.encode_spaces(scene.gaussians, encoding, metres_per_unit=unit_of(scene, encoder.voxel))
+
+
+def in_space(predicted: Mapping[str, GaussianFeatures], space: FeatureSpace, weights: str) -> GaussianFeatures:
+    """The predicted features of a teacher's space.
+
+    Raises:
+        InputError: the encoder gives none.
+    """
+    for features in predicted.values():
+        if features.space == space:
+            return features
+    theirs = "; ".join(each.space.describe() for each in predicted.values())
+    raise InputError(
+        f"weights: the encoder of {weights} gives features of ({theirs}), and the teacher's are of "
+        f"({space.describe()}); give weights that were trained with this teacher"
+    )
 
 
 def _draw(
