@@ -22,6 +22,7 @@ def make_memory(
     bank = MemoryBank(
         components=raw,
         sources=np.zeros((components, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (components, 1, 1)),
         mean=mean if scoring == "centered" else np.zeros_like(mean),
         threshold=0.9,
         coverage=1.0,

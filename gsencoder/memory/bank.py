@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.even_indices import even_indices
@@ -127,6 +127,7 @@ class _Builder:
         self, maps: MapStream, space: FeatureSpace, mean: Float32[np.ndarray, " D"], config: BankConfig
     ) -> None:
         self._maps, self._space, self._mean, self._config = maps, space, mean, config
+        self._grids: dict[int, Float64[np.ndarray, "2 3"]] = {}
         self._floor = MIN_RELATIVE_NORM * float(np.linalg.norm(mean.astype(np.float64)))
         self._limit = free_memory() // 2 // (COPIES * 4 * space.channels)
         if config.components > self._limit:
@@ -146,6 +147,7 @@ class _Builder:
         return MemoryBank(
             components=components,
             sources=sources,
+            grid_from_image=np.stack([self._grids[view] for view in sources[:, 0].tolist()]),
             mean=self._mean,
             threshold=threshold,
             coverage=coverage,
@@ -157,6 +159,7 @@ class _Builder:
         """For each view its raw features less the mean, where they are, and which of them have a direction."""
         for view, feature_map in self._maps():
             rows, sources = raw_features(view, feature_map)
+            self._grids[view] = feature_map.grid_from_image
             with about(f"view {view}"):
                 centered = rows - self._mean
                 lengths = np.abs(centered).max(axis=1, initial=0)

@@ -28,6 +28,7 @@ def assert_near(read: QueryMemory, written: QueryMemory) -> None:
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
     np.testing.assert_array_equal(read.bank.mean, written.bank.mean)
     np.testing.assert_array_equal(read.bank.sources, written.bank.sources)
+    np.testing.assert_array_equal(read.bank.grid_from_image, written.bank.grid_from_image)
     for name in ("scoring", "temperature", "space"):
         assert getattr(read, name) == getattr(written, name)
     assert (read.bank.threshold, read.bank.coverage, read.bank.cosine) == (0.9, 1.0, 0.95)

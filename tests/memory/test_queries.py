@@ -18,6 +18,7 @@ def bank_of(features: GaussianFeatures, scoring: Scoring = "centered") -> Memory
     return MemoryBank(
         components=rows,
         sources=np.zeros((len(rows), 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (len(rows), 1, 1)),
         mean=features.mean if scoring == "centered" else np.zeros_like(features.mean),
         threshold=0.9,
         coverage=1.0,

@@ -17,7 +17,7 @@ from gsencoder.train import memory as training
 
 pytestmark = pytest.mark.slow
 
-QUICK = ("quiet=true", "train.steps=30", "train.warmup=5", "memory.channels=8")
+QUICK = ("quiet=true", "train.steps=30", "train.warmup=5", "memory.channels=8", "pictures=0")
 
 
 @pytest.fixture(scope="module")
