@@ -65,7 +65,12 @@ def test_rare_kinds_are_told_apart_where_most_gaussians_are_of_one_kind() -> Non
     values = features.mean + kinds[number] + 0.3 * rng.normal(size=(3000, 1)).astype(np.float32) * kinds[0]
     values[~features.seen] = 0
     features = replace(features, features=values.astype(np.float32))
-    bank = replace(bank_of(features), components=features.mean + kinds, sources=np.zeros((6, 3), np.int32))
+    bank = replace(
+        bank_of(features),
+        components=features.mean + kinds,
+        sources=np.zeros((6, 3), np.int32),
+        grid_from_image=bank_of(features).grid_from_image[:6],
+    )
     memory = memory_of_features(features, bank, channels=5)
     seen = np.flatnonzero(features.seen)
     nearest = memory.attention(memory.queries[seen]).argmax(axis=1)
