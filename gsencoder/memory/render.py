@@ -9,8 +9,8 @@ from gsencoder.render import Blend
 from gsencoder.types import QueryMemory
 
 
-def render_features(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "P D"], Float32[np.ndarray, " P"]]:
-    """The features of the rows of B, and how opaque these rows are. Where nothing is hit a feature means nothing.
+def render_queries(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "P s"], Float32[np.ndarray, " P"]]:
+    """The mean queries of the rows of B, and how opaque those Gaussians make a row that have a query.
 
     Args:
         memory: of the Gaussians of B.
@@ -25,5 +25,13 @@ def render_features(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, 
     queries = b.render(torch.from_numpy(memory.queries))
     # Gaussians without a query take no part in the mean.
     alpha = b.render(seen)
-    rendered = queries / alpha.clamp(min=1e-12)[:, None]
-    return memory.attend(rendered.numpy()), b.alpha.numpy()
+    return (queries / alpha.clamp(min=1e-12)[:, None]).numpy(), alpha.numpy()
+
+
+def render_features(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "P D"], Float32[np.ndarray, " P"]]:
+    """The features of the rows of B, and how opaque these rows are. Where nothing is hit a feature means nothing.
+
+    Arguments and errors are those of `render_queries`.
+    """
+    queries, _ = render_queries(memory, b)
+    return memory.attend(queries), b.alpha.numpy()
