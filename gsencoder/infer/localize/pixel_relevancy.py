@@ -47,6 +47,7 @@ class GaussianProducts:
 
     def __init__(self, features: GaussianFeatures, mode: Mode = "centred") -> None:
         self.features, self.axes = features, feature_axes(features, mode)
+        self._unseen = np.flatnonzero(~features.seen)
         rows = features.features
         self._lengths = np.zeros(len(rows), np.float32)
         step = max(1, CHUNK_BYTES // (8 * len(self.axes.offset)))
@@ -88,7 +89,7 @@ class GaussianProducts:
             values = np.concatenate([of_rows, np.zeros_like(of_rows, shape=(1, *of_rows.shape[1:]))])[
                 self.features.index
             ]
-        values[~self.features.seen] = fill
+        values[self._unseen] = fill
         return values
 
 
@@ -101,7 +102,8 @@ class BlendedFeatures:
         squares = alpha.double() ** 2 * products.axes.floor
         for start in range(0, len(products.axes.offset), BLOCK_AXES):
             block = products.along(slice(start, start + BLOCK_AXES))
-            squares += (b.render(torch.from_numpy(np.ascontiguousarray(block))).double() ** 2).sum(dim=1)
+            rendered = b.render(torch.from_numpy(block))
+            squares += torch.einsum("ps,ps->p", rendered, rendered)
         self.alpha = alpha.numpy()
         self._inverse_lengths = (1 / squares.clamp(min=EPS).sqrt()).float()
 
