@@ -8,8 +8,6 @@ words. So all channels are rendered once for a view, and one channel for each wo
 Q words, N Gaussians, P pixels, D channels, S axes of the features (see `FeatureAxes`).
 """
 
-from typing import Protocol
-
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
@@ -22,19 +20,6 @@ from gsencoder.types import GaussianFeatures, QueryMemory
 
 BLOCK_AXES = 32
 """Axes that are rendered at once where the lengths of features at pixels are computed."""
-
-
-class PixelFeatures(Protocol):
-    """The features at the pixels of a view, as words are compared with them.
-
-    Attributes:
-        alpha: how opaque the Gaussians that have a feature make each pixel.
-    """
-
-    alpha: Float32[np.ndarray, " P"]
-
-    def cosines(self, directions: Float64[np.ndarray, "Q D"]) -> Float32[np.ndarray, "Q P"]:
-        """Cosines with words of length 1; rounding may lead a little beyond 1. They mean nothing where alpha is 0."""
 
 
 class GaussianProducts:
@@ -57,7 +42,7 @@ class GaussianProducts:
 
     def products(self, directions: Float64[np.ndarray, "Q D"]) -> Float32[np.ndarray, "N Q"]:
         """(f − mean)·t of each Gaussian and word; 0 for Gaussians never seen."""
-        return self._of_gaussians(self._products_of_rows(directions), fill=0)
+        return self._of_gaussians(self._products_of_rows(directions), fill=0.0)
 
     def cosines(self, directions: Float64[np.ndarray, "Q D"]) -> Float32[np.ndarray, "Q N"]:
         """Cosines of words of length 1 with the features of Gaussians; NaN for Gaussians never seen."""
@@ -66,7 +51,7 @@ class GaussianProducts:
 
     def along(self, axes: slice) -> Float32[np.ndarray, "N axes"]:
         """f − mean of each Gaussian along some of the axes; 0 for Gaussians never seen."""
-        return self._of_gaussians(self._local(self.features.features, axes, np.float32), fill=0)
+        return self._of_gaussians(self._local(self.features.features, axes, np.float32), fill=0.0)
 
     def _local(self, stored: np.ndarray, axes: slice, dtype: type) -> np.ndarray:
         offset: np.ndarray = self.axes.offset[axes].astype(dtype)
@@ -85,16 +70,20 @@ class GaussianProducts:
         if self.features.index is None:
             values = of_rows
         else:
-            # The row behind the last one is that of Gaussians without a row.
-            values = np.concatenate([of_rows, np.zeros_like(of_rows, shape=(1, *of_rows.shape[1:]))])[
-                self.features.index
-            ]
+            # The row behind the last one, where −1 leads, is that of Gaussians without a row.
+            values = np.concatenate([of_rows, np.zeros((1, of_rows.shape[1]), of_rows.dtype)])[self.features.index]
         values[self._unseen] = fill
         return values
 
 
 class BlendedFeatures:
-    """Features of Gaussians as a view blends them; see `PixelFeatures`."""
+    """Features of Gaussians as a view blends them.
+
+    Attributes:
+        alpha: how opaque the Gaussians that have a feature make each pixel.
+    """
+
+    alpha: Float32[np.ndarray, " P"]
 
     def __init__(self, products: GaussianProducts, b: Blend) -> None:
         self._products, self._b = products, b
@@ -108,16 +97,21 @@ class BlendedFeatures:
         self._inverse_lengths = (1 / squares.clamp(min=EPS).sqrt()).float()
 
     def cosines(self, directions: Float64[np.ndarray, "Q D"]) -> Float32[np.ndarray, "Q P"]:
-        """See `PixelFeatures`."""
+        """Cosines with words of length 1; rounding may lead a little beyond 1. They mean nothing where alpha is 0."""
         rendered = self._b.render(torch.from_numpy(self._products.products(directions)))
         return (rendered * self._inverse_lengths[:, None]).T.numpy()
 
 
 class AttendedQueries:
-    """Features that the queries of a view's pixels attend to in the bank of a memory; see `PixelFeatures`.
+    """Features that the queries of a view's pixels attend to in the bank of a memory.
 
     Attention is not linear, so that the features of all pixels are computed, and kept in their axes.
+
+    Attributes:
+        alpha: how opaque the Gaussians that have a query make each pixel.
     """
+
+    alpha: Float32[np.ndarray, " P"]
 
     def __init__(self, memory: QueryMemory, b: Blend, mode: Mode = "centred") -> None:
         queries, self.alpha = render_queries(memory, b)
@@ -134,8 +128,12 @@ class AttendedQueries:
         self._directions = features
 
     def cosines(self, directions: Float64[np.ndarray, "Q D"]) -> Float32[np.ndarray, "Q P"]:
-        """See `PixelFeatures`."""
+        """See `BlendedFeatures.cosines`."""
         return (self._directions @ (directions @ self._axes).T.astype(np.float32)).T
+
+
+PixelFeatures = BlendedFeatures | AttendedQueries
+"""The features at the pixels of a view, as words are compared with them."""
 
 
 def pixel_features(
