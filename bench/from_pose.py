@@ -49,7 +49,6 @@ def timings(field: FeatureField, cameras: Cameras, view: int, names: list[str], 
     kept.find(many, text)
     for _ in range(runs):
         b = timed("blend", lambda: blend(field.gaussians, cameras, view, config=field.config.blend))
-        timed("alpha and median depth", partial(lambda made: (made.alpha, made.median_depth), b))
         timed("lengths of features", partial(field.at, cameras, view, b=b))
         timed("one word, kept", lambda: kept.find(names[:1], text))
         timed("one word, anew", whole)

@@ -1,4 +1,4 @@
-"""Words to points from a pose: beside the plain definition in float64, under motions of the world, at the ends."""
+"""Words to points from a pose: beside the plain definition in float64, in moved worlds, at the ends of the range."""
 
 from dataclasses import replace
 
@@ -119,20 +119,34 @@ def test_maps_of_relevancy_are_the_plain_definition_and_nan_where_there_is_no_su
     np.testing.assert_allclose(maps[plain > -2], plain[plain > -2], atol=5e-6)
 
 
-def test_depth_and_position_agree_with_the_camera_and_with_the_median_depth() -> None:
+def test_depth_and_position_agree_with_the_camera_and_with_the_gaussians_of_the_pixel() -> None:
     gaussians, text = opaque_ball(), words()
     origin = (10.0, -20.0, 5.0)
     scene = scene_of(gaussians, some_features(len(gaussians), "basis"), origin)
-    field = FeatureField(scene)
-    seen = field.at(front_camera())
-    for point in seen.find(NAMES, text):
+    seen = FeatureField(scene).at(front_camera())
+    own = relevancy(scene.features["toy"], text.encode(NAMES), text.mean)
+    both = [0, 0]
+    for point, scores in zip(seen.find(NAMES, text), own, strict=True):
         pixels, depths = seen.cameras.project(point.position[None] - origin, 0)
         np.testing.assert_allclose(pixels[0], point.pixel, atol=1e-6)
         assert depths[0] == pytest.approx(point.depth, rel=1e-9)
         column, row = (point.pixel - 0.5).astype(int)
         at = row * 61 + column
-        assert point.depth == float(seen.b.median_depth[at])
-        assert point.alpha == float(seen.b.alpha[at])
+        assert point.alpha == pytest.approx(float(seen.b.alpha[at]), abs=1e-6)
+        entries = slice(int(seen.b.crow[at]), int(seen.b.crow[at + 1]))
+        columns, weights = seen.b.col[entries].numpy(), seen.b.weight[entries].numpy()
+        relevant = scores[columns] >= point.threshold
+        both[int(relevant.any())] += 1
+        chosen = relevant if relevant.any() else np.isfinite(scores[columns])
+        depths = seen.b.depths.numpy()[columns]
+        assert point.depth in depths[chosen]
+        before, until = (
+            weights[chosen & mask].sum() / weights[chosen].sum()
+            for mask in (depths < point.depth, depths <= point.depth)
+        )
+        assert before <= 0.5 + 1e-6
+        assert until >= 0.5 - 1e-6
+    assert both[1] > 0
 
 
 def moved_world(gaussians: Gaussians, cameras: Cameras, R: np.ndarray, t: np.ndarray) -> tuple[Gaussians, Cameras]:
@@ -265,10 +279,23 @@ def test_a_word_behind_something_opaque_is_not_visible() -> None:
     assert not hidden.visible
 
 
-def test_the_median_depth_is_that_of_a_surface_where_the_expected_depth_is_not() -> None:
-    """Half of each ray ends at the near Gaussian: the mean of both depths is in empty space."""
-    gaussians, features = two_kinds(one_gaussian((0, 0, 2), 3.0, 0.7), one_gaussian((0, 0, 8), 9.0, 0.999))
+def test_the_depth_is_that_of_what_is_relevant_and_not_between_it_and_the_background() -> None:
+    """Each ray ends partly at the near Gaussian: the mean of both depths is in empty space."""
+    for opacity in (0.7, 0.3):
+        near, far = one_gaussian((0, 0, 2), 3.0, opacity), one_gaussian((0, 0, 8), 9.0, 0.999)
+        gaussians, features = two_kinds(near, far)
+        point, _ = from_pose(scene_of(gaussians, features), front_camera(), NAMES[:2], words(), EVERYTHING)
+        assert point.depth == (2.0 if opacity == 0.7 else 8.0)  # All reach this threshold.
+        least = FromPoseConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.5))
+        a, b = from_pose(scene_of(gaussians, features), front_camera(), NAMES[:2], words(), least)
+        assert (a.depth, b.depth) == (2.0, 8.0)
+
+
+def test_a_small_share_before_a_background_of_the_mean_feature_has_its_own_depth() -> None:
+    gaussians, features = two_kinds(one_gaussian((0, 0, 2), 3.0, 0.2), one_gaussian((0, 0, 8), 9.0, 0.999))
+    features = replace(features, features=np.stack([features.features[0], features.mean]))
     (point,) = from_pose(scene_of(gaussians, features), front_camera(), NAMES[:1], words())
+    assert point.relevancy == pytest.approx(1, abs=1e-4)
     assert point.depth == 2.0
 
 
@@ -430,6 +457,6 @@ def test_wrong_input_is_refused() -> None:
         field.at(cameras, 1)
     with pytest.raises(InputError, match="no features"):
         FeatureField(replace(scene, features={}))
-    for options in ({"stride": 0}, {"min_alpha": 0.4}, {"min_alpha": float("nan")}):
+    for options in ({"stride": 0}, {"min_alpha": 0.0}, {"min_alpha": float("nan")}):
         with pytest.raises(InputError, match=next(iter(options))):
             FromPoseConfig(**options)  # type: ignore[arg-type]

@@ -78,9 +78,9 @@ def _camera(
         pose = invert_rigid(pose @ OPENCV_FROM_OPENGL)
     fx, fy, cx, cy, width, height = (_number(entry, _key(entry, names, where), where) for names in INTRINSICS)
     for name, focal in (("fx", fx), ("fy", fy)):
-        # In float32, as cameras are held; 1e-50 would be zero there.
-        if not 0 < np.float32(focal) < np.inf:
-            raise InputError(f"{where}: {name} must be a positive number of pixels, got {focal:g}")
+        # Cameras are held in float32, in which 1e-50 is zero and 1e300 infinite.
+        if not 1e-9 <= focal <= 1e9:
+            raise InputError(f"{where}: {name} must be a positive number of pixels, 1e-9 to 1e9, got {focal:g}")
     for name, value in (("cx", cx), ("cy", cy)):
         if not abs(value) <= 1e9:
             raise InputError(f"{where}: {name} must lie within 1e9 pixels, got {value:g}")

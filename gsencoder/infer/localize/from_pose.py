@@ -40,8 +40,8 @@ class FromPoseConfig:
         mode: cosines after removing each side's mean ("centred"), or as they are ("raw").
         threshold: relevancy from which on something relevant is visible; it is taken over all Gaussians of the scene,
             so that a word whose best Gaussians are elsewhere is not visible here.
-        min_alpha: a pixel counts where the Gaussians that have features are at least so opaque, from 0.5: then there
-            is a surface, whose depth is the median depth.
+        min_alpha: a pixel counts where the Gaussians that have features are at least so opaque: what is fainter is
+            haze, and no surface.
         stride: every so many pixels are looked at, in both directions; None = all for features, and every fourth for a
             memory, whose attention takes longer.
         blend: accuracy of the rendering.
@@ -56,8 +56,8 @@ class FromPoseConfig:
     def __post_init__(self) -> None:
         if self.mode not in ("centred", "raw"):
             raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
-        if not 0.5 <= self.min_alpha <= 1:
-            raise InputError(f"min_alpha: expected a number in [0.5, 1], got {self.min_alpha}")
+        if not 0 < self.min_alpha <= 1:
+            raise InputError(f"min_alpha: expected a number in (0, 1], got {self.min_alpha}")
         if self.stride is not None and self.stride < 1:
             raise InputError(f"stride: expected at least 1 pixel, got {self.stride}")
 
@@ -76,9 +76,11 @@ class PosePoint:
             where the camera sees no surface with features.
         alpha: opacity of all Gaussians at the pixel.
         pixel: (x, y), pixel centers at .5.
-        depth: z in the camera, world units: the median depth, at which the ray has lost half its transmittance. It is
-            that of a Gaussian; the expected depth of a ray that grazes an edge lies between object and background,
-            where nothing is.
+        depth: z in the camera, world units: the median, by blending weight, over those Gaussians of the pixel whose own
+            relevancy reaches the threshold, or over all that have features where none does. The expected depth of a
+            pixel at an edge lies between object and background, where nothing is. The median over all Gaussians may be
+            that of the background: a cosine has no length, so that before a background with about the mean feature
+            a pixel with a small share of the object is as relevant as one that shows nothing else.
         position: in world coordinates, with the scene's origin added.
     """
 
@@ -191,7 +193,7 @@ class SeenField:
             of_gaussians = self.field.products.cosines(block)
             of_pixels = self._pixels.cosines(block)
             for word, scores, pixels in zip(queries[start : start + BLOCK_WORDS], of_gaussians, of_pixels, strict=True):
-                points.append(self._point(word, threshold(scores, self.field.config.threshold), pixels))
+                points.append(self._point(word, scores, pixels))
         return tuple(points)
 
     def relevancy(self, queries: Sequence[str], text: TextEncoder) -> Float32[np.ndarray, "Q h w"]:
@@ -209,27 +211,38 @@ class SeenField:
         check_space(self.field.space, text.space)
         return word_directions(text.encode(list(queries)), text.mean, self.field.config.mode)
 
-    def _point(self, query: str, least: float, scores: Float32[np.ndarray, " P"]) -> PosePoint:
+    def _point(
+        self, query: str, of_gaussians: Float32[np.ndarray, " N"], of_pixels: Float32[np.ndarray, " P"]
+    ) -> PosePoint:
+        least = threshold(of_gaussians, self.field.config.threshold)
         if not self._opaque.any():
             nowhere = np.full(3, math.nan)
             return PosePoint(
                 query=query, camera=self.view, visible=False, threshold=least, relevancy=math.nan, alpha=math.nan,
                 pixel=nowhere[:2], depth=math.nan, position=nowhere,
             )  # fmt: skip
-        best = int(np.where(self._opaque, scores, -np.inf).argmax())
-        row, column = divmod(best, self.b.lattice.width)
+        best = int(np.where(self._opaque, of_pixels, -np.inf).argmax())
+        relevancy = float(np.clip(of_pixels[best], -1, 1))
         lattice = self.b.lattice
+        row, column = divmod(best, lattice.width)
         pixel = np.array([lattice.x0 + column * lattice.dx, lattice.y0 + row * lattice.dy])
-        depth = float(self.b.median_depth[best])
+        entries = slice(int(self.b.crow[best]), int(self.b.crow[best + 1]))
+        gaussians, weights = self.b.col[entries].numpy(), self.b.weight[entries].numpy().astype(np.float64)
+        own = of_gaussians[gaussians]
+        relevant = own >= least
+        chosen = relevant if relevant.any() else np.isfinite(own)
+        # Entries are in order of depth.
+        total = weights[chosen].cumsum()
+        middle = int(np.searchsorted(total, total[-1] / 2))
+        depth = float(self.b.depths[gaussians[chosen][middle]])
         position = self.cameras.unproject(pixel[None], np.array([depth]), self.view)[0] + self.field.origin
-        relevancy = float(np.clip(scores[best], -1, 1))
         return PosePoint(
             query=query,
             camera=self.view,
             visible=relevancy >= least,
             threshold=least,
             relevancy=relevancy,
-            alpha=float(self.b.alpha[best]),
+            alpha=float(weights.sum()),
             pixel=pixel,
             depth=depth,
             position=position,
