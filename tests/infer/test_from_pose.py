@@ -361,6 +361,7 @@ def memory_of(n: int, *, components: int, temperature: float = 0.05) -> QueryMem
     bank = MemoryBank(
         components=(rng.normal(size=(components, CHANNELS)) + mean).astype(np.float32),
         sources=np.zeros((components, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (components, 1, 1)),
         mean=mean,
         threshold=0.9,
         coverage=1.0,
@@ -406,6 +407,7 @@ def test_a_memory_answers_as_features_where_its_attention_is_exact() -> None:
     bank = MemoryBank(
         components=features.features,
         sources=np.zeros((2, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (2, 1, 1)),
         mean=features.mean,
         threshold=0.9,
         coverage=1.0,
