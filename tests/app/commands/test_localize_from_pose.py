@@ -87,7 +87,8 @@ def test_memories_are_asked_by_their_queries(features: Path, tmp_path: Path) -> 
     scene = load_features(features)
     (kept,) = scene.features.values()
     bank = MemoryBank(
-        components=np.eye(4, 16, dtype=np.float32), sources=np.zeros((4, 3), np.int32), mean=kept.mean, threshold=0.9,
+        components=np.eye(4, 16, dtype=np.float32), sources=np.zeros((4, 3), np.int32), threshold=0.9, mean=kept.mean,
+        grid_from_image=np.tile(np.eye(2, 3), (4, 1, 1)),
         coverage=1.0, cosine=1.0, space=kept.space,
     )  # fmt: skip
     memory = QueryMemory(
