@@ -6,7 +6,7 @@ continues with the maps and sums of its fusion.
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -108,15 +108,13 @@ def prepare_memory(
         _sample_raw(folder, stream, made.outputs.space, sample)
         return made
     maps = folder / MAPS_FOLDER
-    with advised(f"remove {folder} to prepare the scene again"):
-        fusion = replace(prepare.fusion, views=0)
-        work = None if teacher.cheap else maps
-        features = predicted or fuse(scene, teacher, fusion, work=work, track=track).features
-        outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
-        source = _source(teacher, folder)
-        maps.mkdir(parents=True, exist_ok=True)
-        components = build_bank(stream, features.space, features.mean, bank)
-        rows = view_rows(scene, source, outputs, prepare)
+    work = None if teacher.cheap else maps
+    features = predicted or fuse(scene, teacher, prepare.fusion, work=work, track=track).features
+    outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
+    source = _source(teacher, folder)
+    maps.mkdir(parents=True, exist_ok=True)
+    components = build_bank(stream, features.space, features.mean, bank)
+    rows = view_rows(scene, source, outputs, prepare)
     folder.mkdir(parents=True, exist_ok=True)
     _sample_raw(folder, stream, features.space, sample)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())
