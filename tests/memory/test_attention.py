@@ -74,10 +74,17 @@ def test_blocks_of_queries_give_what_all_at_once_give(monkeypatch: pytest.Monkey
     memory = make_memory()
     module, queries = module_of(memory), torch.from_numpy(memory.queries)
     whole, whole_numpy = module(queries).detach(), memory.attend(memory.queries)
+    leaf = queries.clone().requires_grad_()
+    expected = torch.autograd.grad(module(leaf).square().sum(), [leaf, module.projection])
     monkeypatch.setattr(attention_module, "BLOCK_SCORES", 70 * 13)
     monkeypatch.setattr(memory_types, "BLOCK_SCORES", 70 * 13)
     with torch.no_grad():
         torch.testing.assert_close(module(queries), whole)
+    queries.requires_grad_()
+    (in_blocks := module(queries)).square().sum().backward()
+    torch.testing.assert_close(in_blocks.detach(), whole)
+    torch.testing.assert_close(queries.grad, expected[0])
+    torch.testing.assert_close(module.projection.grad, expected[1])
     np.testing.assert_allclose(memory.attend(memory.queries), whole_numpy, rtol=1e-6, atol=1e-7)
     assert memory.attend(memory.queries[:0]).shape == (0, 24)
 
