@@ -1,7 +1,7 @@
 """Reductions of raw features to principal scene components, beside a transcription of M3's Algorithm 1.
 
-    python bench/reduction.py SCENE [--rows 100000] [--thresholds 0.8 0.9] [--teacher teacher=dinov2_s14] [--maps FOLDER]
-        [--repeats 2]
+    python bench/reduction.py SCENE [--rows 100000] [--thresholds 0.8 0.9] [--teacher teacher=dinov2_s14]
+        [--maps FOLDER] [--repeats 2]
 
 Raw features are those of the teacher's maps of all views, evenly thinned to --rows. The transcription compares chunks
 of 5,000 rows with all others by float32 matrix products on all cores. Each figure of a reduction is the fastest of
@@ -80,9 +80,8 @@ def main() -> None:
     if arguments.replicas:
         of_many(features, arguments.thresholds, arguments.replicas)
         return
-    print(
-        "| θ | algorithm | seconds | × | components | coverage | mean cosine | same set |\n|---|---|---|---|---|---|---|---|"
-    )
+    print("| θ | algorithm | seconds | × | components | coverage | mean cosine | same set |")
+    print("|---|---|---|---|---|---|---|---|")
     for threshold in arguments.thresholds:
         start = time.perf_counter()
         published, used = transcription(features, threshold)

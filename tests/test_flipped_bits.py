@@ -15,6 +15,7 @@ import pytest
 import torch
 from archives import flip_bit
 from feature_fields import make_features
+from memory_samples import make_memory
 from splats import front_camera, random_gaussians
 from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
@@ -24,7 +25,15 @@ from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint
 from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import load_heads, save_heads
-from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
+from gsencoder.fusion.store.folder import (
+    FEATURES_FILE,
+    SCENE_FILE,
+    load_features,
+    load_memories,
+    save_features,
+    save_memories,
+)
+from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
 from gsencoder.fusion.teacher_maps import read_map, write_map
 from gsencoder.memory.index import index_features
@@ -66,6 +75,11 @@ def package(folder: Path, name: str) -> Made:
 def index_package(folder: Path) -> Made:
     save_index_package(folder, a_scene(), index_features(make_features(n=60)).features, error=0.05)
     return folder / PACKAGE_FILE, lambda: load_features(folder)
+
+
+def memory(folder: Path) -> Made:
+    save_memories(folder, Scene(name="b", gaussians=random_gaussians(200)), {"a": make_memory()})
+    return folder / MEMORY_FILE, lambda: (load_features(folder), load_memories(folder))
 
 
 def words(folder: Path) -> Made:
@@ -178,6 +192,7 @@ KINDS: dict[str, Callable[[Path], Made]] = {
     "scene of features": lambda folder: features(folder, SCENE_FILE),
     "package": lambda folder: package(folder, PACKAGE_FILE),
     "package of an index": index_package,
+    "memory": memory,
     "splat of a package": lambda folder: package(folder, SPLAT_FILE),
     "words": words,
     "words of another program": words_of_numpy,

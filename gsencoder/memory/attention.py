@@ -6,21 +6,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
+from torch.utils.checkpoint import checkpoint
 
 from gsencoder.types import MemoryBank
 from gsencoder.types.memory import EPS, Scoring, attention_keys
 
 BLOCK_SCORES = 1 << 24
-"""Scores of queries and components that are computed at once where gradients are not needed; 64 MiB."""
+"""Scores of queries and components that are held at once; 64 MiB."""
 
 
 class MemoryAttention(nn.Module):
     """Features for principal queries: R̂ = softmax(score(Q_p W_m, PSC) / τ) PSC.
 
     The projection is applied to the components, not to the queries: (q W)·k = q·(W k), and |q W|² = q (W Wᵀ) qᵀ, so
-    that scores cost s products a pair instead of D. Attention over M components is one call of
-    `scaled_dot_product_attention`, which never holds all scores where it has a fused kernel. Without gradients, queries
-    go in blocks, so that no more than `BLOCK_SCORES` scores are held in any case.
+    that scores cost s products a pair instead of D. Queries go in blocks, with gradients as well, so that no more than
+    `BLOCK_SCORES` scores are held at once, however many components there are.
     """
 
     def __init__(
@@ -51,12 +51,13 @@ class MemoryAttention(nn.Module):
 
     def forward(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n C"]:
         """The features that queries stand for; with cosines their length does not matter."""
-        if torch.is_grad_enabled():
-            return self._attend(queries)
         step = max(1, BLOCK_SCORES // len(self.values))
-        return (
-            torch.cat([self._attend(part) for part in queries.split(step)]) if len(queries) else self._attend(queries)
-        )
+        if len(queries) <= step:
+            return self._attend(queries)
+        if not torch.is_grad_enabled():
+            return torch.cat([self._attend(part) for part in queries.split(step)])
+        # Scores of a block are computed again for its gradient, instead of those of all blocks being kept.
+        return torch.cat([checkpoint(self._attend, part, use_reentrant=False) for part in queries.split(step)])
 
     def _attend(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n C"]:
         keys = self.keys @ self.projection.T

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.even_indices import even_indices
@@ -27,6 +27,8 @@ SAMPLE = 20_000
 """Features among which a threshold is searched for a mean cosine."""
 MIN_RELATIVE_NORM = 1e-3
 """Share of the mean's length below which a centered feature is rounding, not direction."""
+MAX_NAMES = 1000
+"""Up to so many vectors of coded maps are all components, unless another number or threshold is asked for."""
 SAME_KIND_COSINE = 0.95
 """Features within this of another one are of its kind."""
 COPIES = 6
@@ -55,7 +57,7 @@ class BankConfig:
         default=0.9,
         metadata={
             "help": "mean cosine with the nearest component that the threshold is chosen for, over features and over "
-            "kinds of features, unless threshold= or components= is given"
+            "kinds of features, unless threshold= or components= is given; names and captions are all components"
         },
     )
     threshold: float = field(
@@ -125,6 +127,7 @@ class _Builder:
         self, maps: MapStream, space: FeatureSpace, mean: Float32[np.ndarray, " D"], config: BankConfig
     ) -> None:
         self._maps, self._space, self._mean, self._config = maps, space, mean, config
+        self._grids: dict[int, Float64[np.ndarray, "2 3"]] = {}
         self._floor = MIN_RELATIVE_NORM * float(np.linalg.norm(mean.astype(np.float64)))
         self._limit = free_memory() // 2 // (COPIES * 4 * space.channels)
         if config.components > self._limit:
@@ -144,6 +147,7 @@ class _Builder:
         return MemoryBank(
             components=components,
             sources=sources,
+            grid_from_image=np.stack([self._grids[view] for view in sources[:, 0].tolist()]),
             mean=self._mean,
             threshold=threshold,
             coverage=coverage,
@@ -155,6 +159,7 @@ class _Builder:
         """For each view its raw features less the mean, where they are, and which of them have a direction."""
         for view, feature_map in self._maps():
             rows, sources = raw_features(view, feature_map)
+            self._grids[view] = feature_map.grid_from_image
             with about(f"view {view}"):
                 centered = rows - self._mean
                 lengths = np.abs(centered).max(axis=1, initial=0)
@@ -181,11 +186,17 @@ class _Builder:
         sample = self._sample()
         if not len(sample):
             return 1.0
+        if self._is_coded() and len(np.unique(sample, axis=0)) <= MAX_NAMES:
+            # The vectors are names or captions, and none of these may stand for another one.
+            return 1.0
         # A feature that few cells have counts little in a mean over all of them, and as much as others among kinds.
         kinds = sample[_cover_of(sample, SAME_KIND_COSINE).rows]
         return 1 - largest_threshold(
             lambda each: _mean_cosine(sample, _cover_of(sample, 1 - each), kinds) >= config.cosine
         )
+
+    def _is_coded(self) -> bool:
+        return all(feature_map.codes is not None for _, feature_map in self._maps())
 
     def _has_undirected(self) -> bool:
         return any(not directed.all() for _, _, directed in self._rows())

@@ -16,7 +16,7 @@ from torch import Tensor
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
 from gsencoder.render import reference
-from gsencoder.render.rays import Lattice, grid_lattice, patch_lattice, pixel_lattice
+from gsencoder.render.rays import Lattice, grid_lattice, patch_lattice, strided_lattice
 from gsencoder.types import Cameras, FeatureMap, Gaussians
 
 Backend = Literal["auto", "cpu", "reference"]
@@ -231,6 +231,7 @@ def blend(
     *,
     patch: int | None = None,
     like: FeatureMap | None = None,
+    stride: int = 1,
     config: BlendConfig = BlendConfig(),
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float32,
@@ -243,6 +244,7 @@ def blend(
         view: which camera.
         patch: pixels along the side of a square patch; None for one row a pixel.
         like: a feature map whose grid the rows follow, in place of `patch`.
+        stride: where the rows are pixels, only every so many of them, in both directions.
         config: accuracy knobs.
         device: where the result lives; other than "cpu" needs the torch backend.
         dtype: float type of the reference backend; the numba backend computes in float64 and stores float32.
@@ -258,7 +260,7 @@ def blend(
     elif patch is not None:
         lattice = patch_lattice(width, height, patch, config.rays_per_patch)
     else:
-        lattice = pixel_lattice(width, height)
+        lattice = strided_lattice(width, height, stride)
     backend = config.backend
     if backend == "auto":
         backend = "cpu" if torch.device(device).type == "cpu" and dtype == torch.float32 else "reference"

@@ -48,6 +48,26 @@ def pixel_lattice(width: int, height: int) -> Lattice:
     return Lattice(height=height, width=width, side=1, x0=0.5, y0=0.5, dx=1.0, dy=1.0)
 
 
+def strided_lattice(width: int, height: int, stride: int) -> Lattice:
+    """One ray through the center of every `stride`-th pixel, from the middle of the first block of that many on.
+
+    Raises:
+        InputError: a stride of no pixels.
+    """
+    if stride < 1:
+        raise InputError(f"stride: expected at least 1 pixel, got {stride}")
+    first_x, first_y = min(stride, width) // 2, min(stride, height) // 2
+    return Lattice(
+        height=math.ceil((height - first_y) / stride),
+        width=math.ceil((width - first_x) / stride),
+        side=1,
+        x0=first_x + 0.5,
+        y0=first_y + 0.5,
+        dx=float(stride),
+        dy=float(stride),
+    )
+
+
 def patch_lattice(width: int, height: int, patch: int, rays_per_patch: int) -> Lattice:
     """Square patches from the image's top left corner; the last ones may reach over the right and lower border.
 

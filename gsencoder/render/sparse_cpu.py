@@ -50,16 +50,27 @@ def _product(first, last, crow, cols, weights, values, targets, out):
             e += 1
 
 
+@kernel
+@no_type_check
+def _product_of_one_channel(first, last, crow, cols, weights, values, targets, out):
+    for row in range(first, last):
+        total = out[targets[row], 0]
+        for e in range(crow[row], crow[row + 1]):
+            total += weights[e] * values[cols[e], 0]
+        out[targets[row], 0] = total
+
+
 def product(
     crow: np.ndarray, cols: np.ndarray, weights: np.ndarray, values: np.ndarray, targets: np.ndarray, out: np.ndarray
 ) -> None:
     """Adds row i of CSR @ values to out[targets[i]]; targets are distinct, so that threads never meet."""
     cuts = even_cuts(crow)
+    run = _product_of_one_channel if values.shape[1] == 1 else _product
     if values.shape[1] * crow[-1] < 1 << 16:
-        _product(0, len(crow) - 1, crow, cols, weights, values, targets, out)
+        run(0, len(crow) - 1, crow, cols, weights, values, targets, out)
         return
     parallel(
-        lambda piece: _product(cuts[piece], cuts[piece + 1], crow, cols, weights, values, targets, out),
+        lambda piece: run(cuts[piece], cuts[piece + 1], crow, cols, weights, values, targets, out),
         range(PIECES),
     )
 

@@ -15,6 +15,7 @@ from gsencoder.core.files.json_values import plain
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.memory.attention import MemoryAttention, random_projection
 from gsencoder.memory.decoders import Decoder, make_decoder
+from gsencoder.memory.queries import principal_queries
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.memory_network import MemoryConfig, MemoryNetwork, MemoryObjective, ViewSamples, join_views
@@ -28,42 +29,20 @@ CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_ev
 
 def memory_training() -> TrainerConfig:
     """The training loop's settings for memories."""
-    return TrainerConfig(steps=600, learning_rate=0.005, warmup=50, weight_decay=0.0, validate_every=0, log_every=10)
+    return TrainerConfig(steps=600, learning_rate=0.04, warmup=50, weight_decay=0.0, validate_every=0, log_every=10)
 
 
 def first_queries(
     scene: MemoryScene, config: MemoryConfig, seed: int
 ) -> tuple[Float32[np.ndarray, "N s"], Float32[np.ndarray, "s D"]]:
-    """Queries and projection before the training: the fused features in their s principal directions, or random ones.
-
-    A cosine that is not centered depends on the mean as well, whose coordinate is 1 for every Gaussian.
-    """
-    prepared, outputs, width = scene.prepared, scene.outputs, config.channels
-    rng = np.random.default_rng([seed, 2])
-    channels = outputs.space.channels
-    unit = 1.0 if config.scoring == "dot" else math.sqrt(channels)
-    if config.init == "random":
-        generator = torch.Generator().manual_seed(int(rng.integers(1 << 62)))
-        queries = rng.standard_normal((len(prepared), width), np.float32)
-        return queries, (unit * random_projection(width, channels, generator)).numpy()
-    seen = np.flatnonzero(prepared.weights)
-    standard = prepared.targets(seen)
-    values, vectors = np.linalg.eigh(standard.T.astype(np.float64) @ standard)
-    constant = int(config.scoring != "centered")
-    rank = min(width - constant, len(values))
-    directions = vectors[:, ::-1][:, :rank].astype(np.float32)
-    queries = np.zeros((len(prepared), width), np.float32)
-    queries[seen, constant : constant + rank] = standard @ directions * np.float32(outputs.unit)
-    projection = np.zeros((width, channels), np.float32)
-    in_space = directions.T if outputs.basis is None else directions.T @ outputs.basis.components
-    projection[constant : constant + rank] = in_space
-    if constant:
-        queries[seen, 0], projection[0] = 1, outputs.mean
-    if config.scoring == "dot":
-        return queries, projection
-    # With cosines the length of a query does not matter. These units let one learning rate serve both.
-    spread = float(queries[seen].std()) or 1.0
-    return queries / np.float32(spread), (projection * np.float32(unit)).astype(np.float32)
+    """Queries and projection before the training: those of the fused features, or random ones."""
+    if config.init == "fused":
+        return principal_queries(scene.fused_features(), scene.bank, config.channels, config.scoring)
+    channels, generator = scene.outputs.space.channels, torch.Generator().manual_seed(seed)
+    projection = random_projection(config.channels, channels, generator)
+    if config.scoring != "dot":
+        projection = projection * math.sqrt(channels)
+    return torch.randn(len(scene.prepared), config.channels, generator=generator).numpy(), projection.numpy()
 
 
 def untrained_memory(scene: MemoryScene, config: MemoryConfig, seed: int = 0) -> QueryMemory:
@@ -150,7 +129,7 @@ def _train(
     for name, scene in scenes.items():
         first, projection = first_queries(scene, config, training.seed)
         queries[name] = torch.from_numpy(first)
-        decoders[name] = _decoder_of(scene, config, kind, projection, training.seed)
+        decoders[name] = _decoder_of(scene, config, kind, first, projection, training.seed)
     settings = {
         "memory": plain(config),
         "train": {name: value for name, value in plain(training).items() if name not in CHANGEABLE_ON_RESUME},
@@ -177,21 +156,27 @@ def _train(
 
 
 def _decoder_of(
-    scene: MemoryScene, config: MemoryConfig, kind: Decoder | None, projection: np.ndarray, seed: int
+    scene: MemoryScene,
+    config: MemoryConfig,
+    kind: Decoder | None,
+    queries: Float32[np.ndarray, "N s"],
+    projection: Float32[np.ndarray, "s D"],
+    seed: int,
 ) -> nn.Module:
-    values = torch.from_numpy(scene.values)
+    """What turns queries into features in standard units, before the training."""
     if kind is None:
         return MemoryAttention(
             scene.bank,
             torch.from_numpy(projection),
             scoring=config.scoring,
             temperature=config.temperature,
-            values=values,
+            values=torch.from_numpy(scene.values),
         )
-    outputs = scene.outputs
-    in_columns = projection if outputs.basis is None else projection @ outputs.basis.components.T
-    generator = torch.Generator().manual_seed(seed)
-    return make_decoder(kind, torch.from_numpy(in_columns), generator=generator)
+    # A linear decoder begins as the least squares from the first queries to the fused features.
+    seen = np.flatnonzero(scene.prepared.weights)
+    targets, chosen = scene.prepared.targets(seen), queries[seen].astype(np.float64)
+    weights = np.linalg.lstsq(chosen.T @ chosen, chosen.T @ targets, rcond=None)[0].astype(np.float32)
+    return make_decoder(kind, torch.from_numpy(weights), generator=torch.Generator().manual_seed(seed))
 
 
 def _memory_of(

@@ -3,7 +3,8 @@ to banks (M3 sec. 3.3).
 
     R̂ = A_gm(B q / alpha),   L = λ_cos · (1 − cos(R̂, R)) + λ_L2 · |R̂ − R|² / C
 
-over rows of B that are drawn at random in each view, in standard units about the mean of the space. With the geometry
+over rows of B that are drawn at random in each view, and Gaussians, which are rows with one entry, with a weight of
+their own; in standard units about the mean of the space. With the geometry
 frozen this is a regression on sparse rows, without a rasterizer.
 """
 
@@ -20,7 +21,8 @@ from torch.utils.data import Dataset
 
 from gsencoder.core.errors import InputError
 from gsencoder.train.memory_scene import MemoryScene
-from gsencoder.train.render_rows import RenderRows, join_rows, sample_rows
+from gsencoder.train.prepared_scene import PreparedScene
+from gsencoder.train.render_rows import RenderRows, gaussian_rows, join_rows, sample_rows
 from gsencoder.types.memory import Scoring
 
 EPS = 1e-12
@@ -47,6 +49,13 @@ class MemoryConfig:
     )
     temperature: float = field(default=0.05, metadata={"help": "temperature of the attention's softmax"})
     points: int = field(default=2000, metadata={"help": "rows of B that are drawn in each view of a step"})
+    gaussian_weight: float = field(
+        default=0.3,
+        metadata={
+            "help": "weight of Gaussians that are compared with their fused features, half as many as points; without "
+            "them rendered features come nearer to the teacher's, and those of the Gaussians go their own way; 0 = off"
+        },
+    )
     min_alpha: float = field(default=0.5, metadata={"help": "smallest opacity of a row"})
     cosine: float = field(default=1.0, metadata={"help": "weight of 1 − cosine"})
     l2: float = field(default=1.0, metadata={"help": "weight of the squared distance in standard units"})
@@ -59,7 +68,7 @@ class MemoryConfig:
             raise InputError(f"temperature: expected a positive number, got {self.temperature}")
         if not 0 < self.min_alpha <= 1:
             raise InputError(f"min_alpha: expected a number in (0, 1], got {self.min_alpha}")
-        for name in ("cosine", "l2"):
+        for name in ("cosine", "l2", "gaussian_weight"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         if not self.cosine + self.l2 > 0:
@@ -90,21 +99,22 @@ class ViewSamples(Dataset[MemoryBatch]):
         """Sample `number`, or its error as a value."""
         epoch, position = divmod(number, len(self._views))
         view = int(np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._views))[position])
-        config = self._config
         try:
-            rows = tuple(
-                sample_rows(
-                    scene.view(view),
-                    scene.weights > 0,
-                    config.min_alpha,
-                    config.points,
-                    np.random.default_rng([self._seed, 1, number]),
-                )
-                for scene in self._scenes.values()
-            )
+            rows = tuple(self._rows(scene, view, number) for scene in self._scenes.values())
         except InputError as error:
             return error
         return MemoryBatch(names=(self._views[view],), rows=rows)
+
+    def _rows(self, scene: PreparedScene, view: int, number: int) -> RenderRows:
+        config, rng = self._config, np.random.default_rng([self._seed, 1, number])
+        seen = scene.weights > 0
+        rows = sample_rows(scene.view(view), seen, config.min_alpha, config.points, rng)
+        if not config.gaussian_weight:
+            return rows
+        # A Gaussian is a row of B with one entry.
+        of_seen = np.flatnonzero(seen)
+        chosen = np.sort(rng.choice(of_seen, min(len(of_seen), -(-config.points // 2)), replace=False))
+        return join_rows([rows, gaussian_rows(chosen, scene.targets(chosen), config.gaussian_weight)], [0, 0])
 
 
 def join_views(samples: Sequence[MemoryBatch | InputError]) -> MemoryBatch | InputError:
@@ -138,7 +148,7 @@ class MemoryNetwork(nn.Module):
 
 
 class MemoryObjective:
-    """The loss of a memory: for each teacher and row λ_cos · (1 − cos) + λ_L2 · |R̂ − R|² / C."""
+    """The loss of a memory: for each teacher and row w · (λ_cos · (1 − cos) + λ_L2 · |R̂ − R|² / C)."""
 
     def __init__(self, network: nn.Module, config: MemoryConfig, teachers: Sequence[str]) -> None:
         self.network, self._config, self._teachers = network, config, tuple(teachers)
@@ -158,9 +168,11 @@ class MemoryObjective:
         return term if len(self._teachers) == 1 else f"{teacher}/{term}"
 
     def divisors(self, batch: MemoryBatch) -> dict[str, float]:
-        """The number of rows, for each term."""
-        counts = {name: float(len(rows.row_weights)) for name, rows in zip(self._teachers, batch.rows, strict=True)}
-        return {self._term(name, term): count for name, count in counts.items() for term in ("cosine", "l2")}
+        """The sum of the weights of the rows, for each term."""
+        sums = {
+            name: float(rows.row_weights.double().sum()) for name, rows in zip(self._teachers, batch.rows, strict=True)
+        }
+        return {self._term(name, term): total for name, total in sums.items() for term in ("cosine", "l2")}
 
     def __call__(self, batch: MemoryBatch) -> dict[str, Tensor]:
         """Totals of the terms whose weight is not 0."""
@@ -169,6 +181,6 @@ class MemoryObjective:
             predicted, target = predicted.float(), rows.targets
             products = (predicted * target).sum(dim=1)
             lengths = torch.sqrt(((predicted * predicted).sum(dim=1) + EPS) * ((target * target).sum(dim=1) + EPS))
-            terms[self._term(name, "cosine")] = (1 - products / lengths).sum()
-            terms[self._term(name, "l2")] = (predicted - target).square().mean(dim=1).sum()
+            terms[self._term(name, "cosine")] = ((1 - products / lengths) * rows.row_weights).sum()
+            terms[self._term(name, "l2")] = ((predicted - target).square().mean(dim=1) * rows.row_weights).sum()
         return {name: terms[name] for name in self.lambdas}

@@ -6,7 +6,8 @@ continues with the maps and sums of its fusion.
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,15 @@ from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
-from gsencoder.memory.bank import BankConfig, build_bank
+from gsencoder.memory.bank import BankConfig, MapStream, build_bank
+from gsencoder.memory.raw_sample import RawSample, draw_sample
 from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 from gsencoder.train.prepare import PrepareConfig, view_rows
 from gsencoder.train.prepared_scene import PreparedScene, write_prepared
-from gsencoder.types import FeatureMap, GaussianFeatures, MemoryBank, Scene
+from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, Scene
 
 BANK_FILE, SCENE_FILE, MAPS_FOLDER = "bank.safetensors", "scene.safetensors", "maps"
+SAMPLE_FILE = "sample.safetensors"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,6 +55,17 @@ class MemoryScene:
         rows = self.bank.components if basis is None else to_coordinates(basis, self.bank.components)
         return self.outputs.standardize(rows)
 
+    def fused_features(self) -> GaussianFeatures:
+        """The fused features, as they were stored."""
+        prepared, outputs = self.prepared, self.outputs
+        rows = np.arange(len(prepared))
+        restored = outputs.restore(prepared.targets(rows))
+        weights = np.array(prepared.weights)
+        restored[weights == 0] = 0
+        return GaussianFeatures(
+            features=restored, weights=weights, mean=outputs.mean, space=outputs.space, basis=outputs.basis
+        )
+
 
 def prepare_memory(
     scene: Scene,
@@ -60,6 +74,8 @@ def prepare_memory(
     bank: BankConfig = BankConfig(),
     prepare: PrepareConfig = PrepareConfig(),
     *,
+    predicted: GaussianFeatures | None = None,
+    sample: int = 0,
     track: Track = untracked,
 ) -> MemoryScene:
     """Prepares a scene for one teacher, or opens what was prepared in this folder before.
@@ -70,6 +86,8 @@ def prepare_memory(
         folder: created if it does not exist.
         bank: how the bank is made.
         prepare: settings of the fusion and of the rows.
+        predicted: features of the teacher's space that an encoder predicts for the scene; None = they are fused.
+        sample: number of raw features that are stored beside the bank for `open_raw_sample`, or all if there are fewer.
         track: wraps loops to show progress.
 
     Raises:
@@ -78,26 +96,27 @@ def prepare_memory(
     """
     if not (prepare.center and prepare.scale):
         raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
-    made_with = _made_with(scene, teacher, bank, prepare)
+    if predicted is not None and predicted.space != teacher.space:
+        raise InputError(
+            f"memory: the predicted features are of ({predicted.space.describe()}), and the teacher's of "
+            f"({teacher.space.describe()})"
+        )
+    made_with = _made_with(scene, teacher, bank, prepare, predicted)
+    stream = _map_stream(scene, teacher, folder)
     if (folder / BANK_FILE).is_file():
-        return open_memory_scene(folder, made_with)
-    assert scene.views is not None
+        made = open_memory_scene(folder, made_with)
+        _sample_raw(folder, stream, made.outputs.space, sample)
+        return made
     maps = folder / MAPS_FOLDER
-    with advised(f"remove {folder} to prepare the scene again"):
-        fusion = replace(prepare.fusion, views=0)
-        fused = fuse(scene, teacher, fusion, work=None if teacher.cheap else maps, track=track)
-        features = fused.features
-        outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
-        source: Teacher = teacher if teacher.cheap else CachedTeacher(teacher, maps)
-        views, count = scene.views, len(scene.views)
-
-        def stream() -> Iterator[tuple[int, FeatureMap]]:
-            for view in range(count):
-                yield view, source.feature_map(views, view)
-
-        components = build_bank(stream, features.space, features.mean, bank)
-        rows = view_rows(scene, source, outputs, prepare)
+    work = None if teacher.cheap else maps
+    features = predicted or fuse(scene, teacher, prepare.fusion, work=work, track=track).features
+    outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
+    source = _source(teacher, folder)
+    maps.mkdir(parents=True, exist_ok=True)
+    components = build_bank(stream, features.space, features.mean, bank)
+    rows = view_rows(scene, source, outputs, prepare)
     folder.mkdir(parents=True, exist_ok=True)
+    _sample_raw(folder, stream, features.space, sample)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())
     _write_bank(folder / BANK_FILE, components, outputs, made_with)
     return open_memory_scene(folder, made_with)
@@ -123,6 +142,7 @@ def open_memory_scene(folder: Path, made_with: Mapping[str, Any] | None = None) 
         bank = MemoryBank(
             components=components,
             sources=file.array("sources", "int32", (len(components), 3)),
+            grid_from_image=file.array("source_grids", "float64", (len(components), 2, 3)),
             mean=file.array("bank_mean", "float32", (outputs.space.channels,)),
             **{name: file.value(name, float, int) for name in ("threshold", "coverage", "cosine")},
             space=outputs.space,
@@ -130,14 +150,56 @@ def open_memory_scene(folder: Path, made_with: Mapping[str, Any] | None = None) 
     return MemoryScene(prepared=PreparedScene(folder / SCENE_FILE), outputs=outputs, bank=bank)
 
 
+def open_raw_sample(folder: Path) -> RawSample:
+    """The raw features that were stored beside the bank.
+
+    Raises:
+        InputError: none were, or they are damaged.
+    """
+    with advised(f"remove {folder} to prepare the scene again"), open_archive(folder / SAMPLE_FILE) as file:
+        return RawSample(features=file.array("features", "float32", ("n", "D")), total=file.value("total", int))
+
+
+def _sample_raw(folder: Path, stream: MapStream, space: FeatureSpace, count: int) -> None:
+    """Stores a sample of raw features, unless there is one of this number already."""
+    path = folder / SAMPLE_FILE
+    if not count:
+        return
+    if path.is_file():
+        with open_archive(path) as file:
+            if file.value("limit", int) == count:
+                return
+    sample = draw_sample(stream, space, count)
+    write_archive(path, {"features": sample.features}, {"total": sample.total, "limit": count})
+
+
+def _source(teacher: Teacher, folder: Path) -> Teacher:
+    """The teacher, its maps read from where the fusion has left them unless they are cheap."""
+    return teacher if teacher.cheap else CachedTeacher(teacher, folder / MAPS_FOLDER)
+
+
+def _map_stream(scene: Scene, teacher: Teacher, folder: Path) -> MapStream:
+    assert scene.views is not None
+    views, source = scene.views, _source(teacher, folder)
+
+    def stream() -> Iterator[tuple[int, FeatureMap]]:
+        for view in range(len(views)):
+            yield view, source.feature_map(views, view)
+
+    return stream
+
+
 def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, made_with: Mapping[str, Any]) -> None:
     arrays, header = output_space_parts(outputs)
     arrays |= {"bank": bank.components, "sources": bank.sources, "bank_mean": bank.mean}
+    arrays["source_grids"] = bank.grid_from_image
     figures = {name: getattr(bank, name) for name in ("threshold", "coverage", "cosine")}
     write_archive(path, arrays, {**header, **figures, "made_with": dict(made_with)})
 
 
-def _made_with(scene: Scene, teacher: Teacher, bank: BankConfig, prepare: PrepareConfig) -> dict[str, Any]:
+def _made_with(
+    scene: Scene, teacher: Teacher, bank: BankConfig, prepare: PrepareConfig, predicted: GaussianFeatures | None
+) -> dict[str, Any]:
     """What a preparation depends on, as JSON values."""
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -147,6 +209,7 @@ def _made_with(scene: Scene, teacher: Teacher, bank: BankConfig, prepare: Prepar
         "teacher": teacher.settings(),
         "bank": plain(bank),
         "prepare": plain(prepare),
+        "predicted": None if predicted is None else sha256(predicted.features.tobytes()).hexdigest()[:16],
     }
     return dict(json.loads(json.dumps(made_with, default=str)))
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 from torch import Tensor
 
 from gsencoder.render import Blend, BlendConfig
@@ -117,6 +117,24 @@ def sample_rows(
         weight=torch.from_numpy(weight[entries]),
         targets=torch.from_numpy(view.targets[chosen]),
         row_weights=torch.ones(len(chosen)),
+    )
+
+
+def gaussian_rows(rows: Int64[np.ndarray, " n"], targets: Float32[np.ndarray, "n C"], weight: float) -> RenderRows:
+    """Gaussians as rows of B with one entry each.
+
+    Args:
+        rows: which Gaussians.
+        targets: of these, standard units.
+        weight: of each in the loss.
+    """
+    count = len(rows)
+    return RenderRows(
+        crow=torch.arange(count + 1),
+        col=torch.from_numpy(rows.astype(np.int32)),
+        weight=torch.ones(count),
+        targets=torch.from_numpy(targets),
+        row_weights=torch.full((count,), float(weight)),
     )
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from gsencoder.types.checks import check_array, check_finite, check_rows, fail
 from gsencoder.types.features import FeatureBasis, FeatureSpace, GaussianFeatures
@@ -25,6 +25,8 @@ class MemoryBank:
     Attributes:
         components: raw features.
         sources: for each component the view, and the row and column of the map's cell, that it comes from.
+        grid_from_image: for each component the affine of its map, as `FeatureMap` has it: from pixels of the view's
+            image to cells of the map.
         mean: of the space; zero where cosines are not centered.
         threshold: θ, a cosine.
         coverage: share of the raw features that have a component within the threshold.
@@ -34,6 +36,7 @@ class MemoryBank:
 
     components: Float32[np.ndarray, "M D"]
     sources: Int32[np.ndarray, "M 3"]
+    grid_from_image: Float64[np.ndarray, "M 2 3"]
     mean: Float32[np.ndarray, " D"]
     threshold: float
     coverage: float
@@ -43,11 +46,16 @@ class MemoryBank:
     def __post_init__(self) -> None:
         check_array("MemoryBank", "components", self.components, "float32", ("M", self.space.channels))
         check_array("MemoryBank", "sources", self.sources, "int32", (len(self.components), 3))
+        check_array("MemoryBank", "grid_from_image", self.grid_from_image, "float64", (len(self.components), 2, 3))
         check_array("MemoryBank", "mean", self.mean, "float32", (self.space.channels,))
+        check_finite("MemoryBank", "grid_from_image", self.grid_from_image)
         check_finite("MemoryBank", "components", self.components)
         check_finite("MemoryBank", "mean", self.mean)
         if not len(self.components):
             fail("MemoryBank", "components", "one component or more", "none")
+        affine = self.grid_from_image
+        diagonal = (affine[:, 0, 1] == 0) & (affine[:, 1, 0] == 0) & (affine[:, 0, 0] > 0) & (affine[:, 1, 1] > 0)
+        check_rows("MemoryBank", "grid_from_image", diagonal, "resizes and crops (diagonal, positive)", affine)
         if not 0 < self.threshold <= 1:
             fail("MemoryBank", "threshold", "a cosine above 0 and up to 1", str(self.threshold))
         if not -1 <= self.cosine <= 1 + EPS or not 0 <= self.coverage <= 1:
@@ -55,6 +63,14 @@ class MemoryBank:
 
     def __len__(self) -> int:
         return len(self.components)
+
+    @property
+    def cells(self) -> Float64[np.ndarray, "M 4"]:
+        """The rectangles that the components come from, in pixels of the images of their views: left, top, right and
+        bottom edge. A rectangle may reach beyond its image where the map does."""
+        scale, shift = self.grid_from_image[:, [0, 1], [0, 1]], self.grid_from_image[:, :, 2]
+        first = self.sources[:, [2, 1]]
+        return np.concatenate([(first - shift) / scale, (first + 1 - shift) / scale], axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,47 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from memory_samples import make_memory
 
 from gsencoder.core.errors import InputError
 from gsencoder.memory import attention as attention_module
 from gsencoder.memory.attention import MemoryAttention, random_projection
-from gsencoder.types import FeatureBasis, FeatureSpace, MemoryBank, QueryMemory
+from gsencoder.types import FeatureBasis, FeatureSpace, QueryMemory
 from gsencoder.types import memory as memory_types
 from gsencoder.types.memory import Scoring
 
 SCORINGS: list[Scoring] = ["centered", "cosine", "dot"]
-TEMPERATURE = {"centered": 0.05, "cosine": 0.05, "dot": 1.0}
-
-
-def make_memory(
-    scoring: Scoring = "centered", *, components: int = 70, channels: int = 24, width: int = 6, gaussians: int = 200
-) -> QueryMemory:
-    rng = np.random.default_rng(components)
-    space = FeatureSpace(name="s", channels=channels)
-    mean = rng.normal(size=channels).astype(np.float32)
-    raw = (rng.normal(size=(components, channels)) + mean).astype(np.float32)
-    weights = rng.uniform(0.5, 2, gaussians).astype(np.float32)
-    weights[::7] = 0
-    queries = rng.normal(size=(gaussians, width)).astype(np.float32)
-    queries[weights == 0] = 0
-    bank = MemoryBank(
-        components=raw,
-        sources=np.zeros((components, 3), np.int32),
-        mean=mean if scoring == "centered" else np.zeros_like(mean),
-        threshold=0.9,
-        coverage=1.0,
-        cosine=0.95,
-        space=space,
-    )
-    return QueryMemory(
-        queries=queries,
-        weights=weights,
-        projection=rng.normal(size=(width, channels)).astype(np.float32),
-        bank=bank,
-        scoring=scoring,
-        temperature=TEMPERATURE[scoring],
-        mean=mean,
-    )
 
 
 def equation(memory: QueryMemory, queries: np.ndarray) -> np.ndarray:
@@ -105,10 +74,17 @@ def test_blocks_of_queries_give_what_all_at_once_give(monkeypatch: pytest.Monkey
     memory = make_memory()
     module, queries = module_of(memory), torch.from_numpy(memory.queries)
     whole, whole_numpy = module(queries).detach(), memory.attend(memory.queries)
+    leaf = queries.clone().requires_grad_()
+    expected = torch.autograd.grad(module(leaf).square().sum(), [leaf, module.projection])
     monkeypatch.setattr(attention_module, "BLOCK_SCORES", 70 * 13)
     monkeypatch.setattr(memory_types, "BLOCK_SCORES", 70 * 13)
     with torch.no_grad():
         torch.testing.assert_close(module(queries), whole)
+    queries.requires_grad_()
+    (in_blocks := module(queries)).square().sum().backward()
+    torch.testing.assert_close(in_blocks.detach(), whole)
+    torch.testing.assert_close(queries.grad, expected[0])
+    torch.testing.assert_close(module.projection.grad, expected[1])
     np.testing.assert_allclose(memory.attend(memory.queries), whole_numpy, rtol=1e-6, atol=1e-7)
     assert memory.attend(memory.queries[:0]).shape == (0, 24)
 
@@ -191,6 +167,10 @@ def test_a_memory_whose_parts_do_not_fit_is_refused(no_jaxtyping: None) -> None:
         {"components": memory.bank.components[:0], "sources": memory.bank.sources[:0]},
         {"components": memory.bank.components * np.float32(np.inf)},
         {"sources": memory.bank.sources[:-1]},
+        {"grid_from_image": memory.bank.grid_from_image[:-1]},
+        {"grid_from_image": -memory.bank.grid_from_image},
+        {"grid_from_image": memory.bank.grid_from_image[:, :, [1, 0, 2]]},
+        {"grid_from_image": memory.bank.grid_from_image * np.nan},
         {"threshold": 0.0},
         {"coverage": 1.1},
         {"space": FeatureSpace(name="s", channels=23)},

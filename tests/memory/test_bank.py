@@ -127,6 +127,18 @@ def test_a_coded_map_gives_each_vector_that_occurs_once() -> None:
     np.testing.assert_array_equal(sources, [[7, 1, 0], [7, 0, 1]])
 
 
+def test_names_are_all_components_however_alike_they_are_unless_fewer_are_asked_for() -> None:
+    rng = np.random.default_rng(0)
+    table = (rng.normal(size=16) + 0.1 * rng.normal(size=(40, 16))).astype(np.float32)
+    codes = rng.integers(0, 40, (2, 12, 20)).astype(np.int32)
+    maps = [FeatureMap(codes=each, table=table, grid_from_image=GRID, space=SPACE) for each in codes]
+    mean = np.zeros(16, np.float32)
+    bank = build_bank(stream(maps), SPACE, mean)
+    assert len(bank) == 40
+    assert {row.tobytes() for row in bank.components} == {row.tobytes() for row in table}
+    assert len(build_bank(stream(maps), SPACE, mean, BankConfig(components=20))) <= 20
+
+
 def test_equal_features_are_one_component_and_no_features_are_refused() -> None:
     equal = FeatureMap(features=np.full((4, 5, 16), 2, np.float32), grid_from_image=GRID, space=SPACE)
     mean = np.full(16, 2, np.float32)

@@ -55,7 +55,9 @@ COMMANDS = {
             name="pack", config="PackConfig", help="store features in a few bytes a Gaussian, or for other programs"
         ),
         Command(
-            name="export", config="ExportConfig", help="export an encoder as one ONNX file that takes raw Gaussians"
+            name="export",
+            config="ExportConfig",
+            help="export an encoder, which takes raw Gaussians, or a memory as one ONNX file",
         ),
         Command(
             name="localize", config="LocalizeCommandConfig", help="find words in a scene: boxes, scores and pictures"

@@ -16,6 +16,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
+from gsencoder.fusion.store.folder import load_memories
 from gsencoder.fusion.store.heads_file import copy_heads, heads_beside, heads_of_graph
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.load_encoder import file_of_encoder
@@ -29,6 +30,7 @@ from gsencoder.infer.onnx.export import (
     lower,
     random_cloud,
 )
+from gsencoder.infer.onnx.memory import export_memory
 from gsencoder.infer.onnx.runtime import SUFFIX
 
 
@@ -50,6 +52,14 @@ class ExportConfig(CommonConfig):
             "house_cpu, which does"
         },
     )
+    memory: str = field(
+        default="",
+        metadata={
+            "help": "folder written by `memory`, whose attention is exported, from queries to features, in place of an "
+            "encoder"
+        },
+    )
+    space: str = field(default="", metadata={"help": "teacher of the memory, if the folder holds several"})
     out: Path | None = field(
         default=None,
         metadata={
@@ -91,6 +101,10 @@ class ExportConfig(CommonConfig):
             raise InputError(f"tolerance: expected a share between 0 and 1, got {self.tolerance}")
         if not -1 <= self.cosine <= 1:
             raise InputError(f"cosine: expected -1 to 1, got {self.cosine}")
+        if self.memory and self.weights:
+            raise InputError("memory, weights: expected one of the two, a memory or an encoder")
+        if self.memory and self.precision != "float32":
+            raise InputError(f"precision: expected float32 with memory=, got {self.precision}")
 
 
 def run(config: ExportConfig, summary: Summary) -> None:
@@ -102,6 +116,9 @@ def run(config: ExportConfig, summary: Summary) -> None:
         raise InputError(f"weights: {config.weights} is an exported graph already; give the encoder that `train` wrote")
     for path in (config.out, Path(f"{config.out}.summary.json"), heads_of_graph(config.out)):
         refuse_existing(path, config.overwrite)
+    if config.memory:
+        _export_memory(config, config.out, summary)
+        return
     track = Progress(quiet=config.quiet)
     with summary.step("load"):
         encoder = TorchEncoder(config.weights)
@@ -152,6 +169,30 @@ def run(config: ExportConfig, summary: Summary) -> None:
     screen.print(
         f"{config.out}: {len(model) / 1e6:.1f} MB; {agreement} on {len(compared)} clouds of {min(compared):,} to "
         f"{max(compared):,} Gaussians"
+    )
+
+
+def _export_memory(config: ExportConfig, out: Path, summary: Summary) -> None:
+    """Writes the attention of a memory.
+
+    Raises:
+        InputError: no memory, or several and none is named.
+    """
+    with summary.step("load"):
+        memories = load_memories(config.memory)
+        if len(memories) > 1 and config.space not in memories:
+            names = ", ".join(str(name) for name in memories)
+            raise InputError(f"space: the folder has memories of {names}; name one of them")
+        memory = memories[config.space] if len(memories) > 1 else next(iter(memories.values()))
+    with summary.step("export"):
+        model = export_memory(memory)
+    with summary.step("write"), atomic_file(out) as stream:
+        stream.write(model)
+    summary.results.update(onnx=str(out), bytes=len(model), components=len(memory.bank), space=memory.space.describe())
+    write_json(f"{out}.summary.json", summary.to_dict())
+    console(config.quiet).print(
+        f"{out}: {len(model) / 1e6:.1f} MB; features of {memory.space.channels} channels from queries of "
+        f"{memory.channels}, by attention to {len(memory.bank):,} components"
     )
 
 

@@ -2,9 +2,17 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gsencoder.app.commands.from_poses import (
+    FROM_POSE,
+    asked_cameras,
+    describe_point,
+    memory_of,
+    search_from_poses,
+)
 from gsencoder.app.commands.query_words import asked_scene, query_words
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import one_line
@@ -41,6 +49,16 @@ class LocalizeCommandConfig(CommonConfig):
             "features themselves are"
         },
     )
+    pose: str = field(
+        default="",
+        metadata={
+            "help": "a JSON file of cameras in world coordinates (cam_from_world or transform_matrix, fx, fy, cx, cy, "
+            "width, height); in each the pixel that answers a word best, and its position, are found"
+        },
+    )
+    view: tuple[str, ...] = field(
+        default=(), metadata={"help": "names of views of the scene, whose cameras are asked like those of pose="}
+    )
     pictures: int = field(default=4, metadata={"help": "number of views drawn for each word; 0 = none"})
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
@@ -50,6 +68,8 @@ class LocalizeCommandConfig(CommonConfig):
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
         if self.pictures < 0:
             raise InputError(f"pictures: expected 0 or more, got {self.pictures}")
+        if (self.pose or self.view) and self.localize.contrast:
+            raise InputError("pose= and view= compare cosines, not contrasts; leave localize.contrast=true out")
 
 
 def run(config: LocalizeCommandConfig, summary: Summary) -> None:
@@ -66,6 +86,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         asked, table = asked_scene(
             scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
         )
+        cameras = asked_cameras(scene, config.pose, config.view)
     with summary.step("localize"):
         localization = localize(asked, words, table, config.localize)
     out = config.out or Path("outputs") / scene.name / "boxes"
@@ -84,11 +105,30 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
             with summary.step("pictures"):
                 for name, picture in relevancy_pictures(scene, localization, per_word=config.pictures):
                     picture.save(target / f"{name}.png")
+        points: list[dict[str, Any]] = []
+        if cameras is not None:
+            with summary.step("from_pose"):
+                # Heads lead into other spaces than the one in which a memory attends.
+                memory = None if config.head else memory_of(folder, asked)
+                for found, drawn in search_from_poses(
+                    asked, cameras, words, table, config.localize, memory=memory, pictures=config.pictures > 0
+                ):
+                    points += found
+                    for name, picture in drawn:
+                        picture.save(target / f"{name}.png")
+            write_json(target / FROM_POSE, points)
+            summary.results["from_pose"] = points
     screen = console(config.quiet)
     for word in words:
         screen.print(f"{one_line(word)}: {_first_box(localization, word)}")
-    drawn = "boxes.ply and pictures" if config.pictures and scene.views is not None else "boxes.ply"
-    screen.print(f"{out}: boxes.json, words.json, {drawn}; boxes are drawn around Gaussian {config.localize.extent}")
+        for point in points:
+            if point["query"] == word:
+                screen.print(f"  {one_line(describe_point(point))}")
+    drawn_files = "boxes.ply and pictures" if config.pictures and scene.views is not None else "boxes.ply"
+    more = f" {FROM_POSE}," if cameras is not None else ""
+    screen.print(
+        f"{out}: boxes.json, words.json,{more} {drawn_files}; boxes are drawn around Gaussian {config.localize.extent}"
+    )
 
 
 def _first_box(localization: Localization, word: str) -> str:

@@ -14,27 +14,34 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, about, advised
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
+from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
 from gsencoder.fusion.store.folder import file_of_teacher, save_memories
 from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.fusion.store.words import save_tables
 from gsencoder.fusion.teachers.build import build_teacher, words_beside, words_by_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.memory.bank import BankConfig
+from gsencoder.memory.raw_sample import RawSample
 from gsencoder.models.output_space import check_distinct
 from gsencoder.text.table import TextTable
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.memory import memory_training, train_memory, untrained_memory
 from gsencoder.train.memory_network import MemoryConfig
-from gsencoder.train.memory_scene import MemoryScene, open_memory_scene, prepare_memory
+from gsencoder.train.memory_scene import MemoryScene, open_memory_scene, open_raw_sample, prepare_memory
 from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.train.render_rows import sample_rows
 from gsencoder.train.trainer import TrainerConfig
-from gsencoder.types import QueryMemory, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
+
+DRAWN_FEATURES = 20_000
+"""Raw features in a scatter plot, at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,11 +54,28 @@ class MemoryCommandConfig(SourceConfig, CommonConfig):
     bank: BankConfig = field(default_factory=BankConfig)
     memory: MemoryConfig = field(default_factory=MemoryConfig)
     train: TrainerConfig = field(default_factory=memory_training)
+    weights: str = field(
+        default="",
+        metadata={
+            "help": "an encoder whose predictions take the place of fused features; with optimize=false the memory of "
+            "an unseen scene is made in one pass; empty = features are fused"
+        },
+    )
     optimize: bool = field(
         default=True, metadata={"help": "optimize the queries; false = those of the fused features, without training"}
     )
     joint: bool = field(
         default=True, metadata={"help": "optimize for all teachers at once; false = for one after the other"}
+    )
+    pictures: int = field(
+        default=4,
+        metadata={
+            "help": "number of views, evenly spaced, of which a pixel and the components that it attends to are drawn, "
+            "beside a scatter plot of components and raw features; 0 = no pictures"
+        },
+    )
+    umap: bool = field(
+        default=False, metadata={"help": "draw the scatter plot by UMAP, too; needs the package umap-learn"}
     )
     resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
     device: Device = field(default="auto", metadata={"help": "where queries are optimized"})
@@ -60,6 +84,14 @@ class MemoryCommandConfig(SourceConfig, CommonConfig):
         SourceConfig.__post_init__(self)
         if len(self.paths) > 1:
             raise InputError(f"paths: expected one scene, got {len(self.paths)}")
+        if self.pictures < 0:
+            raise InputError(f"pictures: expected 0 or more, got {self.pictures}")
+        if self.umap:
+            if not self.pictures:
+                raise InputError("umap: expected pictures=1 or more with umap=true; there is no scatter plot without")
+            from gsencoder.infer.draw.component_scatter import check_umap
+
+            check_umap()
         if not self.optimize and self.memory.init == "random":
             raise InputError("optimize=false: random queries mean nothing without training; give memory.init=fused")
 
@@ -108,6 +140,11 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
         with summary.step("write"):
             save_memories(folder, scene, memories, settings(config))
             save_tables(folder, tables, memories)
+        if config.pictures:
+            advice = "give pictures=0 to write the memory without pictures"
+            with summary.step("pictures"), advised(advice):
+                for name, memory in memories.items():
+                    _draw(folder, scene, name, memory, open_raw_sample(state.path / name), config)
         files = {name: file_of_teacher(MEMORY_FILE, name if len(memories) > 1 else None) for name in memories}
         figures = {name: _figures(folder / files[name], each, errors[name]) for name, each in memories.items()}
         summary.results.update(gaussians=len(next(iter(memories.values()))), teachers=figures)
@@ -136,6 +173,8 @@ def _prepare(
 ) -> dict[str, TextTable]:
     """Prepares a scene for all teachers in folders of their own; the tables of words that lead into their features."""
     tables, spaces = {}, {}
+    with summary.step("encode"):
+        predicted = predicted_features(scene, config) if config.weights else {}
     for name, teacher_config in config.teachers_by_name.items():
         with about(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
             with summary.step("teacher"):
@@ -143,10 +182,60 @@ def _prepare(
             spaces[name] = teacher.space
             check_distinct(spaces)
             with summary.step("prepare"):
-                prepare_memory(scene, teacher, work / name, config.bank, config.prepare, track=track)
+                features = in_space(predicted, teacher.space, config.weights) if config.weights else None
+                prepare_memory(
+                    scene,
+                    teacher,
+                    work / name,
+                    config.bank,
+                    config.prepare,
+                    predicted=features,
+                    sample=DRAWN_FEATURES if config.pictures else 0,
+                    track=track,
+                )
             if (table := words_beside(teacher, words.get(name))) is not None:
                 tables[name] = table
     return tables
+
+
+def predicted_features(scene: Scene, config: MemoryCommandConfig) -> dict[str, GaussianFeatures]:
+    """The features that an encoder predicts for a scene, by its teachers."""
+    assert scene.gaussians is not None
+    encoder = load_encoder(config.weights, config.device)
+    encoding = EncodeConfig(device=config.device)
+    return encoder.encode_spaces(scene.gaussians, encoding, metres_per_unit=unit_of(scene, encoder.voxel))
+
+
+def in_space(predicted: Mapping[str, GaussianFeatures], space: FeatureSpace, weights: str) -> GaussianFeatures:
+    """The predicted features of a teacher's space.
+
+    Raises:
+        InputError: the encoder gives none.
+    """
+    for features in predicted.values():
+        if features.space == space:
+            return features
+    theirs = "; ".join(each.space.describe() for each in predicted.values())
+    raise InputError(
+        f"weights: the encoder of {weights} gives features of ({theirs}), and the teacher's are of "
+        f"({space.describe()}); give weights that were trained with this teacher"
+    )
+
+
+def _draw(
+    folder: Path, scene: Scene, name: str, memory: QueryMemory, sample: RawSample, config: MemoryCommandConfig
+) -> None:
+    """Writes the pictures of one teacher's memory."""
+    from PIL import Image
+
+    from gsencoder.infer.draw.attention_pictures import attention_pictures
+    from gsencoder.infer.draw.component_scatter import component_scatter
+
+    scatter = component_scatter(memory.bank, sample, umap=config.umap)
+    Image.fromarray(scatter).save(folder / f"components.{name}.png")
+    blend = config.prepare.fusion.blend
+    for view, picture in attention_pictures(memory, scene, views=config.pictures, config=blend):
+        picture.save(folder / f"attention.{name}.view{view:03d}.png")
 
 
 def fit_errors(memory: QueryMemory, scene: MemoryScene, min_alpha: float) -> RenderedErrors:

@@ -141,7 +141,7 @@ def read_transforms(
         scale = next(value for value in (depth_scale, stated, NERFSTUDIO_DEPTH_SCALE) if value is not None)
         if not 0 < scale < math.inf:
             raise InputError(f"{where}: the depth scale must be positive, got {scale}")
-        pose = rigid_pose(_matrix(frame, "transform_matrix", where), where)
+        pose = rigid_pose(read_matrix(frame, "transform_matrix", where), where)
         depth_camera, depth_from_color = _depth_sensor(data | frame, beside["depth"], where)
         measure, no_depth = (data | frame).get("depth_measure", "z"), number(data | frame, "no_depth", where)
         if measure not in ("z", "ray"):
@@ -206,10 +206,15 @@ def _depth_sensor(
         camera = _camera({}, stated, depth, f"{where}: depth_camera")
     if values.get("depth_from_color") is None:
         return camera, None
-    return camera, rigid_pose(_matrix(values, "depth_from_color", where), f"{where}: depth_from_color")
+    return camera, rigid_pose(read_matrix(values, "depth_from_color", where), f"{where}: depth_from_color")
 
 
-def _matrix(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:
+def read_matrix(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:
+    """A matrix of 4 rows, or of the upper 3, of a JSON object; whether it is a pose is not asked.
+
+    Raises:
+        InputError: the key is missing, or its value is no such matrix of finite numbers; `where` starts the message.
+    """
     value = values.get(key)
     rows = value if isinstance(value, list) else []
     good = len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)

@@ -45,6 +45,7 @@ def write_memory(path: Path, memory: QueryMemory, gaussians: Gaussians, more: Ma
         "bank_scale": component_scale,
         "bank_mean": bank.mean,
         "sources": bank.sources,
+        "source_grids": bank.grid_from_image,
     }
     header |= {
         "fingerprint": fingerprint(gaussians),
@@ -78,6 +79,7 @@ def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
     bank = MemoryBank(
         components=components * file.array("bank_scale", "float32", (space.channels,)),
         sources=file.array("sources", "int32", (len(components), 3)),
+        grid_from_image=file.array("source_grids", "float64", (len(components), 2, 3)),
         mean=file.array("bank_mean", "float32", (space.channels,)),
         **{name: file.value(name, float, int) for name in ("threshold", "coverage", "cosine")},
         space=space,

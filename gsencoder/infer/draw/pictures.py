@@ -311,17 +311,17 @@ def contact_sheet(
     for row, height in zip(rows, heights, strict=True):
         for column, i in enumerate(row):
             left = gap + column * (width + gap)
-            draw.text((left, top + 2), _fit(draw, titles[i], width), fill=INK, font=label_font(17))
+            draw.text((left, top + 2), fit_text(draw, titles[i], width), fill=INK, font=label_font(17))
             sheet.paste(images[i], (left, top + head))
         top += height
     return np.asarray(sheet)
 
 
-def _fit(draw: ImageDraw.ImageDraw, text: str, width: int) -> str:
-    """The text, cut with an ellipsis to what a line holds."""
+def fit_text(draw: ImageDraw.ImageDraw, text: str, width: int, size: int = 17) -> str:
+    """The text, cut with an ellipsis to what a line of a width in pixels holds in the label font of this size."""
     text = _printable(text, 200)
-    if draw.textlength(text, label_font(17)) <= width:
+    if draw.textlength(text, label_font(size)) <= width:
         return text
-    while text and draw.textlength(text + "…", label_font(17)) > width:
+    while text and draw.textlength(text + "…", label_font(size)) > width:
         text = text[:-1]
     return text.rstrip() + "…"

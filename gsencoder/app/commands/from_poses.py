@@ -1,0 +1,152 @@
+"""The cameras of pose= and view=, and what they see of words: points, their JSON values and pictures."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsencoder.core.errors import InputError, listed
+from gsencoder.data.readers.camera_file import read_cameras
+from gsencoder.fusion.store.folder import load_memories, teachers_in
+from gsencoder.fusion.store.memory_file import MEMORY_FILE
+from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.text.encoder import TextEncoder
+from gsencoder.types import Cameras, QueryMemory, Scene
+
+FROM_POSE = "from_pose.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AskedCameras:
+    """Cameras that words are searched from.
+
+    Attributes:
+        cameras: relative to the scene's origin.
+        views: for each the name of the scene's view, or None for a camera of a file.
+    """
+
+    cameras: Cameras
+    views: tuple[str | None, ...]
+
+
+def asked_cameras(scene: Scene, pose: str, views: Sequence[str]) -> AskedCameras | None:
+    """The cameras of a file, followed by those of views of the scene; None where neither is asked for.
+
+    Args:
+        scene: whose views and origin they are.
+        pose: path of a JSON file in the form of `gsencoder.data.readers.camera_file`, or empty.
+        views: names of views.
+
+    Raises:
+        InputError: an unknown or malformed file, or an unknown view.
+    """
+    parts, names = [], [*views]
+    in_file = 0
+    if pose:
+        parts.append(read_cameras(Path(pose), scene.origin))
+        in_file = len(parts[0])
+    if names:
+        known = {} if scene.views is None else {name: row for row, name in enumerate(scene.views.names)}
+        for name in names:
+            if name not in known:
+                some = f"its views are {listed(list(known))}" if known else "it has no views"
+                raise InputError(f"view: scene {scene.name} has no view {name[:80]!r}; {some}")
+        assert scene.views is not None
+        parts.append(scene.views.cameras.select([known[name] for name in names]))
+    if not parts:
+        return None
+    cameras = Cameras(
+        cam_from_world=np.concatenate([part.cam_from_world for part in parts]),
+        Ks=np.concatenate([part.Ks for part in parts]),
+        widths=np.concatenate([part.widths for part in parts]),
+        heights=np.concatenate([part.heights for part in parts]),
+    )
+    return AskedCameras(cameras=cameras, views=(*(None,) * in_file, *names))
+
+
+def memory_of(folder: Path, asked: Scene) -> QueryMemory | None:
+    """The memory that the one feature set of a scene was decoded from; None where features are stored themselves."""
+    if not (folder / MEMORY_FILE).is_file() and not teachers_in(folder, MEMORY_FILE):
+        return None
+    (features,) = asked.features.values()
+    return next((memory for memory in load_memories(folder).values() if memory.space == features.space), None)
+
+
+def search_from_poses(
+    asked: Scene,
+    cameras: AskedCameras,
+    words: Sequence[str],
+    text: TextEncoder,
+    config: LocalizeConfig,
+    *,
+    memory: QueryMemory | None = None,
+    pictures: bool = True,
+) -> Iterator[tuple[list[dict[str, Any]], list[tuple[str, Image.Image]]]]:
+    """What each camera sees of the words.
+
+    Args:
+        asked: the scene with one feature set.
+        cameras: relative to its origin.
+        words: that `text` knows.
+        text: turns words into the features' space.
+        config: its mode and threshold are used.
+        memory: of the Gaussians, where the features come from one.
+        pictures: draw a picture for each word.
+
+    Yields:
+        For each camera the points of the words as JSON values, and pictures with their names.
+    """
+    # Rendering needs torch, which finding boxes does without.
+    from gsencoder.infer.draw.pose_pictures import pose_picture, view_picture
+    from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig
+
+    field = FeatureField(asked, memory=memory, config=FromPoseConfig(mode=config.mode, threshold=config.threshold))
+    for view, name in enumerate(cameras.views):
+        seen = field.at(cameras.cameras, view)
+        points = seen.find(words, text)
+        drawn = []
+        if pictures:
+            rgb = view_picture(seen)
+            for number, point in enumerate(points):
+                (relevancy,) = seen.relevancy([point.query], text)
+                safe = "".join(c if c.isalnum() else "_" for c in point.query)[:60]
+                picture = pose_picture(rgb, seen, point, relevancy)
+                drawn.append((f"pose{view:03d}_{number:02d}_{safe}", Image.fromarray(picture)))
+        yield (
+            [
+                {
+                    "query": point.query,
+                    "camera": view,
+                    "view": name,
+                    "visible": point.visible,
+                    "relevancy": _finite(point.relevancy),
+                    "threshold": _finite(point.threshold),
+                    "alpha": _finite(point.alpha),
+                    "pixel": [_finite(value) for value in point.pixel.tolist()],
+                    "depth": _finite(point.depth),
+                    "position": [_finite(value) for value in point.position.tolist()],
+                }
+                for point in points
+            ],
+            drawn,
+        )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def describe_point(point: dict[str, Any]) -> str:
+    """A line about one point, for people."""
+    camera = f"camera {point['camera']}" if point["view"] is None else f"view {point['view']}"
+    if point["relevancy"] is None:
+        return f"{camera}: nothing that has features is in view"
+    if not point["visible"]:
+        return f"{camera}: not visible (relevancy {point['relevancy']:.2f}, threshold {point['threshold']:.2f})"
+    x, y = point["pixel"]
+    place = ", ".join(f"{value:.3f}" for value in point["position"])
+    return f"{camera}: pixel ({x:.1f}, {y:.1f}), relevancy {point['relevancy']:.2f}, at ({place})"

@@ -1,0 +1,280 @@
+"""Words to points from the pose of a camera, as a robot asks for what it sees (M3, sec. 4.4).
+
+The features of the scene are rendered at the pose, the pixel that is most relevant to a word is found, and its depth
+turns it into a position in the world:
+
+    field = FeatureField(scene)              # once for a scene
+    seen = field.at(cameras, view)           # once for a pose
+    seen.find(["yellow bath duck"], words)   # for each question
+
+M3's robot takes the depth from its depth camera; here it is that of the splat.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from gsencoder.core.errors import InputError
+from gsencoder.infer.localize.localize import select_features
+from gsencoder.infer.localize.pixel_relevancy import GaussianProducts, pixel_features
+from gsencoder.infer.localize.relevancy import Mode, word_directions
+from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
+from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.render.rays import strided_lattice
+from gsencoder.text.encoder import TextEncoder, check_space
+from gsencoder.types import Cameras, QueryMemory, Scene
+
+MEMORY_STRIDE = 4
+BLOCK_WORDS = 16
+"""Words that are answered at once."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FromPoseConfig:
+    """How words are found in a view.
+
+    Attributes:
+        mode: cosines after removing each side's mean ("centred"), or as they are ("raw").
+        threshold: relevancy from which on something relevant is visible; it is taken over all Gaussians of the scene,
+            so that a word whose best Gaussians are elsewhere is not visible here.
+        min_alpha: a pixel counts where the Gaussians that have features are at least so opaque: what is fainter is
+            haze, and no surface.
+        stride: every so many pixels are looked at, in both directions; None = all for features, and every fourth for a
+            memory, whose attention takes longer.
+        blend: accuracy of the rendering.
+    """
+
+    mode: Mode = "centred"
+    threshold: ThresholdConfig = field(default_factory=ThresholdConfig)
+    min_alpha: float = 0.5
+    stride: int | None = None
+    blend: BlendConfig = field(default_factory=BlendConfig)
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("centred", "raw"):
+            raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
+        if not 0 < self.min_alpha <= 1:
+            raise InputError(f"min_alpha: expected a number in (0, 1], got {self.min_alpha}")
+        if self.stride is not None and self.stride < 1:
+            raise InputError(f"stride: expected at least 1 pixel, got {self.stride}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosePoint:
+    """Where a camera sees what a word says.
+
+    Attributes:
+        query: the word.
+        camera: number of the camera.
+        visible: whether the relevancy of the pixel reaches the threshold. Where it does not, the other values are those
+            of the best pixel there is.
+        threshold: relevancy from which on something relevant is visible; NaN where no Gaussian has a feature.
+        relevancy: centered cosine of the blended feature at the pixel, in [−1, 1]. This and all that follows is NaN
+            where the camera sees no surface with features.
+        alpha: opacity of all Gaussians at the pixel.
+        pixel: (x, y), pixel centers at .5.
+        depth: z in the camera, world units: the median, by blending weight, over those Gaussians of the pixel whose own
+            relevancy reaches the threshold, or over all that have features where none does. The expected depth of a
+            pixel at an edge lies between object and background, where nothing is. The median over all Gaussians may be
+            that of the background: a cosine has no length, so that before a background with about the mean feature
+            a pixel with a small share of the object is as relevant as one that shows nothing else.
+        position: in world coordinates, with the scene's origin added.
+    """
+
+    query: str
+    camera: int
+    visible: bool
+    threshold: float
+    relevancy: float
+    alpha: float
+    pixel: Float64[np.ndarray, "2"]
+    depth: float
+    position: Float64[np.ndarray, "3"]
+
+
+class FeatureField:
+    """The features of a scene, ready to be looked at from any pose."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        space: str | None = None,
+        memory: QueryMemory | None = None,
+        config: FromPoseConfig = FromPoseConfig(),
+    ) -> None:
+        """Args:
+        scene: Gaussians with features.
+        space: name of the feature set; None where the scene has only one.
+        memory: queries of the same Gaussians. The feature of a pixel is then what its blended query attends to, and
+            the features of the scene, if it has any, give only the threshold; they are those of the memory.
+        config: how words are found.
+
+        Raises:
+            InputError: no Gaussians or features, or a memory of other Gaussians or of another space.
+        """
+        if memory is not None and not scene.features:
+            features, gaussians = memory.features(), scene.gaussians
+            if gaussians is None:
+                raise InputError(f"scene {scene.name} has no Gaussians")
+        else:
+            gaussians, features = select_features(scene, space)
+        if memory is not None:
+            check_space(features.space, memory.space)
+            if len(memory) != len(gaussians):
+                raise InputError(f"memory: queries of {len(memory):,} Gaussians, and a scene of {len(gaussians):,}")
+        self.gaussians, self.origin, self.space = gaussians, scene.origin, features.space
+        self.memory, self.config = memory, config
+        self.products = GaussianProducts(features, config.mode)
+
+    @property
+    def stride(self) -> int:
+        """Every so many pixels of a view are looked at."""
+        if self.config.stride is not None:
+            return self.config.stride
+        return 1 if self.memory is None else MEMORY_STRIDE
+
+    def at(self, cameras: Cameras, view: int = 0, *, b: Blend | None = None) -> "SeenField":
+        """What one camera sees of the field, kept for many words.
+
+        Args:
+            cameras: relative to the scene's origin.
+            view: which camera.
+            b: its blend at the stride of this field, where it has been made already.
+
+        Raises:
+            InputError: no such view, or the blend of other Gaussians or pixels.
+        """
+        if b is None:
+            b = blend(self.gaussians, cameras, view, stride=self.stride, config=self.config.blend)
+        expected = strided_lattice(int(cameras.widths[view]), int(cameras.heights[view]), self.stride)
+        if b.lattice != expected:
+            raise InputError(
+                f"from_pose: expected a blend of {expected.width}×{expected.height} rays, every {self.stride} pixels, "
+                f"got {b.lattice.width}×{b.lattice.height} with {b.lattice.side**2} rays each"
+            )
+        return SeenField(self, cameras, view % len(cameras), b)
+
+
+class SeenField:
+    """A feature field as one camera sees it; its geometry is kept and answers any number of words.
+
+    Attributes:
+        field: of the scene.
+        cameras: relative to the scene's origin.
+        view: number of the camera.
+        b: its blend, a row for each pixel that is looked at.
+    """
+
+    def __init__(self, field: FeatureField, cameras: Cameras, view: int, b: Blend) -> None:
+        self.field, self.cameras, self.view, self.b = field, cameras, view, b
+        self._pixels = pixel_features(field.products, b, memory=field.memory, mode=field.config.mode)
+        self._opaque = self._pixels.alpha >= field.config.min_alpha
+
+    def find(self, queries: Sequence[str], text: TextEncoder) -> tuple[PosePoint, ...]:
+        """Where the camera sees each word.
+
+        Args:
+            queries: words that `text` knows.
+            text: turns words into the features' space.
+
+        Returns:
+            One point for each word, in the order asked.
+
+        Raises:
+            InputError: no or unknown words, or words of another space.
+        """
+        points: list[PosePoint] = []
+        for start in range(0, len(directions := self._directions(queries, text)), BLOCK_WORDS):
+            block = directions[start : start + BLOCK_WORDS]
+            of_gaussians = self.field.products.cosines(block)
+            of_pixels = self._pixels.cosines(block)
+            for word, scores, pixels in zip(queries[start : start + BLOCK_WORDS], of_gaussians, of_pixels, strict=True):
+                points.append(self._point(word, scores, pixels))
+        return tuple(points)
+
+    def relevancy(self, queries: Sequence[str], text: TextEncoder) -> Float32[np.ndarray, "Q h w"]:
+        """Relevancy of each word at the pixels that are looked at; NaN where there is no surface with features.
+
+        Arguments and errors are those of `find`.
+        """
+        cosines = np.clip(self._pixels.cosines(self._directions(queries, text)), -1, 1)
+        cosines[:, ~self._opaque] = np.nan
+        return cosines.reshape(len(queries), *self.b.shape)
+
+    def _directions(self, queries: Sequence[str], text: TextEncoder) -> Float64[np.ndarray, "Q D"]:
+        if isinstance(queries, str) or not queries or any(not word.strip() for word in queries):
+            raise InputError(f"from_pose: expected a list of one or more words, got {queries!r}")
+        check_space(self.field.space, text.space)
+        return word_directions(text.encode(list(queries)), text.mean, self.field.config.mode)
+
+    def _point(
+        self, query: str, of_gaussians: Float32[np.ndarray, " N"], of_pixels: Float32[np.ndarray, " P"]
+    ) -> PosePoint:
+        least = threshold(of_gaussians, self.field.config.threshold)
+        if not self._opaque.any():
+            nowhere = np.full(3, math.nan)
+            return PosePoint(
+                query=query, camera=self.view, visible=False, threshold=least, relevancy=math.nan, alpha=math.nan,
+                pixel=nowhere[:2], depth=math.nan, position=nowhere,
+            )  # fmt: skip
+        best = int(np.where(self._opaque, of_pixels, -np.inf).argmax())
+        relevancy = float(np.clip(of_pixels[best], -1, 1))
+        lattice = self.b.lattice
+        row, column = divmod(best, lattice.width)
+        pixel = np.array([lattice.x0 + column * lattice.dx, lattice.y0 + row * lattice.dy])
+        entries = slice(int(self.b.crow[best]), int(self.b.crow[best + 1]))
+        gaussians, weights = self.b.col[entries].numpy(), self.b.weight[entries].numpy().astype(np.float64)
+        own = of_gaussians[gaussians]
+        relevant = own >= least
+        chosen = relevant if relevant.any() else np.isfinite(own)
+        # Entries are in order of depth.
+        total = weights[chosen].cumsum()
+        middle = int(np.searchsorted(total, total[-1] / 2))
+        depth = float(self.b.depths[gaussians[chosen][middle]])
+        position = self.cameras.unproject(pixel[None], np.array([depth]), self.view)[0] + self.field.origin
+        return PosePoint(
+            query=query,
+            camera=self.view,
+            visible=relevancy >= least,
+            threshold=least,
+            relevancy=relevancy,
+            alpha=float(weights.sum()),
+            pixel=pixel,
+            depth=depth,
+            position=position,
+        )
+
+
+def from_pose(
+    scene: Scene,
+    cameras: Cameras,
+    queries: Sequence[str],
+    text: TextEncoder,
+    config: FromPoseConfig = FromPoseConfig(),
+    *,
+    space: str | None = None,
+    memory: QueryMemory | None = None,
+) -> tuple[PosePoint, ...]:
+    """Where each camera sees each word: `FeatureField` for those who ask once.
+
+    Args:
+        scene: Gaussians with features.
+        cameras: one or several, relative to the scene's origin.
+        queries: words that `text` knows.
+        text: turns words into the features' space.
+        config: how words are found.
+        space: name of the feature set; None where the scene has only one.
+        memory: queries of the same Gaussians; see `FeatureField`.
+
+    Returns:
+        A point for each camera and word: all words of the first camera, then those of the next.
+
+    Raises:
+        InputError: no Gaussians or features, no or unknown words, words of another space.
+    """
+    field = FeatureField(scene, space=space, memory=memory, config=config)
+    return tuple(point for view in range(len(cameras)) for point in field.at(cameras, view).find(queries, text))

@@ -1,0 +1,339 @@
+"""What a pixel attends to, and pictures of it: the components are the strongest, and their cells are outlined."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from memory_samples import make_memory
+from memory_scenes import prepared_wall
+from training_scenes import scene as wall
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.infer.draw.attention_pictures import (
+    EMPTY_BAR,
+    FULL_BAR,
+    GAP,
+    HALO,
+    HEAD,
+    MARK,
+    TILE_SIDE,
+    VIEW_SIDE,
+    attention_picture,
+    attention_pictures,
+    cell_tile,
+    mark_pixel,
+)
+from gsencoder.infer.draw.strongest_components import (
+    attention_entropy,
+    salient_pixel,
+    strongest_components,
+)
+from gsencoder.memory.bank import BankConfig
+from gsencoder.memory.render import render_features, render_queries
+from gsencoder.render import blend
+from gsencoder.render.images import render_image
+from gsencoder.train.memory import untrained_memory
+from gsencoder.train.memory_network import MemoryConfig
+from gsencoder.types import MemoryBank, QueryMemory, Scene
+
+GREY = np.full((60, 80, 3), 90, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory: pytest.TempPathFactory) -> QueryMemory:
+    """Of the wall, without training."""
+    made = prepared_wall(tmp_path_factory.mktemp("memory"), bank=BankConfig(threshold=0.9))
+    return untrained_memory(made, MemoryConfig(channels=5))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return wall(0)
+
+
+def with_photographs(scene: Scene) -> Scene:
+    rng = np.random.default_rng(0)
+    assert scene.views is not None
+    photographs = [rng.integers(0, 256, (40, 48, 3), dtype=np.uint8) for _ in range(len(scene.views))]
+    return replace(scene, views=replace(scene.views, images=photographs))
+
+
+def one_component(memory: QueryMemory) -> QueryMemory:
+    bank = memory.bank
+    return replace(
+        memory,
+        bank=replace(
+            bank,
+            components=bank.components[:1],
+            sources=bank.sources[:1],
+            grid_from_image=bank.grid_from_image[:1],
+        ),
+    )
+
+
+def in_color(picture: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
+    return np.asarray((picture == np.array(color)).all(axis=2))
+
+
+@pytest.mark.parametrize("pixel", [(24, 20), (18, 11), (30, 27)])
+@pytest.mark.parametrize("view", [0, 1])
+def test_the_components_are_the_first_of_the_attention_of_the_pixels_query(
+    memory: QueryMemory, scene: Scene, view: int, pixel: tuple[int, int]
+) -> None:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    b = blend(scene.gaussians, scene.views.cameras, view)
+    seen = torch.from_numpy((memory.weights > 0).astype(np.float32))
+    row = pixel[1] * b.shape[1] + pixel[0]
+    query = (b.render(torch.from_numpy(memory.queries)) / b.render(seen)[:, None])[row].numpy()
+    attention = memory.attention(query[None])[0]
+    found = strongest_components(memory, scene.gaussians, scene.views.cameras, view, pixel, 4, blended=b)
+    assert found.pixel == pixel
+    np.testing.assert_allclose(found.weights, np.sort(attention)[::-1][:4], rtol=1e-5)
+    np.testing.assert_allclose(attention[found.components], found.weights, rtol=1e-5)
+    again = strongest_components(memory, scene.gaussians, scene.views.cameras, view, pixel, 4)
+    np.testing.assert_array_equal(again.components, found.components)
+    np.testing.assert_array_equal(again.weights, found.weights)
+
+
+def test_weights_of_all_components_sum_to_one_and_a_bank_may_have_fewer(memory: QueryMemory, scene: Scene) -> None:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    found = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 10_000)
+    assert sorted(found.components.tolist()) == list(range(len(memory.bank)))
+    assert found.weights.sum() == pytest.approx(1, abs=1e-5)
+    assert (np.diff(found.weights) <= 0).all()
+    single = strongest_components(one_component(memory), scene.gaussians, scene.views.cameras, 0, (24, 20), 6)
+    assert single.components.tolist() == [0]
+    assert single.weights.tolist() == [1.0]
+
+
+def test_of_equal_components_the_first_come_first(memory: QueryMemory, scene: Scene) -> None:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    bank = memory.bank
+    same = replace(bank, components=np.repeat(bank.components[:1], len(bank), axis=0))
+    tied = replace(memory, bank=same)
+    found = strongest_components(tied, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
+    assert found.components.tolist() == [0, 1, 2]
+
+
+def test_rendered_features_are_what_rendered_queries_attend_to(memory: QueryMemory, scene: Scene) -> None:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    b = blend(scene.gaussians, scene.views.cameras, 0)
+    queries, alpha = render_queries(memory, b)
+    features, opacity = render_features(memory, b)
+    np.testing.assert_array_equal(features, memory.attend(queries))
+    assert (alpha <= opacity + 1e-6).all()
+    np.testing.assert_array_equal(queries[alpha == 0], 0)
+
+
+@pytest.mark.parametrize("pixel", [(-1, 5), (48, 5), (5, -1), (5, 40)])
+def test_a_pixel_outside_of_the_view_is_refused(memory: QueryMemory, scene: Scene, pixel: tuple[int, int]) -> None:
+    with pytest.raises(InputError, match="expected a column from 0 to 47 and a row from 0 to 39"):
+        attention_picture(memory, scene, 0, pixel)
+
+
+def test_a_pixel_that_hits_nothing_is_refused(memory: QueryMemory, scene: Scene) -> None:
+    with pytest.raises(InputError, match=r"pixel \(0, 0\): no Gaussian with a query is seen in this pixel of view 1"):
+        attention_picture(memory, scene, 1, (0, 0))
+    unseen = replace(memory, queries=np.zeros_like(memory.queries), weights=np.zeros_like(memory.weights))
+    with pytest.raises(InputError, match=r"pixel \(24, 20\): no Gaussian with a query"):
+        attention_picture(unseen, scene, 0, (24, 20))
+
+
+def test_memories_views_and_counts_that_do_not_fit_are_refused(memory: QueryMemory, scene: Scene) -> None:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    with pytest.raises(InputError, match="count: expected 1 component or more, got 0"):
+        attention_picture(memory, scene, 0, (24, 20), count=0)
+    for view in (-1, 2):
+        with pytest.raises(InputError, match=f"has 2 views, and view {view} is asked for"):
+            attention_picture(memory, scene, view, (24, 20))
+    third = replace(memory.bank, sources=memory.bank.sources + np.array([2, 0, 0], np.int32))
+    with pytest.raises(InputError, match=r"components come from view [23]; expected the views that the memory was"):
+        attention_picture(replace(memory, bank=third), scene, 0, (24, 20))
+    with pytest.raises(InputError, match="queries of 200 Gaussians, and a view of 400"):
+        attention_picture(make_memory(), scene, 0, (24, 20))
+    for lacking in (replace(scene, views=None), Scene(name="empty", views=scene.views)):
+        with pytest.raises(InputError, match="needs Gaussians and cameras"):
+            attention_picture(memory, lacking, 0, (24, 20))
+
+
+@pytest.mark.parametrize("cell", [(30, 20, 40, 30), (0, 0, 10, 10), (70, 50, 80, 60), (12.5, 41.25, 17.5, 46.25)])
+def test_the_outline_lies_around_the_cell_and_the_cell_stays_as_it_is(cell: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(0)
+    photograph = rng.integers(0, 200, (60, 80, 3), dtype=np.uint8)
+    factor = TILE_SIDE / 80
+    tile = cell_tile(photograph, np.array(cell, np.float64))
+    assert tile.shape == (225, 300, 3)
+    left, top, right, bottom = (edge * factor for edge in cell)
+    rows, columns = np.nonzero(in_color(tile, MARK))
+    near = (abs(columns - (left + right) / 2) < (right - left) / 2 + 4) & (
+        abs(rows - (top + bottom) / 2) < (bottom - top) / 2 + 4
+    )
+    rows, columns = rows[near], columns[near]
+    assert abs(columns.min() - max(left - 2, 1)) <= 1.5
+    assert abs(columns.max() - min(right + 2, 298)) <= 1.5
+    assert abs(rows.min() - max(top - 2, 1)) <= 1.5
+    assert abs(rows.max() - min(bottom + 2, 223)) <= 1.5
+    inside = np.s_[int(top) + 5 : int(bottom) - 4, int(left) + 5 : int(right) - 4]
+    plain = cell_tile(photograph, np.array([0.0, 0, 80, 60]))
+    np.testing.assert_array_equal(tile[inside], plain[inside])
+
+
+def test_a_small_cell_is_enlarged_in_the_corner_that_is_farthest_from_it() -> None:
+    """A white pixel on grey: in its place, and as a bright square in the middle of the close-up."""
+    for row, column, corner in ((5, 5, (-98, -98)), (5, 74, (-98, 2)), (54, 5, (2, -98)), (54, 74, (2, 2))):
+        photograph = GREY.copy()
+        photograph[row, column] = 255
+        cell = np.array([column, row, column + 1, row + 1], np.float64)
+        tile = cell_tile(photograph, cell)
+        top, left = (start if start >= 0 else side + start for start, side in zip(corner, tile.shape, strict=False))
+        close = tile[top : top + 96, left : left + 96]
+        assert in_color(close, MARK).any()
+        assert (close[46:50, 46:50] > 220).all()
+        assert (close[46:50, 16:24] == 90).all()
+    large = cell_tile(GREY, np.array([10.0, 10, 60, 50]))
+    assert (in_color(large, (90, 90, 90)) | in_color(large, MARK) | in_color(large, HALO)).all()
+
+
+def test_cells_beyond_the_photograph_are_outlined_at_its_edge() -> None:
+    for cell in ([-20, -20, 10, 10], [75, 50, 95, 70], [-30, 20, -10, 40], [90, 70, 95, 75]):
+        tile = cell_tile(GREY, np.array(cell, np.float64))
+        assert in_color(tile, MARK).any()
+
+
+@pytest.mark.parametrize("pixel", [(0, 0), (40, 30), (79, 59)])
+def test_the_mark_surrounds_the_pixel_and_does_not_hide_it(pixel: tuple[int, int]) -> None:
+    picture = mark_pixel(GREY, pixel)
+    assert picture.shape == (495, VIEW_SIDE, 3)
+    x, y = ((each + 0.5) * VIEW_SIDE / 80 for each in pixel)
+    rows, columns = np.nonzero(in_color(picture, MARK))
+    distance = np.hypot(rows - y, columns - x)
+    assert 8 <= distance.min() <= 12
+    assert distance.max() <= 26
+    np.testing.assert_array_equal(picture[int(y), int(x)], 90)
+
+
+def test_a_picture_holds_the_view_and_the_tiles_of_the_components_and_comes_again_the_same(
+    memory: QueryMemory, scene: Scene
+) -> None:
+    scene = with_photographs(scene)
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    assert scene.views.images is not None
+    picture = attention_picture(memory, scene, 0, (24, 20), count=3)
+    np.testing.assert_array_equal(picture, attention_picture(memory, scene, 0, (24, 20), count=3))
+    found = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
+    tiles = []
+    for number, component in enumerate(found.components.tolist()):
+        photograph = scene.views.images[int(memory.bank.sources[component, 0])]
+        tile = cell_tile(photograph, memory.bank.cells[component])
+        left = 3 * GAP + VIEW_SIDE + number * (TILE_SIDE + GAP)
+        np.testing.assert_array_equal(picture[HEAD : HEAD + tile.shape[0], left : left + TILE_SIDE], tile)
+        tiles.append(tile)
+    assert not np.array_equal(tiles[0], tiles[1])
+    assert not np.array_equal(tiles[1], tiles[2])
+    shown = picture[HEAD : HEAD + 550, GAP : GAP + VIEW_SIDE]
+    view = render_image(scene.gaussians, scene.views.cameras, 0)
+    np.testing.assert_array_equal(shown, mark_pixel(view, (24, 20)))
+
+
+def test_the_bar_under_a_tile_is_as_long_as_its_weight(memory: QueryMemory, scene: Scene) -> None:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    found = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
+    picture = attention_picture(memory, scene, 0, (24, 20), count=3)
+    for number, weight in enumerate(found.weights.tolist()):
+        left = 3 * GAP + VIEW_SIDE + number * (TILE_SIDE + GAP)
+        row = picture[HEAD + 250 + 6, left : left + TILE_SIDE]
+        full = (row == np.array(FULL_BAR)).all(axis=1)
+        assert full.sum() == round(weight * TILE_SIDE)
+        assert (row[~full] == np.array(EMPTY_BAR)).all()
+
+
+def test_scenes_without_photographs_and_banks_of_one_component_are_drawn(memory: QueryMemory, scene: Scene) -> None:
+    rendered = attention_picture(memory, scene, 0, (24, 20))
+    assert in_color(rendered, MARK).any()
+    single = attention_picture(one_component(memory), scene, 0, (24, 20))
+    assert single.shape[1] < rendered.shape[1]
+    assert in_color(single, MARK).any()
+
+
+def test_entropy_is_none_for_one_component_and_largest_for_equal_ones() -> None:
+    weights = np.array([[1, 0, 0, 0], [0.25] * 4, [0.5, 0.5, 0, 0]], np.float32)
+    np.testing.assert_allclose(attention_entropy(weights), [0, np.log(4), np.log(2)], atol=1e-6)
+
+
+def test_the_salient_pixel_is_opaque_and_has_the_lowest_entropy_of_the_middle(
+    memory: QueryMemory, scene: Scene
+) -> None:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    b = blend(scene.gaussians, scene.views.cameras, 0)
+    pixel = salient_pixel(memory, b)
+    assert pixel is not None
+    x, y = pixel
+    assert 12 <= x < 36
+    assert 10 <= y < 30
+    queries, alpha = render_queries(memory, b)
+    entropy = attention_entropy(memory.attention(queries)).reshape(40, 48)
+    middle = np.where(alpha.reshape(40, 48) >= 0.5, entropy, np.inf)[10:30, 12:36]
+    assert alpha.reshape(40, 48)[y, x] >= 0.5
+    assert entropy[y, x] == middle.min()
+    unseen = replace(memory, queries=np.zeros_like(memory.queries), weights=np.zeros_like(memory.weights))
+    assert salient_pixel(unseen, b) is None
+
+
+def test_where_only_the_rim_of_a_view_shows_something_the_salient_pixel_is_there(
+    memory: QueryMemory, scene: Scene
+) -> None:
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    corner = (scene.gaussians.means[:, 0] < -0.75) & (memory.weights > 0)
+    weights = np.where(corner, memory.weights, 0).astype(np.float32)
+    rim = replace(memory, weights=weights, queries=np.where(corner[:, None], memory.queries, 0).astype(np.float32))
+    b = blend(scene.gaussians, scene.views.cameras, 0)
+    pixel = salient_pixel(rim, b)
+    assert pixel is not None
+    assert pixel[0] < 24
+
+
+def test_evenly_spaced_views_are_drawn_and_those_that_show_nothing_are_named(memory: QueryMemory, scene: Scene) -> None:
+    assert scene.views is not None
+    drawn = dict(attention_pictures(memory, scene, views=5))
+    assert sorted(drawn) == [0, 1]
+    assert [view for view, _ in attention_pictures(memory, scene, views=1)] == [0]
+    assert [view for view, _ in attention_pictures(memory, scene, views=0)] == []
+    away = scene.views.cameras.cam_from_world.copy()
+    away[1] = np.diag(np.array([-1, 1, -1, 1], np.float32))
+    turned = replace(scene, views=replace(scene.views, cameras=replace(scene.views.cameras, cam_from_world=away)))
+    with pytest.warns(SceneWarning, match="view far shows no Gaussian with a query and is not drawn"):
+        assert [view for view, _ in attention_pictures(memory, turned, views=2)] == [0]
+
+
+def test_features_of_one_channel_are_drawn(scene: Scene) -> None:
+    assert scene.gaussians is not None
+    one = make_memory("dot", components=2, channels=1, width=1, gaussians=len(scene.gaussians))
+    picture = attention_picture(one, scene, 0, (24, 20))
+    assert in_color(picture, MARK).any()
+
+
+def test_the_picture_is_a_file_that_is_the_same_again(memory: QueryMemory, scene: Scene, tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        for view, picture in attention_pictures(memory, with_photographs(scene), views=2):
+            picture.save(tmp_path / f"{name}{view}.png")
+    for view in (0, 1):
+        assert (tmp_path / f"one{view}.png").read_bytes() == (tmp_path / f"other{view}.png").read_bytes()
+
+
+def test_sources_of_the_walls_bank_are_cells_of_two_pixels(memory: QueryMemory) -> None:
+    bank: MemoryBank = memory.bank
+    expected = np.stack(
+        [bank.sources[:, 2], bank.sources[:, 1], bank.sources[:, 2] + 1, bank.sources[:, 1] + 1], axis=1
+    )
+    np.testing.assert_allclose(bank.cells, 2 * expected)

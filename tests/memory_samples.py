@@ -1,0 +1,40 @@
+"""Random memories."""
+
+import numpy as np
+
+from gsencoder.types import FeatureSpace, MemoryBank, QueryMemory
+from gsencoder.types.memory import Scoring
+
+TEMPERATURE = {"centered": 0.05, "cosine": 0.05, "dot": 1.0}
+
+
+def make_memory(
+    scoring: Scoring = "centered", *, components: int = 70, channels: int = 24, width: int = 6, gaussians: int = 200
+) -> QueryMemory:
+    rng = np.random.default_rng(components)
+    space = FeatureSpace(name="s", channels=channels)
+    mean = rng.normal(size=channels).astype(np.float32)
+    raw = (rng.normal(size=(components, channels)) + mean).astype(np.float32)
+    weights = rng.uniform(0.5, 2, gaussians).astype(np.float32)
+    weights[::7] = 0
+    queries = rng.normal(size=(gaussians, width)).astype(np.float32)
+    queries[weights == 0] = 0
+    bank = MemoryBank(
+        components=raw,
+        sources=np.zeros((components, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (components, 1, 1)),
+        mean=mean if scoring == "centered" else np.zeros_like(mean),
+        threshold=0.9,
+        coverage=1.0,
+        cosine=0.95,
+        space=space,
+    )
+    return QueryMemory(
+        queries=queries,
+        weights=weights,
+        projection=rng.normal(size=(width, channels)).astype(np.float32),
+        bank=bank,
+        scoring=scoring,
+        temperature=TEMPERATURE[scoring],
+        mean=mean,
+    )
