@@ -1,4 +1,4 @@
-"""Grounding in pictures, as M3 measures it (sec. 4.1, table 2): Otsu's threshold on the map of a phrase, IoU with a mask.
+"""Grounding in pictures, as M3 measures it (sec. 4.1, table 2): Otsu's threshold on a phrase's map, IoU with a mask.
 
 M3 prints the share of pairs whose IoU reaches 0.5 or 0.6 as AP50 and AP60. It is no average precision, and is called a
 precision here.

@@ -1,7 +1,7 @@
 """Retrieval between rendered views and texts, as M3 measures it (sec. 4.1, table 2): recall at 1, 5 and 10.
 
-A query is one view or one text. Its pool is what belongs to it and distractors, which M3 takes from COCO. The score of a
-view with a text is the largest cosine of one of its rendered cells with it.
+A query is one view or one text. Its pool is what belongs to it and distractors, which M3 takes from COCO. The score of
+a view with a text is the largest cosine of one of its rendered cells with it.
 """
 
 import hashlib

@@ -37,14 +37,6 @@ def test_the_threshold_is_the_split_of_largest_variance_between_the_classes(seed
     assert variances[split] == pytest.approx(largest, rel=1e-12)
 
 
-def test_scikit_image_gives_the_same_threshold() -> None:
-    filters = pytest.importorskip("skimage.filters")
-    rng = np.random.default_rng(0)
-    for number in range(50):
-        values = rng.normal(size=(number + 2, 7)).astype(np.float32)
-        assert otsu_threshold(values) == filters.threshold_otsu(values.astype(np.float64))
-
-
 @given(arrays(np.float32, st.integers(1, 40), elements=st.floats(-1, 1, width=32)))
 def test_the_threshold_lies_within_the_values_and_parts_them_unless_all_are_equal(values: np.ndarray) -> None:
     threshold = otsu_threshold(values)
