@@ -20,11 +20,8 @@ from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.memory_network import MemoryConfig, MemoryNetwork, MemoryObjective, ViewSamples, join_views
 from gsencoder.train.memory_scene import MemoryScene
-from gsencoder.train.trainer import Trainer, TrainerConfig
+from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig
 from gsencoder.types import QueryMemory
-
-CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
-"""Settings of the loop that a resumed run may change, since they do not change the result of a step."""
 
 
 def memory_training() -> TrainerConfig:

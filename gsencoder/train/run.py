@@ -31,7 +31,7 @@ from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
-from gsencoder.train.trainer import TrainerConfig, ValidationResult
+from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, TrainerConfig, ValidationResult
 from gsencoder.train.training_scene import TrainingScene
 
 SceneValidator = Callable[
@@ -40,8 +40,6 @@ SceneValidator = Callable[
 ]
 """Scores an encoder on held-out scenes, given these, the encoder, its output spaces, and the codebook of each teacher's
 target classes."""
-CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
-"""Settings of the trainer that a resumed run may change, since they do not change the result of a step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

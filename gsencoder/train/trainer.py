@@ -27,6 +27,8 @@ from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, 
 from gsencoder.train.distributed import STOPPED_ELSEWHERE, ProcessRank, fail_together, sum_over_processes
 from gsencoder.train.samples import StepSampler
 
+CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
+"""Settings of the loop that a resumed run may change, since they do not change the result of a step."""
 NO_WEIGHT = 1e-12
 """Divisor of a term that nothing in a step has a weight for."""
 

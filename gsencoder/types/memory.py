@@ -130,8 +130,16 @@ class QueryMemory:
 
     def attention(self, queries: Float32[np.ndarray, "n s"]) -> Float32[np.ndarray, "n M"]:
         """The weights of the components for queries; each row sums to 1."""
-        keys = attention_keys(self.bank.components, self.mean, self.scoring)
-        scores = queries @ (self.projection @ keys.T)
+        return self._attention(queries, self._projected_keys())
+
+    def _projected_keys(self) -> Float32[np.ndarray, "s M"]:
+        """W_m PSCᵀ, which is the same for all queries."""
+        return self.projection @ attention_keys(self.bank.components, self.mean, self.scoring).T
+
+    def _attention(
+        self, queries: Float32[np.ndarray, "n s"], keys: Float32[np.ndarray, "s M"]
+    ) -> Float32[np.ndarray, "n M"]:
+        scores = queries @ keys
         if self.scoring != "dot":
             gram = self.projection.astype(np.float64) @ self.projection.T
             lengths = np.sqrt(np.maximum(np.einsum("ns,st,nt->n", queries, gram, queries, dtype=np.float64), 0))
@@ -150,8 +158,10 @@ class QueryMemory:
             values: what is averaged; None = the components.
         """
         values = self.bank.components if values is None else values
-        step = max(1, BLOCK_SCORES // len(self.bank))
-        parts = [self.attention(queries[start : start + step]) @ values for start in range(0, len(queries), step)]
+        step, keys = max(1, BLOCK_SCORES // len(self.bank)), self._projected_keys()
+        parts = [
+            self._attention(queries[start : start + step], keys) @ values for start in range(0, len(queries), step)
+        ]
         return np.concatenate(parts) if parts else np.zeros((0, values.shape[1]), np.float32)
 
     def features(self) -> GaussianFeatures:

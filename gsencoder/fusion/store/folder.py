@@ -158,7 +158,7 @@ def load_features(folder: str | Path) -> Scene:
     if _files_of_teachers(folder, MEMORY_FILE):
         if files:
             raise InputError(f"{folder}: holds features and memories, two kinds of features; keep one")
-        features = {name: each.features() for name, each in load_memories(folder).items()}
+        features = {name: each.features() for name, each in _read_memories(folder, gaussians).items()}
     else:
         files = files or {None: FEATURES_FILE}
         features = {name: _load_rows(folder, file, gaussians) for name, file in files.items()}
@@ -172,7 +172,10 @@ def load_memories(folder: str | Path) -> dict[str | None, QueryMemory]:
         InputError: not such a folder, damaged, of another version, or memories of another splat.
     """
     folder = Path(folder)
-    _, gaussians = _load_scene(folder)
+    return _read_memories(folder, _load_scene(folder)[1])
+
+
+def _read_memories(folder: Path, gaussians: Gaussians) -> dict[str | None, QueryMemory]:
     memories = {}
     for name, file in (_files_of_teachers(folder, MEMORY_FILE) or {None: MEMORY_FILE}).items():
         with _open(folder, file) as archive:
