@@ -3,13 +3,13 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float16, Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import Archive
 from gsencoder.data.readers.images import PIXEL_LIMIT
 from gsencoder.data.splats import fingerprint
-from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, Gaussians, Scene, Views
+from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, Gaussians, MemoryBank, Scene, Views
 
 
 def check_splat(file: Archive, gaussians: Gaussians, advice: str) -> None:
@@ -68,6 +68,37 @@ def read_space(file: Archive) -> tuple[FeatureSpace, Float32[np.ndarray, " D"], 
         return space, mean, None
     components, energy_kept = file.array("components", "float32", ("R", "D")), file.value("energy_kept", float, int)
     return space, mean, FeatureBasis(mean=mean, components=components, energy_kept=energy_kept, space=space)
+
+
+def bank_parts(bank: MemoryBank) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """The arrays and header values of a bank, without its components and its space."""
+    arrays = {"sources": bank.sources, "source_grids": bank.grid_from_image, "bank_mean": bank.mean}
+    return arrays, {name: getattr(bank, name) for name in ("threshold", "coverage", "cosine")}
+
+
+def read_bank(file: Archive, components: Float32[np.ndarray, "M D"], space: FeatureSpace) -> MemoryBank:
+    """Reads a bank whose components and space have been read.
+
+    Raises:
+        InputError: damaged, or arrays of other sizes.
+    """
+    return MemoryBank(
+        components=components,
+        sources=file.array("sources", "int32", (len(components), 3)),
+        grid_from_image=file.array("source_grids", "float64", (len(components), 2, 3)),
+        mean=file.array("bank_mean", "float32", (space.channels,)),
+        **{name: file.value(name, float, int) for name in ("threshold", "coverage", "cosine")},
+        space=space,
+    )
+
+
+def scaled_halves(
+    values: Float32[np.ndarray, "n C"],
+) -> tuple[Float16[np.ndarray, "n C"], Float32[np.ndarray, " C"]]:
+    """Values as float16, and what each channel was divided by: its largest magnitude, or 1."""
+    largest = np.abs(values).max(axis=0, initial=0)
+    scale = np.where(largest > 0, largest, 1).astype(np.float32)
+    return (values / scale).astype(np.float16), scale
 
 
 def scene_parts(scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -18,6 +18,7 @@ from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.data.archive_records import bank_parts, read_bank
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
@@ -138,15 +139,7 @@ def open_memory_scene(folder: Path, made_with: Mapping[str, Any] | None = None) 
         if made_with is not None and stored != made_with:
             raise InputError(f"was prepared with {first_difference(stored, dict(made_with))}")
         outputs = read_output_space(file)
-        components = file.array("bank", "float32", ("M", outputs.space.channels))
-        bank = MemoryBank(
-            components=components,
-            sources=file.array("sources", "int32", (len(components), 3)),
-            grid_from_image=file.array("source_grids", "float64", (len(components), 2, 3)),
-            mean=file.array("bank_mean", "float32", (outputs.space.channels,)),
-            **{name: file.value(name, float, int) for name in ("threshold", "coverage", "cosine")},
-            space=outputs.space,
-        )
+        bank = read_bank(file, file.array("bank", "float32", ("M", outputs.space.channels)), outputs.space)
     return MemoryScene(prepared=PreparedScene(folder / SCENE_FILE), outputs=outputs, bank=bank)
 
 
@@ -191,9 +184,8 @@ def _map_stream(scene: Scene, teacher: Teacher, folder: Path) -> MapStream:
 
 def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, made_with: Mapping[str, Any]) -> None:
     arrays, header = output_space_parts(outputs)
-    arrays |= {"bank": bank.components, "sources": bank.sources, "bank_mean": bank.mean}
-    arrays["source_grids"] = bank.grid_from_image
-    figures = {name: getattr(bank, name) for name in ("threshold", "coverage", "cosine")}
+    of_bank, figures = bank_parts(bank)
+    arrays |= {"bank": bank.components, **of_bank}
     write_archive(path, arrays, {**header, **figures, "made_with": dict(made_with)})
 
 

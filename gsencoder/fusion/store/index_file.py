@@ -6,7 +6,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import Archive, write_archive
-from gsencoder.data.archive_records import read_space, scene_parts, space_parts
+from gsencoder.data.archive_records import read_space, scaled_halves, scene_parts, space_parts
 from gsencoder.types import GaussianFeatures, Scene
 
 INDEX_FORM = 2
@@ -32,15 +32,14 @@ def write_index(path: Path, scene: Scene, features: GaussianFeatures, *, fingerp
     unseen = int(np.iinfo(kind).max)
     if rows > unseen:
         raise InputError(f"{path}: expected a table of up to {unseen:,} rows, got {rows:,}")
-    largest = np.abs(features.features).max(axis=0)
-    channel_scale = np.where(largest > 0, largest, 1).astype(np.float32)
+    table, channel_scale = scaled_halves(features.features)
     around, header = scene_parts(scene)
     parts, named = space_parts(features.space, features.mean, features.basis)
     arrays = {
         **around,
         **parts,
         "index": np.where(features.index < 0, unseen, features.index).astype(kind),
-        "table": (features.features / channel_scale).astype(np.float16),
+        "table": table,
         "channel_scale": channel_scale,
     }
     write_archive(path, arrays, header | named | {"form": INDEX_FORM, "fingerprint": fingerprint, "error": error})

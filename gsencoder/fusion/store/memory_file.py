@@ -5,13 +5,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float16, Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import Archive, write_archive
-from gsencoder.data.archive_records import check_splat, read_space, space_parts
+from gsencoder.data.archive_records import (
+    bank_parts,
+    check_splat,
+    read_bank,
+    read_space,
+    scaled_halves,
+    space_parts,
+)
 from gsencoder.data.splats import fingerprint
-from gsencoder.types import Gaussians, MemoryBank, QueryMemory
+from gsencoder.types import Gaussians, QueryMemory
 
 MEMORY_FILE = "memory.safetensors"
 
@@ -33,8 +39,8 @@ def write_memory(path: Path, memory: QueryMemory, gaussians: Gaussians, more: Ma
         raise InputError(f"{path}: {len(memory):,} queries need as many Gaussians, got {len(gaussians):,}")
     rows, bank = np.flatnonzero(memory.weights > 0), memory.bank
     arrays, header = space_parts(memory.space, memory.mean, memory.basis)
-    queries, query_scale = _halves(memory.queries[rows])
-    components, component_scale = _halves(bank.components)
+    queries, query_scale = scaled_halves(memory.queries[rows])
+    components, component_scale = scaled_halves(bank.components)
     arrays |= {
         "rows": rows.astype(np.int32),
         "queries": queries,
@@ -43,17 +49,15 @@ def write_memory(path: Path, memory: QueryMemory, gaussians: Gaussians, more: Ma
         "projection": memory.projection,
         "bank": components,
         "bank_scale": component_scale,
-        "bank_mean": bank.mean,
-        "sources": bank.sources,
-        "source_grids": bank.grid_from_image,
     }
+    of_bank, figures = bank_parts(bank)
     header |= {
         "fingerprint": fingerprint(gaussians),
         "scoring": memory.scoring,
         "temperature": memory.temperature,
-        **{name: getattr(bank, name) for name in ("threshold", "coverage", "cosine")},
+        **figures,
     }
-    write_archive(path, arrays, header | dict(more))
+    write_archive(path, arrays | of_bank, header | dict(more))
 
 
 def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
@@ -76,14 +80,7 @@ def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
     queries[rows] = file.array("queries", "float16", (len(rows), len(projection))).astype(np.float32) * scale
     weights[rows] = seen
     components = file.array("bank", "float16", ("M", space.channels)).astype(np.float32)
-    bank = MemoryBank(
-        components=components * file.array("bank_scale", "float32", (space.channels,)),
-        sources=file.array("sources", "int32", (len(components), 3)),
-        grid_from_image=file.array("source_grids", "float64", (len(components), 2, 3)),
-        mean=file.array("bank_mean", "float32", (space.channels,)),
-        **{name: file.value(name, float, int) for name in ("threshold", "coverage", "cosine")},
-        space=space,
-    )
+    bank = read_bank(file, components * file.array("bank_scale", "float32", (space.channels,)), space)
     scoring = file.value("scoring", str)
     if scoring not in ("centered", "cosine", "dot"):
         raise InputError(f"expected scoring centered, cosine or dot in the header, got {scoring[:40]!r}")
@@ -97,10 +94,3 @@ def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
         mean=mean,
         basis=basis,
     )
-
-
-def _halves(values: Float32[np.ndarray, "n C"]) -> tuple[Float16[np.ndarray, "n C"], Float32[np.ndarray, " C"]]:
-    """Values as float16, and what each channel was divided by."""
-    largest = np.abs(values).max(axis=0, initial=0)
-    scale = np.where(largest > 0, largest, 1).astype(np.float32)
-    return (values / scale).astype(np.float16), scale
