@@ -1,11 +1,11 @@
 """`gsencoder evaluate SCENE… protocol=…`: a metric on labeled scenes, of fused features or of an encoder's."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from rich.table import Table
-
+from gsencoder.app.commands.evaluate_report import names_table, scores_line
+from gsencoder.app.commands.evaluated_features import stored_source, stored_words, with_stored_features
 from gsencoder.app.commands.through_head import words_of_head
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
@@ -15,15 +15,22 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.core.runtime.heap import retain_freed_memory
-from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
+from gsencoder.evaluate.grounding import grounding_scores
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,
     absent_scores,
     evaluate_absent,
     names_of,
     probabilities_by_word,
+)
+from gsencoder.evaluate.protocols.grounding import (
+    GroundingProtocol,
+    evaluate_grounding,
+    phrase_mean,
+    scores_by_phrase,
 )
 from gsencoder.evaluate.protocols.localization import (
     LocalizationProtocol,
@@ -55,25 +62,6 @@ from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, stating_trained, words_of_table
 from gsencoder.types import Scene
 
-SHOWN_NAMES = 15
-COLUMNS = {
-    "localization": {
-        "objects": "objects",
-        "Acc@0.25": "acc_25",
-        "Acc@0.5": "acc_50",
-        "mean IoU": "mean_iou",
-        "best box": "oracle_mean_iou",
-    },
-    "naming": {"gaussians": "gaussians", "accuracy": "accuracy"},
-    "absent": {
-        "present in": "present",
-        "absent in": "absent",
-        "probability where present": "probability_present",
-        "where absent": "probability_absent",
-    },
-}
-"""Columns of the table of names, and the fields of a row that they show, by protocol."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluateConfig(CommonConfig):
@@ -89,9 +77,19 @@ class EvaluateConfig(CommonConfig):
             "help": "encoder whose features are evaluated (see encode); empty = the fused features of the teacher"
         },
     )
+    features: str = field(
+        default="",
+        metadata={
+            "help": "features that are evaluated in place of those: a folder written by fuse, encode, pack or memory, "
+            "or one with such a folder for each scene"
+        },
+    )
     space: str = field(
         default="",
-        metadata={"help": "of an encoder with several teachers, the one that is evaluated; empty = that of the words"},
+        metadata={
+            "help": "of an encoder or features of several teachers, the one that is evaluated; empty = that of the "
+            "words"
+        },
     )
     head: str = field(
         default="",
@@ -100,7 +98,9 @@ class EvaluateConfig(CommonConfig):
             "features themselves"
         },
     )
-    protocol: LocalizationProtocol | NamingProtocol | AbsentProtocol = field(default_factory=LocalizationProtocol)
+    protocol: LocalizationProtocol | NamingProtocol | AbsentProtocol | GroundingProtocol = field(
+        default_factory=LocalizationProtocol
+    )
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
@@ -113,13 +113,18 @@ class EvaluateConfig(CommonConfig):
 
 def run(config: EvaluateConfig, summary: Summary) -> None:
     """Evaluates, prints the scores, and writes them with one row for each object or name."""
-    source, words = _source_of_head(config) if config.head else _source(config)
+    if config.features:
+        source, words = _stored(config)
+    else:
+        source, words = _source_of_head(config) if config.head else _source(config)
     out = config.out or Path("outputs") / "evaluate" / config.protocol.name
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         if isinstance(config.protocol, NamingProtocol):
             _naming(config, config.protocol, source, words, folder, summary)
         elif isinstance(config.protocol, AbsentProtocol):
             _absent(config, config.protocol, source, words, folder, summary)
+        elif isinstance(config.protocol, GroundingProtocol):
+            _grounding(config, config.protocol, source, words, folder, summary)
         else:
             _localization(config, config.protocol, source, words, folder, summary)
     screen = console(config.quiet)
@@ -143,6 +148,16 @@ def _source(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
         return encoder_source(encoder, config.encode, space), words
     words = _given_words(config)
     return fusion_source(config.teacher, words, config.fusion), words
+
+
+def _stored(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
+    """The source of features of a folder, and the words that they are compared with."""
+    if config.weights or config.splat or config.teacher != LabelsConfig():
+        raise InputError("features: a folder has its own Gaussians and words; leave out weights=, splat= and teacher=")
+    first = next(iter(find_scenes(config.paths)))
+    scene = load_scene(first, options=config.data)
+    options = {"head": config.head, "space": config.space}
+    return stored_source, stored_words(config.features, scene.name, text=config.text, **options)
 
 
 def _given_words(config: EvaluateConfig) -> Words:
@@ -177,7 +192,11 @@ def _source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
 
 
 def _scenes(config: EvaluateConfig) -> Iterator[tuple[Scene, float]]:
-    return load_scenes(find_scenes(config.paths), config.data, config.splat, Progress(quiet=config.quiet))
+    scenes = load_scenes(find_scenes(config.paths), config.data, config.splat, Progress(quiet=config.quiet))
+    if config.features:
+        options = {"head": config.head, "space": config.space}
+        return with_stored_features(scenes, config.features, text=config.text, **options)
+    return scenes
 
 
 def _localization(
@@ -256,6 +275,47 @@ def _absent(
     write_bytes(folder / "words.csv", csv_text(rows).encode())
 
 
+def _grounding(
+    config: EvaluateConfig,
+    protocol: GroundingProtocol,
+    source: FeatureSource,
+    words: Words,
+    folder: Path,
+    summary: Summary,
+) -> None:
+    scenes = evaluate_grounding(_scenes(config), source, words, protocol=protocol, seeds=config.seeds)
+    for scene in scenes:
+        summary.add_seconds(scene.seconds)
+    pairs = [pair for scene in scenes for pair in scene.pairs]
+    names = scores_by_phrase(pairs)
+    summary.results.update(
+        protocol="grounding",
+        **asdict(grounding_scores(pairs)),
+        miou_names=phrase_mean(names),
+        small=sum(scene.small for scene in scenes),
+        names=names,
+        scenes=[
+            {
+                "scene": scene.scene,
+                "views": scene.views,
+                "gaussians": scene.gaussians,
+                "small": scene.small,
+                **asdict(grounding_scores(scene.pairs)),
+            }
+            for scene in scenes
+        ],
+        pairs_table="pairs.csv",
+        names_table="names.csv",
+    )
+    rows = [
+        {"scene": scene.scene, "view": pair.view, "name": pair.phrase, "iou": pair.iou, "finite": pair.finite}
+        for scene in scenes
+        for pair in scene.pairs
+    ]
+    write_bytes(folder / "pairs.csv", csv_text(rows).encode())
+    write_bytes(folder / "names.csv", csv_text([{"name": name, **row} for name, row in names.items()]).encode())
+
+
 def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
     """Adds scores, scenes and seconds to the summary."""
     hits = [hit for outcome in outcomes for hit in outcome.hits]
@@ -280,38 +340,3 @@ def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
         hits="hits.csv",
         names_table="names.csv",
     )
-
-
-def scores_line(results: dict) -> str:
-    """The main figures in one line."""
-    if results["protocol"] == "naming":
-        return (
-            f"{len(results['names'])} names in {len(results['scenes'])} scenes: accuracy {results['accuracy']:.3f} "
-            f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centered cosine "
-            f"{results['cosine']:.3f}"
-        )
-    if results["protocol"] == "absent":
-        return (
-            f"{results['present']} present and {results['absent']} absent words in {len(results['scenes'])} scenes: "
-            f"AUROC {results['auroc']:.3f} ± {results['auroc_se']:.3f}, calibration error "
-            f"{results['calibration_error']:.3f}, Brier {results['brier']:.3f}; given a box: "
-            f"{results['boxed_present']:.3f} of the present, {results['boxed_absent']:.3f} of the absent"
-        )
-    return (
-        f"{results['objects']} objects in {len(results['scenes'])} scenes: Acc@0.25 {results['acc_25']:.3f}, "
-        f"Acc@0.5 {results['acc_50']:.3f}, mean IoU {results['mean_iou']:.3f} (best of all boxes: "
-        f"{results['oracle_acc_25']:.3f}, {results['oracle_acc_50']:.3f}, {results['oracle_mean_iou']:.3f})"
-    )
-
-
-def names_table(results: dict) -> Table:
-    """A table of the names with the lowest scores."""
-    names = results["names"]
-    table = Table(title="hardest names" if len(names) > SHOWN_NAMES else "names", title_justify="left")
-    columns = COLUMNS[results["protocol"]]
-    for title in ("name", *columns):
-        table.add_column(title, justify="left" if title == "name" else "right")
-    for name, row in list(names.items())[:SHOWN_NAMES]:
-        figures = (row[key] for key in columns.values())
-        table.add_row(name, *(f"{figure:,}" if isinstance(figure, int) else f"{figure:.3f}" for figure in figures))
-    return table

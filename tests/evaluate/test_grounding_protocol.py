@@ -1,0 +1,235 @@
+"""The grounding protocol: which pairs it has, what is rendered where, and what the command writes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from feature_fields import make_features
+from rooms import corner_cameras, room
+from splats import random_gaussians
+
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+from gsencoder.evaluate.grounding import GroundedPair
+from gsencoder.evaluate.protocols.grounding import (
+    GroundingProtocol,
+    _blend_at,
+    evaluate_grounding,
+    ground_scene,
+    ids_by_name,
+    masks_of,
+    phrase_mean,
+    scores_by_phrase,
+)
+from gsencoder.evaluate.rendered_relevancy import RenderedRelevancy
+from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.render import blend
+from gsencoder.text.table import make_text_table, save_text_table
+from gsencoder.types import FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
+
+
+def thing(number: int, name: str | None, *, placed: bool = True) -> SceneObject:
+    return SceneObject(id=number, name=name, aabb_min=np.zeros(3), aabb_max=np.ones(3), placed=placed)
+
+
+@pytest.mark.parametrize("basis", [True, False])
+def test_rendered_relevancy_is_the_cosine_of_rendered_features(basis: bool) -> None:
+    gaussians = random_gaussians(200)
+    features = make_features(200, basis=basis)
+    rng = np.random.default_rng(0)
+    text, mean = rng.normal(size=(3, 12)).astype(np.float32), rng.normal(size=12).astype(np.float32)
+    blended = blend(gaussians, corner_cameras(1), 0)
+    maps = RenderedRelevancy(features, text, mean).maps(blended)
+    assert maps.shape == (3, *blended.shape)
+    centered = ((features.decode() - features.mean) * features.seen[:, None]).astype(np.float64)
+    rendered = blended.render(torch.from_numpy(centered)).numpy()
+    words = text - mean
+    products = rendered @ words.T / np.linalg.norm(words, axis=1)
+    expected = products / np.maximum(np.linalg.norm(rendered, axis=1, keepdims=True), 1e-30)
+    # Rays that hit little have features too short to have a direction.
+    clear = np.linalg.norm(rendered, axis=1) > 0.05 * np.linalg.norm(features.mean)
+    np.testing.assert_allclose(maps.reshape(3, -1).T[clear], expected[clear], atol=1e-3)
+    nothing = (blended.alpha == 0).numpy()
+    assert clear.any()
+    assert nothing.any()
+    assert (maps.reshape(3, -1)[:, nothing] == 0).all()
+
+
+def test_an_index_and_one_gaussian_a_pixel_change_nothing() -> None:
+    scene, _ = room()
+    assert scene.gaussians is not None
+    count = len(scene.gaussians)
+    table = make_features(7, basis=False).features
+    index = np.random.default_rng(1).integers(-1, 7, count).astype(np.int32)
+    weights = (index >= 0).astype(np.float32)
+    space, mean = FeatureSpace(name="s", channels=12, text_encoder="words"), np.zeros(12, np.float32)
+    shared = GaussianFeatures(features=table, weights=weights, mean=mean, space=space, index=index)
+    own = replace(shared, features=shared.stored(), index=None)
+    text = np.eye(2, 12, dtype=np.float32)
+    blended = blend(scene.gaussians, corner_cameras(2), 1)
+    maps = [RenderedRelevancy(each, text, mean).maps(blended) for each in (shared, own)]
+    assert np.array_equal(*maps)
+    # Where a ray sees Gaussians of one row alone, the map is that row's relevancy.
+    alone = replace(shared, index=np.full(count, 3, np.int32), weights=np.ones(count, np.float32))
+    scores = relevancy(alone, text, mean)
+    opaque = (blended.alpha > 0.5).numpy()
+    found = RenderedRelevancy(alone, text, mean).maps(blended).reshape(2, -1)[:, opaque]
+    np.testing.assert_allclose(found, np.broadcast_to(scores[:, :1], found.shape), atol=1e-5)
+    with pytest.raises(InputError, match="features of 2 Gaussians"):
+        RenderedRelevancy(make_features(2), text, mean).maps(blended)
+
+
+@pytest.mark.parametrize("stride", [2, 3, 5, 48])
+def test_a_stride_takes_every_so_manieth_pixel(stride: int) -> None:
+    scene, _ = room()
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    whole, coarse = (_blend_at(scene, scene.views, 3, each) for each in (1, stride))
+    first = stride // 2
+    expected = whole.alpha.reshape(whole.shape)[first::stride, first::stride]
+    torch.testing.assert_close(coarse.alpha.reshape(coarse.shape), expected, atol=1e-6, rtol=0)
+    depth = whole.depth.reshape(whole.shape)[first::stride, first::stride]
+    torch.testing.assert_close(coarse.depth.reshape(coarse.shape), depth, atol=1e-5, rtol=1e-5)
+
+
+def test_instances_of_one_name_are_one_mask_and_small_ones_are_counted() -> None:
+    objects = [thing(1, "mug"), thing(2, "mug"), thing(3, "desk", placed=False), thing(4, None), thing(5, "fork")]
+    assert ids_by_name(objects) == {"desk": [3], "fork": [5], "mug": [1, 2]}
+    assert ids_by_name(objects, furniture=False) == {"fork": [5], "mug": [1, 2]}
+    instances = np.array([[1, 1, 2, 0], [3, 3, 3, 4], [3, 3, 0, 4]], np.int32)
+    masks, small = masks_of(instances, ids_by_name(objects), GroundingProtocol(min_pixels=3))
+    # The fork is not in the view at all.
+    assert (list(masks), small) == (["desk", "mug"], 0)
+    assert np.array_equal(masks["mug"], np.isin(instances, [1, 2]))
+    masks, small = masks_of(instances, ids_by_name(objects), GroundingProtocol(min_pixels=4))
+    assert (list(masks), small) == (["desk"], 1)
+    # Of every second pixel, from the second on, none is a mug.
+    masks, small = masks_of(instances, ids_by_name(objects), GroundingProtocol(min_pixels=3, stride=2))
+    assert (list(masks), small) == (["desk"], 1)
+    assert masks["desk"].tolist() == [[True, False]]
+
+
+def test_names_have_scores_of_their_own_and_count_the_same_in_their_mean() -> None:
+    def pair(phrase: str, intersection: int) -> GroundedPair:
+        return GroundedPair(view="v", phrase=phrase, intersection=intersection, union=10)
+
+    table = scores_by_phrase([pair("mug", 8), pair("mug", 4), pair("fork", 1), pair("mug", 6)])
+    assert list(table) == ["fork", "mug"]
+    assert table["mug"]["pairs"] == 3
+    assert table["mug"]["miou"] == pytest.approx(0.6)
+    assert phrase_mean(table) == pytest.approx(0.35)
+    assert np.isnan(phrase_mean({}))
+
+
+def labeled_room() -> tuple[Scene, GaussianFeatures]:
+    """A room in which the cube is a mug; features are the words, exactly."""
+    scene, cube = room()
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    which = torch.zeros(len(scene.gaussians))
+    which[cube] = 1
+    cameras = scene.views.cameras
+    instances = []
+    for view in range(len(cameras)):
+        blended = blend(scene.gaussians, cameras, view)
+        instances.append((blended.render(which) > 0.5).reshape(blended.shape).numpy().astype(np.int32))
+    words = np.eye(2, dtype=np.float32)
+    space = FeatureSpace(name="s", channels=2, text_encoder="words")
+    features = GaussianFeatures(
+        features=words[which.long().numpy()],
+        weights=np.ones(len(which), np.float32),
+        mean=np.full(2, 0.5, np.float32),
+        space=space,
+    )
+    views = Views(cameras=cameras, names=scene.views.names, instances=instances)
+    return replace(scene, views=views, objects=(thing(1, "mug"),)), features
+
+
+WORDS = make_text_table(["wall", "mug"], np.eye(2, dtype=np.float32), "words")
+
+
+def test_what_features_say_exactly_is_grounded_exactly() -> None:
+    scene, features = labeled_room()
+    pairs, small = ground_scene(scene, features, WORDS, GroundingProtocol(min_pixels=5))
+    assert scene.views is not None
+    assert len(pairs) + small == len(scene.views)
+    assert [pair.view for pair in pairs] == [name for name in scene.views.names if name in {p.view for p in pairs}]
+    assert min(pair.iou for pair in pairs) > 0.8
+    swapped = replace(features, features=features.features[:, ::-1].copy())
+    assert max(pair.iou for pair in ground_scene(scene, swapped, WORDS, GroundingProtocol(min_pixels=5))[0]) < 0.1
+    coarse, _ = ground_scene(scene, features, WORDS, GroundingProtocol(min_pixels=5, stride=2))
+    assert np.mean([pair.iou for pair in coarse]) > 0.8
+
+
+def test_scenes_without_labels_and_words_of_other_spaces_are_refused() -> None:
+    scene, features = labeled_room()
+
+    def source(_: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
+        return features, {}
+
+    (result,) = evaluate_grounding([(scene, 0.5)], source, WORDS, protocol=GroundingProtocol(min_pixels=5))
+    assert result.seconds["load"] == 0.5
+    assert result.gaussians == len(features)
+    for bad in (replace(scene, objects=()), replace(scene, views=None)):
+        with pytest.raises(InputError, match="needs views with instance maps"):
+            evaluate_grounding([(bad, 0.0)], source, WORDS)
+    with pytest.raises(InputError, match="no view of 1 scenes shows a named object with 100000 pixels"):
+        evaluate_grounding([(scene, 0.0)], source, WORDS, protocol=GroundingProtocol(min_pixels=100000))
+    other = make_text_table(["wall", "mug"], np.eye(2, dtype=np.float32), "others")
+    with pytest.raises(InputError, match="use the text encoder 'words'"):
+        ground_scene(scene, features, other)
+    for name in ("stride", "min_pixels"):
+        with pytest.raises(InputError, match=f"{name}: expected 1 or more, got 0"):
+            GroundingProtocol(**{name: 0})
+
+
+def results_of(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
+    return found
+
+
+@pytest.mark.slow
+def test_the_command_writes_pairs_and_names_and_takes_features_of_folders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = make_room(0, objects=4, views=4, width=120, height=90)
+    write_room(made, tmp_path / "room_0")
+    names = sorted({each.name for each in made.objects if each.name})
+    table = make_text_table(names, np.eye(len(names), dtype=np.float32), "room-words")
+    save_text_table(tmp_path / "words.safetensors", table)
+    scene, teacher = str(tmp_path / "room_0"), f"teacher.words={tmp_path / 'words.safetensors'}"
+    ask = ["evaluate", scene, "protocol=grounding", "protocol.min_pixels=10"]
+    assert cli.main([*ask, teacher, f"out={tmp_path / 'fused'}"]) == 0
+    assert "pairs of a view and a name in 1 scenes: mIoU" in " ".join(capsys.readouterr().out.split())
+    fused = results_of(tmp_path / "fused")
+    pairs = (tmp_path / "fused" / "pairs.csv").read_text().splitlines()
+    assert len(pairs) == 1 + fused["pairs"]
+    assert sum(row["pairs"] for row in fused["names"].values()) == fused["pairs"] > 0
+    assert fused["scenes"][0]["small"] == fused["small"]
+    assert fused["miou"] > 0.5
+    assert 0 <= fused["p60"] <= fused["p50"] <= 1
+    # What was written by fuse is what evaluate makes itself, but for the rounding of the file.
+    folders = tmp_path / "features"
+    assert cli.main(["fuse", scene, teacher, f"out={folders / 'room_0'}", "quiet=true"]) == 0
+    for number, folder in enumerate((folders, folders / "room_0")):
+        out = tmp_path / f"stored {number}"
+        assert cli.main([*ask, f"features={folder}", f"out={out}", "quiet=true"]) == 0
+        stored = results_of(out)
+        assert stored["pairs"] == fused["pairs"]
+        assert stored["miou"] == pytest.approx(fused["miou"], abs=0.01)
+    # The other protocols take them, too.
+    named = ["evaluate", scene, "protocol=naming", f"features={folders}", f"out={tmp_path / 'named'}", "quiet=true"]
+    assert cli.main(named) == 0
+    assert results_of(tmp_path / "named")["accuracy"] > 0.99
+    capsys.readouterr()
+    assert cli.main([*ask, teacher, f"features={folders}", f"out={tmp_path / 'no'}"]) == 2
+    assert "a folder has its own Gaussians and words" in capsys.readouterr().err
+    write_room(made, tmp_path / "room_1")
+    assert cli.main([*ask[:1], str(tmp_path / "room_1"), *ask[2:], f"features={folders / 'room_0'}", "out=x"]) == 2
+    assert "holds those of scene room_0" in capsys.readouterr().err
