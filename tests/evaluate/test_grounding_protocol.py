@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from feature_fields import make_features
-from rooms import corner_cameras, room
-from splats import random_gaussians
+from rooms import room
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
@@ -19,7 +17,6 @@ from gsencoder.data.synthetic.write import write_room
 from gsencoder.evaluate.grounding import GroundedPair
 from gsencoder.evaluate.protocols.grounding import (
     GroundingProtocol,
-    _blend_at,
     evaluate_grounding,
     ground_scene,
     ids_by_name,
@@ -27,75 +24,14 @@ from gsencoder.evaluate.protocols.grounding import (
     phrase_mean,
     scores_by_phrase,
 )
-from gsencoder.evaluate.rendered_relevancy import RenderedRelevancy
-from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.memory.queries import memory_of_features
 from gsencoder.render import blend
 from gsencoder.text.table import make_text_table, save_text_table
-from gsencoder.types import FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
+from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, Scene, SceneObject, Views
 
 
 def thing(number: int, name: str | None, *, placed: bool = True) -> SceneObject:
     return SceneObject(id=number, name=name, aabb_min=np.zeros(3), aabb_max=np.ones(3), placed=placed)
-
-
-@pytest.mark.parametrize("basis", [True, False])
-def test_rendered_relevancy_is_the_cosine_of_rendered_features(basis: bool) -> None:
-    gaussians = random_gaussians(200)
-    features = make_features(200, basis=basis)
-    rng = np.random.default_rng(0)
-    text, mean = rng.normal(size=(3, 12)).astype(np.float32), rng.normal(size=12).astype(np.float32)
-    blended = blend(gaussians, corner_cameras(1), 0)
-    maps = RenderedRelevancy(features, text, mean).maps(blended)
-    assert maps.shape == (3, *blended.shape)
-    centered = ((features.decode() - features.mean) * features.seen[:, None]).astype(np.float64)
-    rendered = blended.render(torch.from_numpy(centered)).numpy()
-    words = text - mean
-    products = rendered @ words.T / np.linalg.norm(words, axis=1)
-    expected = products / np.maximum(np.linalg.norm(rendered, axis=1, keepdims=True), 1e-30)
-    # Rays that hit little have features too short to have a direction.
-    clear = np.linalg.norm(rendered, axis=1) > 0.05 * np.linalg.norm(features.mean)
-    np.testing.assert_allclose(maps.reshape(3, -1).T[clear], expected[clear], atol=1e-3)
-    nothing = (blended.alpha == 0).numpy()
-    assert clear.any()
-    assert nothing.any()
-    assert (maps.reshape(3, -1)[:, nothing] == 0).all()
-
-
-def test_an_index_and_one_gaussian_a_pixel_change_nothing() -> None:
-    scene, _ = room()
-    assert scene.gaussians is not None
-    count = len(scene.gaussians)
-    table = make_features(7, basis=False).features
-    index = np.random.default_rng(1).integers(-1, 7, count).astype(np.int32)
-    weights = (index >= 0).astype(np.float32)
-    space, mean = FeatureSpace(name="s", channels=12, text_encoder="words"), np.zeros(12, np.float32)
-    shared = GaussianFeatures(features=table, weights=weights, mean=mean, space=space, index=index)
-    own = replace(shared, features=shared.stored(), index=None)
-    text = np.eye(2, 12, dtype=np.float32)
-    blended = blend(scene.gaussians, corner_cameras(2), 1)
-    maps = [RenderedRelevancy(each, text, mean).maps(blended) for each in (shared, own)]
-    assert np.array_equal(*maps)
-    # Where a ray sees Gaussians of one row alone, the map is that row's relevancy.
-    alone = replace(shared, index=np.full(count, 3, np.int32), weights=np.ones(count, np.float32))
-    scores = relevancy(alone, text, mean)
-    opaque = (blended.alpha > 0.5).numpy()
-    found = RenderedRelevancy(alone, text, mean).maps(blended).reshape(2, -1)[:, opaque]
-    np.testing.assert_allclose(found, np.broadcast_to(scores[:, :1], found.shape), atol=1e-5)
-    with pytest.raises(InputError, match="features of 2 Gaussians"):
-        RenderedRelevancy(make_features(2), text, mean).maps(blended)
-
-
-@pytest.mark.parametrize("stride", [2, 3, 5, 48])
-def test_a_stride_takes_every_so_manieth_pixel(stride: int) -> None:
-    scene, _ = room()
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    whole, coarse = (_blend_at(scene, scene.views, 3, each) for each in (1, stride))
-    first = stride // 2
-    expected = whole.alpha.reshape(whole.shape)[first::stride, first::stride]
-    torch.testing.assert_close(coarse.alpha.reshape(coarse.shape), expected, atol=1e-6, rtol=0)
-    depth = whole.depth.reshape(whole.shape)[first::stride, first::stride]
-    torch.testing.assert_close(coarse.depth.reshape(coarse.shape), depth, atol=1e-5, rtol=1e-5)
 
 
 def test_instances_of_one_name_are_one_mask_and_small_ones_are_counted() -> None:
@@ -165,6 +101,33 @@ def test_what_features_say_exactly_is_grounded_exactly() -> None:
     assert max(pair.iou for pair in ground_scene(scene, swapped, WORDS, GroundingProtocol(min_pixels=5))[0]) < 0.1
     coarse, _ = ground_scene(scene, features, WORDS, GroundingProtocol(min_pixels=5, stride=2))
     assert np.mean([pair.iou for pair in coarse]) > 0.8
+
+
+def test_a_memory_is_grounded_by_what_pixels_attend_to_and_rays_that_meet_nothing_answer_no_word() -> None:
+    scene, features = labeled_room()
+    bank = MemoryBank(
+        components=np.eye(2, dtype=np.float32),
+        sources=np.zeros((2, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (2, 1, 1)),
+        mean=features.mean,
+        threshold=1.0,
+        coverage=1.0,
+        cosine=1.0,
+        space=features.space,
+    )
+    memory = memory_of_features(features, bank, channels=1)
+    protocol = GroundingProtocol(min_pixels=5)
+    plain, attended = (ground_scene(scene, features, WORDS, protocol, memory=each)[0] for each in (None, memory))
+    assert [(a.view, a.phrase) for a in plain] == [(b.view, b.phrase) for b in attended]
+    assert min(pair.iou for pair in attended) > 0.8
+    # The queries of the other word: the features that are passed beside the memory do not answer.
+    other = replace(memory, queries=-memory.queries)
+    assert max(pair.iou for pair in ground_scene(scene, features, WORDS, protocol, memory=other)[0]) < 0.1
+    # Only the cube has features, so that every pixel that it reaches at all answers, and all others are 0.
+    alone = replace(features, weights=features.features[:, 1].copy())
+    pairs, _ = ground_scene(scene, alone, WORDS, protocol)
+    assert all(pair.finite for pair in pairs)
+    assert min(pair.iou for pair in pairs) > 0.7
 
 
 def test_scenes_without_labels_and_words_of_other_spaces_are_refused() -> None:

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from gsencoder.app.commands.evaluate_report import names_table, scores_line
-from gsencoder.app.commands.evaluated_features import stored_source, stored_words, with_stored_features
+from gsencoder.app.commands.evaluated_features import stored_memory, stored_source, stored_words, with_stored_features
 from gsencoder.app.commands.through_head import words_of_head
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
@@ -60,7 +60,7 @@ from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import file_of_encoder, load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, stating_trained, words_of_table
-from gsencoder.types import Scene
+from gsencoder.types import QueryMemory, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,7 +283,13 @@ def _grounding(
     folder: Path,
     summary: Summary,
 ) -> None:
-    scenes = evaluate_grounding(_scenes(config), source, words, protocol=protocol, seeds=config.seeds)
+    def memory_of(scene: Scene) -> QueryMemory | None:
+        # Outputs of a head are features of their own; the memory holds those of the teacher.
+        return stored_memory(config.features, scene) if config.features and not config.head else None
+
+    scenes = evaluate_grounding(
+        _scenes(config), source, words, protocol=protocol, seeds=config.seeds, memory_of=memory_of
+    )
     for scene in scenes:
         summary.add_seconds(scene.seconds)
     pairs = [pair for scene in scenes for pair in scene.pairs]

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from gsencoder.app.commands.from_poses import memory_of
 from gsencoder.app.commands.query_words import asked_scene
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.text.build import TableTextConfig, TextConfig, Words
-from gsencoder.types import GaussianFeatures, Scene
+from gsencoder.types import GaussianFeatures, QueryMemory, Scene
 
 
 def folder_of(features: str, scene: str) -> Path:
@@ -66,3 +67,8 @@ def with_stored_features(
 def stored_source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
     """The source of features that came with the scene."""
     return next(iter(scene.features.values())), {}
+
+
+def stored_memory(features: str, scene: Scene) -> QueryMemory | None:
+    """The memory that the features of a scene were read from; None where features are stored themselves."""
+    return memory_of(folder_of(features, scene.name), scene)

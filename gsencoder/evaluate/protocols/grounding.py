@@ -8,21 +8,23 @@ rendered at its pixels. The ground truth is the union of all instances of a name
 import math
 import time
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int32
+from jaxtyping import Bool, Int32
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.grounding import GroundedPair, ground, grounding_scores
-from gsencoder.evaluate.rendered_relevancy import RenderedRelevancy
 from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.infer.localize.pixel_relevancy import GaussianProducts, pixel_features
+from gsencoder.infer.localize.relevancy import word_directions
+from gsencoder.render import blend
+from gsencoder.render.rays import strided_lattice
 from gsencoder.text.encoder import TextEncoder, check_space
-from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
+from gsencoder.types import GaussianFeatures, QueryMemory, Scene, SceneObject
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +76,7 @@ def evaluate_grounding(
     *,
     protocol: GroundingProtocol = GroundingProtocol(),
     seeds: SeedConfig = SeedConfig(),
+    memory_of: Callable[[Scene], QueryMemory | None] = lambda _: None,
 ) -> list[SceneGrounding]:
     """Runs the protocol scene by scene; one scene is in memory at a time.
 
@@ -83,6 +86,8 @@ def evaluate_grounding(
         words: turns names into the features' space.
         protocol: which names are looked for.
         seeds: how Gaussians are made for scenes without.
+        memory_of: the memory that the features of a scene come from, or None where there is none. Its queries are
+            rendered, and attend to its bank at each pixel.
 
     Returns:
         One result per scene, in order.
@@ -103,7 +108,7 @@ def evaluate_grounding(
             )
         scene, features, seconds = with_features(loaded_scene, source, seeds)
         start = time.perf_counter()
-        pairs, small = ground_scene(scene, features, words, protocol)
+        pairs, small = ground_scene(scene, features, words, protocol, memory=memory_of(scene))
         seconds = {"load": load_seconds, **seconds, "ground": time.perf_counter() - start}
         results.append(
             SceneGrounding(
@@ -132,15 +137,29 @@ def evaluate_grounding(
 
 
 def ground_scene(
-    scene: Scene, features: GaussianFeatures, words: TextEncoder, protocol: GroundingProtocol = GroundingProtocol()
+    scene: Scene,
+    features: GaussianFeatures,
+    words: TextEncoder,
+    protocol: GroundingProtocol = GroundingProtocol(),
+    *,
+    memory: QueryMemory | None = None,
 ) -> tuple[list[GroundedPair], int]:
     """Looks for the names of a scene's objects in features of its Gaussians, in each view that shows them.
+
+    Pixels that show no Gaussian with a feature have a relevancy of 0.
+
+    Args:
+        scene: Gaussians, views with instance maps, and objects.
+        features: of the Gaussians.
+        words: turns names into the features' space.
+        protocol: which names are looked for.
+        memory: that the features come from; see `evaluate_grounding`.
 
     Returns:
         The pairs, view by view, and the number of pairs that were left out because they have too few pixels.
 
     Raises:
-        InputError: the words are of another space, or do not have a name.
+        InputError: the words are of another space, or do not have a name; features of other Gaussians.
     """
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -149,17 +168,22 @@ def ground_scene(
     ids = ids_by_name(scene.objects, furniture=protocol.furniture)
     if not ids:
         return [], 0
-    relevancy = RenderedRelevancy(features, words.encode(list(ids)), words.mean)
+    directions = dict(zip(ids, word_directions(words.encode(list(ids)), words.mean), strict=True))
+    products = GaussianProducts(features)
     pairs, small = [], 0
     for view, name in enumerate(scene.views.names):
-        instances = scene.views.instances[view]
-        masks, left_out = masks_of(instances, ids, protocol)
+        masks, left_out = masks_of(scene.views.instances[view], ids, protocol)
         small += left_out
         if not masks:
             continue
-        maps = relevancy.maps(_blend_at(scene, scene.views, view, protocol.stride))
-        rows = {phrase: row for row, phrase in enumerate(ids)}
-        pairs += [ground(maps[rows[phrase]], mask, view=name, phrase=phrase) for phrase, mask in masks.items()]
+        b = blend(scene.gaussians, scene.views.cameras, view, stride=protocol.stride)
+        pixels = pixel_features(products, b, memory=memory)
+        cosines = np.clip(pixels.cosines(np.stack([directions[phrase] for phrase in masks])), -1, 1)
+        maps = np.where(pixels.alpha > 0, cosines, 0).reshape(-1, *b.shape)
+        pairs += [
+            ground(relevancy, mask, view=name, phrase=phrase)
+            for (phrase, mask), relevancy in zip(masks.items(), maps, strict=True)
+        ]
     return pairs, small
 
 
@@ -180,40 +204,17 @@ def masks_of(
     Names that the view does not show are neither. A mask that has pixels, but none of those that are rendered, has too
     few.
     """
-    first = protocol.stride // 2
+    lattice = strided_lattice(instances.shape[1], instances.shape[0], protocol.stride)
+    rows, columns = (slice(int(first), None, protocol.stride) for first in (lattice.y0, lattice.x0))
     masks, small = {}, 0
     for name, values in ids.items():
         whole = np.isin(instances, values)
-        mask = whole[first :: protocol.stride, first :: protocol.stride]
+        mask = whole[rows, columns]
         if whole.sum() >= protocol.min_pixels and mask.any():
             masks[name] = mask
         elif whole.any():
             small += 1
     return masks, small
-
-
-def _blend_at(scene: Scene, views: Views, view: int, stride: int) -> Blend:
-    """The blending weights of every stride-th pixel of a view, from the stride // 2-th on."""
-    assert scene.gaussians is not None
-    if stride == 1:
-        return blend(scene.gaussians, views.cameras, view)
-    first = stride // 2
-    width, height = (
-        len(range(first, int(side[view]), stride)) for side in (views.cameras.widths, views.cameras.heights)
-    )
-    # A blend takes its grid from a map; the center of a cell is that of the pixel.
-    cells = FeatureMap(
-        grid_from_image=pixel_affine(stride),
-        space=FeatureSpace(name="grid", channels=1),
-        features=np.zeros((height, width, 1), np.float32),
-    )
-    return blend(scene.gaussians, views.cameras, view, like=cells, config=BlendConfig(rays_per_patch=1))
-
-
-def pixel_affine(stride: int) -> Float64[np.ndarray, "2 3"]:
-    """From pixels to a grid whose cell (r, c) has the middle of pixel (stride·r + stride // 2, …) as its middle."""
-    offset = 0.5 - (stride // 2 + 0.5) / stride
-    return np.array([[1 / stride, 0, offset], [0, 1 / stride, offset]])
 
 
 def scores_by_phrase(pairs: Sequence[GroundedPair]) -> dict[str, dict[str, Any]]:

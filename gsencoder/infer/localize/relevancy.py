@@ -40,18 +40,11 @@ class FeatureAxes:
     axes: Float64[np.ndarray, "D S"] | None
     floor: float
 
-    def coordinates_of(self, stored: Float32[np.ndarray, "n channels"]) -> Float64[np.ndarray, "n S"]:
-        """Stored rows, less the mean that was removed, in these axes."""
-        local = stored.astype(np.float64)
-        return np.asarray((local if self.matrix is None else local @ self.matrix) + self.offset)
-
-    def unit(self, local: Float64[np.ndarray, "n S"]) -> Float64[np.ndarray, "n S"]:
-        """The directions of coordinates; of length 1, or less where a feature is hardly longer than rounding."""
-        return np.asarray(local / np.sqrt((local**2).sum(axis=1, keepdims=True) + self.floor))
-
     def directions_of(self, stored: Float32[np.ndarray, "n channels"]) -> Float64[np.ndarray, "n S"]:
-        """The directions of stored rows, as `unit` gives them."""
-        return self.unit(self.coordinates_of(stored))
+        """The directions of stored rows; of length 1, or less where a feature is hardly longer than rounding."""
+        local = stored.astype(np.float64)
+        local = (local if self.matrix is None else local @ self.matrix) + self.offset
+        return local / np.sqrt((local**2).sum(axis=1, keepdims=True) + self.floor)
 
     def project(self, directions: Float64[np.ndarray, "Q D"]) -> Float64[np.ndarray, "Q S"]:
         """Directions of the space in these axes; what lies across them has no product with any feature."""
