@@ -62,17 +62,21 @@ class MemoryAttention(nn.Module):
     def _attend(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n C"]:
         keys = self.keys @ self.projection.T
         if self.scoring != "dot":
-            queries = queries / self._lengths(queries)
+            queries = unit_queries(queries, self.projection @ self.projection.T)
         scaled = (queries / self.temperature)[None]
         return scaled_dot_product_attention(scaled, keys[None], self.values[None], scale=1.0)[0]
 
-    def _lengths(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n 1"]:
-        """|q W|, at least `EPS`. The largest entry is taken out of the root, so that squares neither overflow nor
-        vanish, and a gradient exists for a query of zeros."""
-        largest = queries.detach().abs().amax(dim=1, keepdim=True).clamp(min=EPS)
-        unit = queries / largest
-        squares = ((unit @ (self.projection @ self.projection.T)) * unit).sum(dim=1, keepdim=True)
-        return largest * squares.clamp(min=EPS**2).sqrt()
+
+def unit_queries(queries: Float[Tensor, "n s"], gram: Float[Tensor, "s s"]) -> Float[Tensor, "n s"]:
+    """Queries q divided by |q W|, or by `EPS` where it is smaller, with gram = W Wᵀ.
+
+    The largest entry is taken out of the root, so that squares neither overflow nor vanish, and a gradient exists for a
+    query of zeros.
+    """
+    largest = queries.detach().abs().amax(dim=1, keepdim=True).clamp(min=EPS)
+    unit = queries / largest
+    squares = ((unit @ gram) * unit).sum(dim=1, keepdim=True)
+    return unit / squares.clamp(min=EPS**2).sqrt()
 
 
 def random_projection(channels: int, width: int, generator: torch.Generator) -> Float[Tensor, "s D"]:

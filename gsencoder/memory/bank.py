@@ -1,6 +1,6 @@
 """Building a memory bank: the principal scene components of a scene's feature maps (M3 sec. 3.3, Algorithm 1)."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.free_memory import free_memory
-from gsencoder.fusion.lift import map_rows
+from gsencoder.memory.raw_features import MapStream, raw_features
 from gsencoder.memory.reduction import (
     ROUNDING,
     CoverReduction,
@@ -19,7 +19,7 @@ from gsencoder.memory.reduction import (
     reduce_as_published,
     unit_rows,
 )
-from gsencoder.types import FeatureMap, FeatureSpace, MemoryBank
+from gsencoder.types import FeatureSpace, MemoryBank
 
 BLOCK = 4096
 """Features that are compared with the components at once."""
@@ -33,9 +33,6 @@ SAME_KIND_COSINE = 0.95
 """Features within this of another one are of its kind."""
 COPIES = 6
 """How many times a bank is in memory while it is made."""
-
-MapStream = Callable[[], Iterator[tuple[int, FeatureMap]]]
-"""Gives the maps of a scene with the numbers of their views, any number of times."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,6 +125,7 @@ class _Builder:
     ) -> None:
         self._maps, self._space, self._mean, self._config = maps, space, mean, config
         self._grids: dict[int, Float64[np.ndarray, "2 3"]] = {}
+        self._coded: dict[int, bool] = {}
         self._floor = MIN_RELATIVE_NORM * float(np.linalg.norm(mean.astype(np.float64)))
         self._limit = free_memory() // 2 // (COPIES * 4 * space.channels)
         if config.components > self._limit:
@@ -159,7 +157,7 @@ class _Builder:
         """For each view its raw features less the mean, where they are, and which of them have a direction."""
         for view, feature_map in self._maps():
             rows, sources = raw_features(view, feature_map)
-            self._grids[view] = feature_map.grid_from_image
+            self._grids[view], self._coded[view] = feature_map.grid_from_image, feature_map.codes is not None
             with about(f"view {view}"):
                 centered = rows - self._mean
                 lengths = np.abs(centered).max(axis=1, initial=0)
@@ -186,7 +184,7 @@ class _Builder:
         sample = self._sample()
         if not len(sample):
             return 1.0
-        if self._is_coded() and len(np.unique(sample, axis=0)) <= MAX_NAMES:
+        if all(self._coded.values()) and len(np.unique(sample, axis=0)) <= MAX_NAMES:
             # The vectors are names or captions, and none of these may stand for another one.
             return 1.0
         # A feature that few cells have counts little in a mean over all of them, and as much as others among kinds.
@@ -194,9 +192,6 @@ class _Builder:
         return 1 - largest_threshold(
             lambda each: _mean_cosine(sample, _cover_of(sample, 1 - each), kinds) >= config.cosine
         )
-
-    def _is_coded(self) -> bool:
-        return all(feature_map.codes is not None for _, feature_map in self._maps())
 
     def _has_undirected(self) -> bool:
         return any(not directed.all() for _, _, directed in self._rows())
@@ -299,21 +294,6 @@ class _Builder:
 
     def _no_features(self) -> InputError:
         return InputError(f"memory: no view has a cell with a feature of {self._space.name}")
-
-
-def raw_features(view: int, feature_map: FeatureMap) -> tuple[Float32[np.ndarray, "n D"], Int32[np.ndarray, "n 3"]]:
-    """The features of a map, and the view, row and column of their cells: of every cell that has a feature; of a coded
-    map each vector that occurs, once, in the first cell that has it."""
-    if feature_map.codes is not None:
-        assert feature_map.table is not None
-        codes, cells = np.unique(feature_map.codes.ravel(), return_index=True)
-        rows, cells = feature_map.table[codes[codes >= 0]], cells[codes >= 0]
-    else:
-        rows = map_rows(feature_map)
-        cells = np.flatnonzero(~np.isnan(rows[:, 0]))
-        rows = rows[cells]
-    line, column = np.divmod(cells, feature_map.width)
-    return rows, np.stack([np.full(len(cells), view), line, column], axis=1).astype(np.int32)
 
 
 def _cover_of(rows: Float32[np.ndarray, "n D"], threshold: float) -> CoverReduction:

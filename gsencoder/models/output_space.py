@@ -206,6 +206,27 @@ def teacher_of_space(spaces: Mapping[str, FeatureSpace], name: str | None = None
     return known[name]
 
 
+def name_of_space(spaces: Mapping[str, FeatureSpace], space: FeatureSpace, encoder: str) -> str:
+    """The teacher of an encoder whose features are of a space.
+
+    Args:
+        spaces: of the encoder, by teacher.
+        space: that is wanted.
+        encoder: in messages: the setting that names it.
+
+    Raises:
+        InputError: the encoder has no such teacher.
+    """
+    for name, each in spaces.items():
+        if each == space:
+            return name
+    theirs = "; ".join(each.describe() for each in spaces.values())
+    raise InputError(
+        f"{encoder}: this encoder gives features of ({theirs}), and the teacher's are of ({space.describe()}); give an "
+        "encoder that was trained with this teacher"
+    )
+
+
 def check_distinct(spaces: Mapping[str, FeatureSpace]) -> None:
     """Checks that no two teachers have the same feature space.
 

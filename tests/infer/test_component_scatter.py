@@ -9,7 +9,7 @@ from sklearn.decomposition import PCA
 
 from gsencoder.core.errors import InputError
 from gsencoder.infer.draw.component_scatter import UMAP_LEAST, component_scatter, principal_plane, umap_plane
-from gsencoder.memory.raw_sample import RawSample
+from gsencoder.memory.raw_features import RawSample
 from gsencoder.types import FeatureSpace, MemoryBank
 
 

@@ -30,7 +30,7 @@ from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.models.output_space import OutputSpaces
+from gsencoder.models.output_space import OutputSpaces, name_of_space
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
@@ -134,14 +134,9 @@ def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> Featu
     Raises:
         InputError: it gives none of them, or all their channels.
     """
-    fitting = [each for each in outputs.by_teacher.values() if each.space == space]
-    if not fitting:
-        theirs = "; ".join(each.space.describe() for each in outputs.by_teacher.values())
-        raise InputError(
-            f"basis: the encoder of {weights} gives features of ({theirs}), and the teacher's are of "
-            f"({space.describe()}); give weights that were trained with this teacher"
-        )
-    basis = fitting[0].basis
+    by_name = outputs.by_teacher
+    name = name_of_space({each: output.space for each, output in by_name.items()}, space, f"basis={weights}")
+    basis = by_name[name].basis
     if basis is None:
         raise InputError(f"basis: the encoder of {weights} gives all channels; leave basis= out, or give other weights")
     return basis

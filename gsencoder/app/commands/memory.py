@@ -28,8 +28,8 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.memory.bank import BankConfig
-from gsencoder.memory.raw_sample import RawSample
-from gsencoder.models.output_space import check_distinct
+from gsencoder.memory.raw_features import RawSample
+from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.text.table import TextTable
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.memory import memory_training, train_memory, untrained_memory
@@ -212,14 +212,8 @@ def in_space(predicted: Mapping[str, GaussianFeatures], space: FeatureSpace, wei
     Raises:
         InputError: the encoder gives none.
     """
-    for features in predicted.values():
-        if features.space == space:
-            return features
-    theirs = "; ".join(each.space.describe() for each in predicted.values())
-    raise InputError(
-        f"weights: the encoder of {weights} gives features of ({theirs}), and the teacher's are of "
-        f"({space.describe()}); give weights that were trained with this teacher"
-    )
+    name = name_of_space({each: features.space for each, features in predicted.items()}, space, f"weights={weights}")
+    return predicted[name]
 
 
 def _draw(

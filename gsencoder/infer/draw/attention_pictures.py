@@ -99,15 +99,15 @@ def attention_picture(
             f"from view {last}; expected the views that the memory was made from"
         )
     b = blended if blended is not None else blend(gaussians, views.cameras, view, config=config)
-    found = strongest_components(memory, gaussians, views.cameras, view, pixel, count, config=config, blended=b)
+    strongest = strongest_components(memory, gaussians, views.cameras, view, pixel, count, config=config, blended=b)
     shown = render_image(gaussians, views.cameras, view, blended=b)
     images = RenderedImages(gaussians, views.cameras, config) if views.images is None else views.images
     cells, tiles = bank.cells, []
-    for component in found.components.tolist():
+    for component in strongest.components.tolist():
         source, row, column = bank.sources[component].tolist()
         where = f"{views.names[source]}{', rendered' if views.images is None else ''}"
         tiles.append((cell_tile(images[source], cells[component]), where, f"row {row}, column {column} of its map"))
-    return _sheet(mark_pixel(shown, pixel), views.names[view], found, tiles, bank)
+    return _sheet(mark_pixel(shown, pixel), views.names[view], strongest, tiles, bank)
 
 
 def fit_in(rgb: UInt8[np.ndarray, "h w 3"], side: int) -> tuple[Image.Image, float]:
@@ -188,7 +188,7 @@ def _outline(image: Image.Image, edges: Sequence[float]) -> None:
 def _sheet(
     view: UInt8[np.ndarray, "h w 3"],
     view_name: str,
-    found: PixelAttention,
+    strongest: PixelAttention,
     tiles: Sequence[tuple[UInt8[np.ndarray, "_h _w 3"], str, str]],
     bank: MemoryBank,
 ) -> UInt8[np.ndarray, "H W 3"]:
@@ -206,7 +206,7 @@ def _sheet(
     def write(at: tuple[int, int], text: str, room: int, size: int, color: tuple[int, int, int] = INK) -> None:
         draw.text(at, fit_text(draw, text, room, size), fill=color, font=label_font(size))
 
-    (x, y), total = found.pixel, 100 * float(found.weights.sum())
+    (x, y), total = strongest.pixel, 100 * float(strongest.weights.sum())
     write((GAP, GAP), "The query that is rendered in the marked pixel …", view_width, 19)
     write((GAP, GAP + 28), f"memory of {bank.space.name}", view_width, 15, FAINT)
     sheet.paste(Image.fromarray(view), (GAP, HEAD))
@@ -223,7 +223,7 @@ def _sheet(
         at_x, at_y = left + column * (TILE_SIDE + GAP), HEAD + row * block
         sheet.paste(Image.fromarray(tile), (at_x, at_y))
         below = at_y + tile.shape[0] + 4
-        weight = float(found.weights[number])
+        weight = float(strongest.weights[number])
         draw.rectangle([at_x, below, at_x + TILE_SIDE - 1, below + BAR - 3], fill=EMPTY_BAR)
         if (filled := round(weight * TILE_SIDE)) > 0:
             draw.rectangle([at_x, below, at_x + filled - 1, below + BAR - 3], fill=FULL_BAR)

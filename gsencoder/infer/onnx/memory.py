@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.memory.attention import MemoryAttention
+from gsencoder.memory.attention import MemoryAttention, unit_queries
 from gsencoder.types import QueryMemory
 
 INPUT, OUTPUT = "queries", "features"
@@ -37,10 +37,7 @@ class _Attention(nn.Module):
 
     def forward(self, queries: Float[Tensor, "n s"]) -> Float[Tensor, "n D"]:
         if self.cosines:
-            largest = queries.abs().amax(dim=1, keepdim=True).clamp(min=1e-6)
-            unit = queries / largest
-            squares = ((unit @ self.gram) * unit).sum(dim=1, keepdim=True)
-            queries = unit / squares.clamp(min=1e-12).sqrt()
+            queries = unit_queries(queries, self.gram)
         return torch.softmax(queries @ self.keys, dim=1) @ self.values
 
 

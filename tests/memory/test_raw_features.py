@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.memory.bank import MapStream, build_bank, raw_features
-from gsencoder.memory.raw_sample import draw_sample
+from gsencoder.memory.bank import build_bank
+from gsencoder.memory.raw_features import MapStream, draw_sample, raw_features
 from gsencoder.types import FeatureMap, FeatureSpace
 
 SPACE = FeatureSpace(name="numbers", channels=2)

@@ -1,13 +1,32 @@
-"""A random sample of a scene's raw features, to look at: no more than it are held while the maps are read."""
+"""The raw features of a scene, as its maps hold them, and a random sample of them to look at."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.memory.bank import MapStream, raw_features
-from gsencoder.types import FeatureSpace
+from gsencoder.fusion.lift import map_rows
+from gsencoder.types import FeatureMap, FeatureSpace
+
+MapStream = Callable[[], Iterator[tuple[int, FeatureMap]]]
+"""Gives the maps of a scene with the numbers of their views, any number of times."""
+
+
+def raw_features(view: int, feature_map: FeatureMap) -> tuple[Float32[np.ndarray, "n D"], Int32[np.ndarray, "n 3"]]:
+    """The features of a map, and the view, row and column of their cells: of every cell that has a feature; of a coded
+    map each vector that occurs, once, in the first cell that has it."""
+    if feature_map.codes is not None:
+        assert feature_map.table is not None
+        codes, cells = np.unique(feature_map.codes.ravel(), return_index=True)
+        rows, cells = feature_map.table[codes[codes >= 0]], cells[codes >= 0]
+    else:
+        rows = map_rows(feature_map)
+        cells = np.flatnonzero(~np.isnan(rows[:, 0]))
+        rows = rows[cells]
+    line, column = np.divmod(cells, feature_map.width)
+    return rows, np.stack([np.full(len(cells), view), line, column], axis=1).astype(np.int32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,8 +45,8 @@ class RawSample:
 def draw_sample(maps: MapStream, space: FeatureSpace, limit: int, *, seed: int = 0) -> RawSample:
     """Draws raw features without replacement, each with the same probability.
 
-    Every feature gets a random number, and those with the smallest numbers are kept. Every n-th feature would come from
-    the same few columns of maps whose width divides n.
+    Every feature gets a random number, and those with the smallest numbers are the sample. Every n-th feature would
+    come from the same few columns of maps whose width divides n.
 
     Args:
         maps: of the scene; read once.
@@ -54,6 +73,6 @@ def draw_sample(maps: MapStream, space: FeatureSpace, limit: int, *, seed: int =
             continue
         features, numbers = np.concatenate([features, rows]), np.concatenate([numbers, drawn])
         if len(numbers) > limit:
-            kept = np.sort(np.argsort(numbers, kind="stable")[:limit])
-            features, numbers = features[kept], numbers[kept]
+            smallest = np.sort(np.argsort(numbers, kind="stable")[:limit])
+            features, numbers = features[smallest], numbers[smallest]
     return RawSample(features=features, total=total)
