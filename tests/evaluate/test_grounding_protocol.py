@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import numpy as np
@@ -186,6 +187,16 @@ def test_the_command_writes_pairs_and_names_and_takes_features_of_folders(
         stored = results_of(out)
         assert stored["pairs"] == fused["pairs"]
         assert stored["miou"] == pytest.approx(fused["miou"], abs=0.01)
+    # Views that the features were not made from: they have another mean, which is their origin.
+    copytree(tmp_path / "room_0", tmp_path / "left_out" / "room_0")
+    listing = tmp_path / "left_out" / "room_0" / "transforms.json"
+    transforms = json.loads(listing.read_text())
+    listing.write_text(json.dumps({**transforms, "frames": transforms["frames"][:1]}))
+    ask_left_out = [ask[0], str(tmp_path / "left_out" / "room_0"), *ask[2:]]
+    assert cli.main([*ask_left_out, f"features={folders}", f"out={tmp_path / 'one view'}", "quiet=true"]) == 0
+    first = [line.split(",")[3] for line in pairs[1:] if line.split(",")[1] == transforms["frames"][0]["file_path"]]
+    assert first
+    assert results_of(tmp_path / "one view")["miou"] == pytest.approx(np.mean([float(iou) for iou in first]), abs=0.02)
     # The other protocols take them, too.
     named = ["evaluate", scene, "protocol=naming", f"features={folders}", f"out={tmp_path / 'named'}", "quiet=true"]
     assert cli.main(named) == 0

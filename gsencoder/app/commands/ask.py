@@ -34,7 +34,7 @@ class AskCommandConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
+        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
     )
     question: str = field(default="", metadata={"help": "the question"})
     questions: str = field(

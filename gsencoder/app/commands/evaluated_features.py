@@ -49,19 +49,25 @@ def with_stored_features(
 ) -> Iterator[tuple[Scene, float]]:
     """Labeled scenes with the Gaussians and features of a folder, as `load_scenes` yields scenes.
 
+    The features may have been made from other views of the scene, such as all but those that are evaluated; the origin,
+    which is the mean of the cameras, is then another one.
+
     Raises:
         InputError: features of another scene, or none.
     """
     for scene, seconds in scenes:
         folder = folder_of(features, scene.name)
         stored = load_features(folder)
-        if stored.name != scene.name or not np.array_equal(stored.origin, scene.origin):
+        if stored.name != scene.name:
             raise InputError(
-                f"features: {folder} holds those of scene {stored.name} with the origin {stored.origin.tolist()}; "
-                f"expected {scene.name} with {scene.origin.tolist()}, or a folder of this name"
+                f"features: {folder} holds those of scene {stored.name}, and {scene.name} is evaluated; give a folder "
+                f"that has the features of each scene in a folder of its name"
             )
         asked, _ = asked_scene(stored, folder, head=head, space=space, text=text)
-        yield replace(scene, gaussians=asked.gaussians, features=asked.features), seconds
+        assert asked.gaussians is not None
+        means = (asked.gaussians.means + (stored.origin - scene.origin)).astype(np.float32)
+        gaussians = replace(asked.gaussians, means=means)
+        yield replace(scene, gaussians=gaussians, features=asked.features), seconds
 
 
 def stored_source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:

@@ -36,7 +36,8 @@ class LocalizeCommandConfig(CommonConfig):
     """Settings of `localize`."""
 
     paths: tuple[str, ...] = field(
-        default=(), metadata={"help": "a folder written by fuse or encode", "metavar": "FEATURES", "required": True}
+        default=(),
+        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
     )
     query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
     queries: str = field(default="", metadata={"help": "a text file with one query a line"})

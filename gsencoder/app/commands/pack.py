@@ -36,7 +36,7 @@ class PackConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
+        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
     )
     space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
     head: str = field(

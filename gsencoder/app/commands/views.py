@@ -39,7 +39,7 @@ class ViewsCommandConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "a folder written by fuse, encode or pack", "metavar": "FEATURES", "required": True},
+        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
     )
     query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
     queries: str = field(default="", metadata={"help": "a text file with one query a line"})
