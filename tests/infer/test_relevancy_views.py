@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from splats import random_gaussians
 
 from gsencoder.data.orbits import looking_cameras
+from gsencoder.infer.draw.pictures import enlarge, legible_factor
 from gsencoder.infer.draw.relevancy_views import best_views, relevancy_pictures
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.render import blend
@@ -130,3 +132,34 @@ def test_every_word_gets_its_pictures_with_names_that_any_disk_takes() -> None:
         f"{index:02d}_{word}_view{view:03d}" for index, word in enumerate(("a_b_c", "é_", "x" * 60)) for view in (0, 1)
     ]
     assert all(picture.width >= 64 for picture in pictures.values())
+
+
+def test_the_photograph_is_on_the_left_and_relevancy_on_the_right() -> None:
+    splat = splat_of(wall(0.0))
+    cameras = facing(1.0)
+    rng = np.random.default_rng(0)
+    photograph = rng.integers(0, 256, (int(cameras.heights[0]), int(cameras.widths[0]), 3), dtype=np.uint8)
+    views = Views(cameras=cameras, names=("a",), images=[photograph])
+    scores = np.ones((1, len(splat)), np.float32)
+    found = Localization(
+        queries=("wall",),
+        relevancy=scores,
+        thresholds=np.full(1, 0.5, np.float32),
+        probabilities=np.ones(1, np.float32),
+        boxes=(),
+    )
+    drawn = {}
+    for name, images in (("photograph", [photograph]), ("rendered", None)):
+        scene = Scene(name="wall", gaussians=splat, views=replace(views, images=images))
+        ((_, picture),) = relevancy_pictures(scene, found, per_word=1)
+        drawn[name] = np.asarray(picture)
+    assert drawn["photograph"].shape == drawn["rendered"].shape
+    middle = drawn["photograph"].shape[1] // 2
+    differs = (drawn["photograph"] != drawn["rendered"]).any(axis=(0, 2))
+    assert differs[:middle].mean() > 0.9
+    assert not differs[middle:].any()
+    left = Image.fromarray(drawn["photograph"][:, :middle])
+    factor = legible_factor(photograph.shape[1])
+    large = enlarge(photograph, factor)
+    windows = np.lib.stride_tricks.sliding_window_view(np.asarray(left), large.shape)
+    assert any(np.array_equal(window, large) for window in windows.reshape(-1, *large.shape))

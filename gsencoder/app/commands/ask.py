@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsencoder.app.commands.query_words import asked_scene, load_words
-from gsencoder.app.commands.views import shown_scene
+from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import printable
 from gsencoder.app.runs.progress import Progress, console

@@ -14,6 +14,7 @@ from gsencoder.app.commands.from_poses import (
     search_from_poses,
 )
 from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.progress import console
@@ -22,8 +23,8 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.threads import import_ahead
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.up import with_up
-from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
@@ -61,6 +62,11 @@ class LocalizeCommandConfig(CommonConfig):
         default=(), metadata={"help": "names of views of the scene, whose cameras are asked like those of pose="}
     )
     pictures: int = field(default=4, metadata={"help": "number of views drawn for each word; 0 = none"})
+    photos: str = field(
+        default="",
+        metadata={"help": "the scene that was fused; its photographs are drawn beside relevancy, not renders"},
+    )
+    data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
 
@@ -81,7 +87,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         # Drawing needs torch, which finding boxes does without; it takes as long to load as they take to find.
         import_ahead("gsencoder.infer.draw.relevancy_views")
     with summary.step("load"):
-        scene = load_features(folder)
+        scene = shown_scene(folder, config.photos, config.data)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
         scene, _ = with_up(scene)
         asked, table = asked_scene(

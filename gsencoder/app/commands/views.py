@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.commands.through_head import features_for_heads, heads_of_folder
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
@@ -12,15 +13,13 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import write_archive
 from gsencoder.core.files.json_values import write_json
-from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.heads.apply import head_space, head_tokens
 from gsencoder.fusion.heads.store import find_head
-from gsencoder.fusion.store.folder import load_features
 from gsencoder.fusion.store.heads_file import check_heads_space
 from gsencoder.infer.localize.localization_json import box_to_json, words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.pictures import describe_view, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
 from gsencoder.infer.views.targets import Target, best_boxes, targets_of
@@ -132,12 +131,6 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     for number, each in enumerate(views.chosen):
         screen.print(f"{number:2d}  {describe_view(each)}")
     screen.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))
-
-
-def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
-    """Loads a folder of features, with the photographs of the scene `photos` if one is given."""
-    scene = load_features(folder)
-    return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
 
 
 def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:

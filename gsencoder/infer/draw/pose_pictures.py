@@ -1,10 +1,10 @@
-"""Pictures of what was found from a pose: the rendered view, relevancy over it, and the pixel marked."""
+"""Pictures of what is seen from a pose: the rendered view, relevancy over it, and the pixel marked in both."""
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image, ImageDraw
 
-from gsencoder.infer.draw.pictures import enlarge, ink_on, label_font, legible_factor, relevancy_overlay
+from gsencoder.infer.draw.pictures import contact_sheet, enlarge, ink_on, label_font, legible_factor, relevancy_overlay
 from gsencoder.infer.localize.from_pose import PosePoint, SeenField
 from gsencoder.render.images import render_image
 
@@ -20,7 +20,8 @@ def view_picture(seen: SeenField) -> UInt8[np.ndarray, "H W 3"]:
 def pose_picture(
     rgb: UInt8[np.ndarray, "H W 3"], seen: SeenField, point: PosePoint, relevancy: Float32[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "H2 W2 3"]:
-    """A view with the relevancy of a word over it, and its pixel in a ring; small views are enlarged.
+    """A view, and beside it the view with the relevancy of a word over it, the word's pixel in a ring in both; small
+    views are enlarged.
 
     Args:
         rgb: of `view_picture`.
@@ -33,7 +34,15 @@ def pose_picture(
     rows = np.minimum(np.arange(height) // int(lattice.dy), lattice.height - 1)
     columns = np.minimum(np.arange(width) // int(lattice.dx), lattice.width - 1)
     factor = legible_factor(width)
-    image = Image.fromarray(enlarge(relevancy_overlay(rgb, relevancy[rows[:, None], columns]), factor))
+    heat = relevancy_overlay(rgb, relevancy[rows[:, None], columns])
+    halves = [_marked(half, factor, point) for half in (rgb, heat)]
+    titles = ("rendered", f"relevancy of {point.query!r}, threshold {point.threshold:.2f}")
+    return contact_sheet(halves, titles, columns=2, width=halves[0].shape[1])
+
+
+def _marked(picture: UInt8[np.ndarray, "H W 3"], factor: int, point: PosePoint) -> UInt8[np.ndarray, "H2 W2 3"]:
+    """A picture, enlarged, with the pixel of a word in a ring, and what was found of the word."""
+    image = Image.fromarray(enlarge(picture, factor))
     draw = ImageDraw.Draw(image)
     if not np.isfinite(point.pixel).all():
         _write(draw, image.size, f"{point.query}: nothing with features in view", HIDDEN, None)

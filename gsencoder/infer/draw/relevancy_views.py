@@ -1,4 +1,4 @@
-"""Pictures of relevancy: heat maps of a word over rendered views of the scene, with its boxes."""
+"""Pictures of relevancy: views of the scene, and beside them heat maps of a word, with its boxes in both."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,7 +8,7 @@ from jaxtyping import Integer
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.draw.pictures import draw_boxes, relevancy_overlay
+from gsencoder.infer.draw.pictures import contact_sheet, draw_boxes, relevancy_overlay
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import render_image
 from gsencoder.render.zbuffer import visible_shares
@@ -54,10 +54,11 @@ def relevancy_pictures(
     per_word: int,
     config: BlendConfig = BlendConfig(),
 ) -> Iterator[tuple[str, Image.Image]]:
-    """For each word its best views, rendered, with relevancy over them and its boxes.
+    """For each word its best views: on the left the photograph, or where there is none the rendered view, on the right
+    the relevancy of the word over the rendered view; the word's boxes are in both.
 
     Args:
-        scene: Gaussians and cameras.
+        scene: Gaussians, and cameras with photographs or without.
         localization: relevancy and boxes of the words.
         per_word: views drawn for each word.
         config: accuracy of the rendering.
@@ -83,13 +84,21 @@ def relevancy_pictures(
     for view in sorted({view for views in chosen for view in views}):
         b = blend(scene.gaussians, cameras, view, config=config)
         rgb = render_image(scene.gaussians, cameras, view, blended=b)
+        images = scene.views.images
+        seen = rgb if images is None else images[view]
+        kind = "rendered" if images is None else "photograph"
         pose, K = cameras.cam_from_world[view], cameras.Ks[view]
         wanted = [index for index, views in enumerate(chosen) if view in views]
         scores = torch.from_numpy(np.nan_to_num(localization.relevancy[wanted].T, nan=0.0))
         heats = b.render(scores).numpy()
         for column, index in enumerate(wanted):
             word = localization.queries[index]
-            picture = relevancy_overlay(rgb, heats[:, column].reshape(b.shape))
-            picture = draw_boxes(picture, boxes_of[word], pose, K, origin=scene.origin)
+            heat = relevancy_overlay(rgb, heats[:, column].reshape(b.shape))
+            halves = [draw_boxes(half, boxes_of[word], pose, K, origin=scene.origin) for half in (seen, heat)]
+            titles = (
+                f"{scene.views.names[view]}, {kind}",
+                f"relevancy of {word!r}, threshold {localization.thresholds[index]:.2f}",
+            )
+            picture = contact_sheet(halves, titles, columns=2, width=halves[0].shape[1])
             safe = "".join(c if c.isalnum() else "_" for c in word)[:60]
             yield f"{index:02d}_{safe}_view{view:03d}", Image.fromarray(picture)

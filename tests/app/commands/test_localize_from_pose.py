@@ -67,8 +67,11 @@ def test_words_are_found_from_the_poses_of_a_file_and_from_views_of_the_scene(fe
     names = {path.name for path in out.glob("pose*.png")}
     assert names == {f"pose{c:03d}_{w}.png" for c in range(4) for w in ("00_cube", "01_wall")}
     with Image.open(out / "pose000_00_cube.png") as picture:
-        assert picture.size == (640, 480)
-        assert np.asarray(picture).std(axis=(0, 1)).min() > 1
+        assert picture.size > (2 * 640, 480)
+        # The view on the left and relevancy on the right, both with the cube.
+        left, right = (np.asarray(picture)[:, half] for half in (slice(0, 640), slice(-640, None)))
+        assert min(left.std(axis=(0, 1)).min(), right.std(axis=(0, 1)).min()) > 1
+        assert not np.array_equal(left, right)
 
 
 def test_without_the_options_nothing_is_added_and_without_pictures_none_is_drawn(
