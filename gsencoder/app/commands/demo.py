@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.app.commands.demo_report import TeacherResult, write_report
+from gsencoder.app.reports.demo import TeacherResult, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary

@@ -102,6 +102,7 @@ class EvaluateConfig(CommonConfig):
         default_factory=LocalizationProtocol
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
+    report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
@@ -127,6 +128,10 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
             _grounding(config, config.protocol, source, words, folder, summary)
         else:
             _localization(config, config.protocol, source, words, folder, summary)
+        if config.report:
+            from gsencoder.app.reports.results import report_scores
+
+            report_scores(folder, summary)
     screen = console(config.quiet)
     screen.print(names_table(summary.results))
     screen.print(f"{out}: {scores_line(summary.results)}")

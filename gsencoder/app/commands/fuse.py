@@ -10,6 +10,7 @@ import numpy as np
 from gsencoder.app.commands.basis_figures import describe_basis
 from gsencoder.app.commands.fusable_scene import load_fusable
 from gsencoder.app.commands.head_figures import describe_heads, head_figures
+from gsencoder.app.reports.results import report_fusion
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
@@ -60,6 +61,7 @@ class FuseCommandConfig(CommonConfig):
         default=0,
         metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
     )
+    report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
@@ -99,6 +101,9 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             fusion = fuse_scene(scene, teacher, config, one, out, basis=basis, sample_cells=bool(heads))
             write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
             lines = write_heads(folder, heads, fusion, one)
+            if config.report:
+                with one.step("report"):
+                    report_fusion(folder, scene, fusion.features, fusion.truncation, config.teacher.name, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
         seen, total = one.results["seen"], one.results["gaussians"]
         screen.print(

@@ -66,6 +66,7 @@ class LocalizeCommandConfig(CommonConfig):
         default="",
         metadata={"help": "the scene that was fused; its photographs are drawn beside relevancy, not renders"},
     )
+    report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
@@ -125,6 +126,11 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
                         picture.save(target / f"{name}.png")
             write_json(target / FROM_POSE, points)
             summary.results["from_pose"] = points
+        if config.report:
+            from gsencoder.app.reports.results import report_words
+
+            with summary.step("report"):
+                report_words(target, scene, localization, summary)
     screen = console(config.quiet)
     for word in words:
         screen.print(f"{one_line(word)}: {_first_box(localization, word)}")
