@@ -14,7 +14,8 @@ import pytest
 
 import gsencoder
 from gsencoder.app.commands import COMMANDS
-from gsencoder.app.settings.compose import Choices, choices_of, overrides, read_words
+from gsencoder.app.settings.choices import Choices, choices_of
+from gsencoder.app.settings.compose import overrides, read_words
 from gsencoder.core.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,21 +15,21 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from gsencoder.app.settings.choices import Choices, choices_of, conf_folder, full_key, option_of_several
 from gsencoder.app.settings.config import CommonConfig, typed
-from gsencoder.app.settings.config_store import EXPERIMENT, groups_of, store_settings
+from gsencoder.app.settings.config_store import EXPERIMENT, store_settings
+from gsencoder.app.settings.hydra_errors import HYDRA_KEY, hydra_error
 from gsencoder.app.settings.options import (
     Option,
     join_list,
     near,
-    options_by_key,
-    options_of,
     without_value,
     wrong_value,
 )
+from gsencoder.app.settings.several import check_options_of_one, check_single, members_of
 from gsencoder.core.errors import InputError
 from gsencoder.core.removed_options import check_removed_option, removed_option
 
@@ -37,31 +37,6 @@ Config = TypeVar("Config", bound=CommonConfig)
 
 SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
 """Form of the value of a text option that is swept, with -m."""
-HYDRA_KEY = re.compile(r"\+{0,2}hydra[./]")
-"""Settings of Hydra itself, with -m; + adds one, as `+hydra.launcher.additional_parameters.account=…`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Choices:
-    """The options and choices of a command.
-
-    Attributes:
-        options: by full key.
-        members: for each key the members of a choice that have this option; empty if it always applies.
-        groups: the names of each choice's members, by the choice's key.
-        chosen: the default of each choice.
-    """
-
-    options: Mapping[str, Option]
-    members: Mapping[str, tuple[str, ...]]
-    groups: Mapping[str, tuple[str, ...]]
-    chosen: Mapping[str, str]
-
-
-def conf_folder() -> Path:
-    """The folder of YAML files: inside an installed package, beside it in a source tree."""
-    package = Path(__file__).resolve().parents[2]
-    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def seal(text: str) -> str:
@@ -94,41 +69,6 @@ def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iter
         raise InputError(" ".join(str(error).split())) from error
 
 
-def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
-    """The options and choices of a command, including the members of choices that are YAML files in `conf`."""
-    folder, groups, chosen = conf or conf_folder(), {}, {}
-    for group in groups_of(cls):
-        files = (path.stem for path in (folder / group.key).glob("*.yaml"))
-        groups[group.key] = tuple(sorted({*group.members, *files}))
-        chosen[group.key] = group.default
-    members: dict[str, tuple[str, ...]] = {}
-    for option in options_of(cls):
-        members[option.key] = (*members.get(option.key, ()), option.member) if option.member else ()
-    return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=chosen)
-
-
-def _option_of_several(key: str, choices: Choices) -> Option | None:
-    """The option that `teachers.NAME.OPTION` stands for, which is that of the choice `teacher`; None for other keys."""
-    field, _, rest = key.partition(".")
-    name, _, last = rest.partition(".")
-    several = choices.options[field].several if field in choices.options else ""
-    return choices.options.get(f"{several}.{last}") if several and name and last else None
-
-
-def _full_key(key: str, choices: Choices) -> str | None:
-    """The option or choice that `key` stands for, or None."""
-    known = [*choices.options, *choices.groups]
-    if key in known or _option_of_several(key, choices) is not None:
-        return key
-    ends = [name for name in known if re.split(r"[./]", name)[-1] == key]
-    # An option of a section within a section gives way to one that is less deep.
-    depths = [len(re.split(r"[./]", name)) for name in ends]
-    ends = [name for name, depth in zip(ends, depths, strict=True) if depth == min(depths)]
-    if len(ends) > 1:
-        raise InputError(f"{key}: stands for more than one option; write {' or '.join(f'{end}=' for end in ends)}")
-    return ends[0] if ends else None
-
-
 def read_words(
     words: Sequence[str], choices: Choices, *, sweep: bool = False
 ) -> tuple[tuple[str, ...], dict[str, str]]:
@@ -146,13 +86,13 @@ def read_words(
             if word == "--" and not only_paths:
                 only_paths = True
                 continue
-            if not only_paths and not os.path.lexists(word) and _full_key(word, choices):
+            if not only_paths and not os.path.lexists(word) and full_key(word, choices):
                 raise InputError(f"{word}: needs a value: {word}=…")
             if not word:
                 raise InputError("a path is empty; leave it out or name a file")
             paths.append(word)
             continue
-        full = key if sweep and HYDRA_KEY.match(key) else _full_key(key, choices)
+        full = key if sweep and HYDRA_KEY.match(key) else full_key(key, choices)
         if full in choices.groups and re.fullmatch(r"\[.*\]", value):
             # Several members of a choice, where the command takes several, are an option of their own.
             full = next((name for name, option in choices.options.items() if option.several == full), full)
@@ -206,11 +146,11 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
 
     parser = OverridesParser.create()
     hydra_overrides = []
-    _check_options_of_one(given, choices)
+    check_options_of_one(given, choices)
     for key, value in given.items():
-        option = choices.options.get(key) or _option_of_several(key, choices)
+        option = choices.options.get(key) or option_of_several(key, choices)
         if option is not None and option.several:
-            hydra_overrides += _members_of(key, value, option.several, choices.groups[option.several])
+            hydra_overrides += members_of(key, value, option.several, choices.groups[option.several])
             continue
         written = value
         if key in choices.groups:
@@ -244,88 +184,8 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
     return hydra_overrides
 
 
-def _check_options_of_one(given: Mapping[str, str], choices: Choices) -> None:
-    """Checks that with several members of a choice no options are given for the only one.
-
-    Raises:
-        InputError: there are such options, or no members.
-    """
-    for key, value in given.items():
-        several = choices.options[key].several if key in choices.options else ""
-        unused = [name for name in given if name == several or name.startswith(f"{several}.")] if several else []
-        if unused:
-            option = unused[0].partition(".")[2]
-            hint = f"{key}.NAME.{option}=… is that of one of them" if option else f"leave out {several}= or {key}="
-            raise InputError(f"{unused[0]}: is for a single {several}, and {key}={value} gives several; {hint}")
-        if several and not value.strip("[] "):
-            raise InputError(f"{key}: expected one or more of {', '.join(choices.groups[several])}, got {value!r}")
-
-
-def _members_of(key: str, value: str, group: str, members: Sequence[str]) -> list[str]:
-    """Overrides that add several members of a choice, each below a name of its own.
-
-    Raises:
-        InputError: an unknown member, or a name that is given twice.
-    """
-    pairs = _named_members(value)
-    names = [name for name, _ in pairs]
-    for name, member in pairs:
-        if member not in members:
-            raise InputError(f"{key}: expected some of {', '.join(members)}, got {member!r}{near(member, members)}")
-        if names.count(name) > 1:
-            raise InputError(f"{key}: {name} is given twice; give other names, such as {name}_2:{member}")
-        if not re.fullmatch(r"\w+", name, re.ASCII):
-            raise InputError(f"{key}: expected names of letters, digits and _, got {name!r}")
-    return [f"+{group}@{key}.{name}={member}" for name, member in pairs]
-
-
-def _named_members(value: str) -> list[tuple[str, str]]:
-    """The names and members of a list such as [labels,dino:onnx]; a member without a name has its own."""
-    words = [word.strip() for word in value.removeprefix("[").removesuffix("]").split(",") if word.strip()]
-    return [(word.partition(":")[0], word.partition(":")[2] or word) for word in words]
-
-
 def _is_list(option: Option) -> bool:
     return getattr(option.annotation, "__origin__", None) is tuple
-
-
-def hydra_error(error: Exception, given: Mapping[str, str], choices: Choices) -> str:
-    """The message of an error of Hydra; it is explained if an option belongs to a member that was not chosen, or to no
-    launcher, or if the launcher is not installed."""
-    missing = re.search(r"Could not find 'hydra/launcher/([^']+)'", str(error))
-    if missing:
-        return (
-            f"hydra/launcher={missing[1]}: no such launcher is installed; submitit_slurm and submitit_local come with "
-            "pip install 'gsencoder[slurm]'"
-        )
-    twice = re.search(r"(\w+)@(\w+)\.(\w+) appears more than once", str(error))
-    if twice:
-        return (
-            f"{twice[2]}.{twice[3]}: is given by {EXPERIMENT}={given.get(EXPERIMENT, '')} and once more; leave out "
-            f"{twice[1]}=, since those of an experiment cannot be replaced, or leave out {EXPERIMENT}="
-        )
-    absent = re.search(r"Could not find '(\w+)/([^']+)'", str(error))
-    if absent and absent[1] in choices.groups:
-        names = choices.groups[absent[1]]
-        return f"{absent[1]}: expected one of {', '.join(names)}, got {absent[2]!r}{near(absent[2], names)}"
-    match = re.search(r"Could not override '([^']+)'", str(error))
-    if match and match[1] in given:
-        key = match[1]
-        if HYDRA_KEY.match(key):
-            return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
-        if key not in choices.options:
-            section, _, name = key.rpartition(".")[0].partition(".")
-            member = dict(_named_members(given.get(section, ""))).get(name)
-            if member is None:
-                return f"{key}: there is no {name} among the {section} of this run; {section}= names them"
-            owners = choices.members.get(f"{section.removesuffix('s')}.{key.rpartition('.')[2]}")
-            whose = " and ".join(owners) if owners else "none of them"
-            return f"{key}: is an option of {whose}, and {name} is {section.removesuffix('s')}={member}"
-        section = key.rpartition(".")[0]
-        group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
-        now = given.get(group, choices.chosen.get(group))
-        return f"{key}: is an option of {' and '.join(choices.members[key]) or section}, and {group} is {now}"
-    return " ".join(str(error).split())
 
 
 def compose(
@@ -352,23 +212,6 @@ def compose(
         data = plain_settings(composed)
         check_single(data, given, choices)
         return typed(cls, data)
-
-
-def check_single(data: Mapping[str, Any], given: Mapping[str, str], choices: Choices) -> None:
-    """Checks that nothing was given for a single member of a choice of which an experiment gives several.
-
-    Raises:
-        InputError: it was.
-    """
-    for key, option in choices.options.items():
-        single = option.several
-        unused = [name for name in given if single and (name == single or name.startswith(f"{single}."))]
-        if unused and data.get(key):
-            raise InputError(
-                f"{unused[0]}: is for a single {single}, and {EXPERIMENT}={given.get(EXPERIMENT, '')} gives several, "
-                f"{', '.join(data[key])}; options of one of them are {key}.NAME.OPTION=…, others need another "
-                f"{EXPERIMENT}="
-            )
 
 
 def plain_settings(composed: Any) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.settings.compose import choices_of
+from gsencoder.app.settings.choices import choices_of
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.app.settings.options import Option, describe, join_list, options_of
 

@@ -15,21 +15,12 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from gsencoder.app.runs.printable import one_line
-from gsencoder.app.settings.compose import (
-    SWEPT_TEXT,
-    Choices,
-    check_single,
-    choices_of,
-    hydra_error,
-    open_hydra,
-    overrides,
-    plain_settings,
-    read_words,
-    seal,
-    unseal,
-)
+from gsencoder.app.settings.choices import Choices, choices_of
+from gsencoder.app.settings.compose import SWEPT_TEXT, open_hydra, overrides, plain_settings, read_words, seal, unseal
 from gsencoder.app.settings.config import CommonConfig, typed
+from gsencoder.app.settings.hydra_errors import hydra_error
 from gsencoder.app.settings.options import join_list
+from gsencoder.app.settings.several import check_single
 from gsencoder.core.errors import InputError
 
 # A launcher that runs jobs in other processes imports this module there before it resolves the settings.
