@@ -50,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return code
     except InputError as error:
         _report("error", str(error), debug)
+        _report_notes(error)
         return 2
     except (KeyboardInterrupt, Stopped) as stop:
         return _stopped(stop, debug)
@@ -72,8 +73,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:
     if isinstance(stop, KeyboardInterrupt):
         _report("interrupted", "", debug)
+        _report_notes(stop)
         return 128 + signal.SIGINT
     _report("stopped", signal.Signals(stop.number).name, debug)
+    _report_notes(stop)
     return 128 + stop.number
 
 
@@ -83,6 +86,11 @@ def _report(kind: str, message: str, debug: bool) -> None:
         for line in traceback.format_exc().splitlines():
             print(printable(clipped(line)), file=sys.stderr)
     print(f"{kind}: {one_line(message)}" if message else kind, file=sys.stderr)
+
+
+def _report_notes(error: BaseException) -> None:
+    for note in getattr(error, "__notes__", ()):
+        print(f"note: {one_line(note)}", file=sys.stderr)
 
 
 def _discard_stdout() -> None:

@@ -128,8 +128,6 @@ class _Builder:
         self._coded: dict[int, bool] = {}
         self._floor = MIN_RELATIVE_NORM * float(np.linalg.norm(mean.astype(np.float64)))
         self._limit = free_memory() // 2 // (COPIES * 4 * space.channels)
-        if config.components > self._limit:
-            raise InputError(f"components={config.components:,}: {self._too_large()}; give at most {self._limit:,}")
 
     def build(self) -> MemoryBank:
         threshold = self._threshold()
@@ -172,13 +170,18 @@ class _Builder:
         if config.threshold:
             return config.threshold
         if config.components:
+            features = sum(len(rows) for rows, _, _ in self._rows())
+            if min(config.components, features) > self._limit:
+                raise InputError(
+                    f"bank.components={config.components:,}: {self._too_large()}; give at most {self._limit:,}"
+                )
             # One component is for features without a direction.
-            most = max(1, config.components - self._has_undirected())
+            most = max(1, min(config.components, features) - self._has_undirected())
             threshold = largest_threshold(lambda each: len(self._cover(each, most)) <= most)
             if len(self._cover(threshold, most)) > most:
                 raise InputError(
-                    f"components={config.components}: the features point in more directions than that even at a "
-                    f"threshold of {threshold:.4f}; give more components"
+                    f"bank.components={config.components}: the features point in more directions than that even at a "
+                    f"threshold of {threshold:.4f}; give more"
                 )
             return threshold
         sample = self._sample()
@@ -230,7 +233,7 @@ class _Builder:
             cover.add(rows[directed], limit=self._limit)
             if len(cover) > self._limit:
                 raise InputError(
-                    f"threshold={threshold:.4g}: {self._too_large()}; {self._limit:,} fit: give components="
+                    f"bank.threshold={threshold:.4g}: {self._too_large()}; {self._limit:,} fit: give bank.components="
                     f"{self._limit} or less, or a smaller threshold"
                 )
             new = cover.rows[len(sources) :] - before
@@ -254,7 +257,7 @@ class _Builder:
         chosen = reduce_as_published(rows, threshold, drop_last=self._config.drop_last).rows
         if not len(chosen):
             raise InputError(
-                f"drop_last={self._config.drop_last}: all {len(rows):,} features are in the last, incomplete chunk"
+                f"bank.drop_last={self._config.drop_last}: all {len(rows):,} features are in the last, incomplete chunk"
             )
         return rows[chosen] + self._mean, sources[chosen]
 

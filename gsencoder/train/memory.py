@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,9 @@ from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.memory_network import MemoryConfig, MemoryNetwork, MemoryObjective, ViewSamples, join_views
 from gsencoder.train.memory_scene import MemoryScene
+from gsencoder.train.render_rows import sample_rows
 from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig
-from gsencoder.types import QueryMemory
+from gsencoder.types import MemoryBank, QueryMemory
 
 
 def memory_training() -> TrainerConfig:
@@ -32,7 +34,16 @@ def memory_training() -> TrainerConfig:
 def first_queries(
     scene: MemoryScene, config: MemoryConfig, seed: int
 ) -> tuple[Float32[np.ndarray, "N s"], Float32[np.ndarray, "s D"]]:
-    """Queries and projection before the training: those of the fused features, or random ones."""
+    """Queries and projection before the training: those of the fused features, or random ones.
+
+    Raises:
+        InputError: queries of more channels than the features have.
+    """
+    if config.channels > scene.bank.space.channels:
+        raise InputError(
+            f"memory.channels: expected at most the {scene.bank.space.channels} channels of the features, got "
+            f"{config.channels:,}; 16 to 64 are enough for most teachers"
+        )
     if config.init == "fused":
         return principal_queries(scene.fused_features(), scene.bank, config.channels, config.scoring)
     channels, generator = scene.outputs.space.channels, torch.Generator().manual_seed(seed)
@@ -43,7 +54,12 @@ def first_queries(
 
 
 def untrained_memory(scene: MemoryScene, config: MemoryConfig, seed: int = 0) -> QueryMemory:
-    """The memory of fused features without any training."""
+    """The memory of fused features without any training.
+
+    Raises:
+        InputError: no rows to compare with, or queries of more channels than the features have.
+    """
+    check_rows({scene.bank.space.name: scene}, config.min_alpha)
     queries, projection = first_queries(scene, config, seed)
     return _memory_of(scene, config, queries, projection)
 
@@ -122,6 +138,7 @@ def _train(
     track: Track,
 ) -> tuple[MemoryNetwork, TrainingState]:
     _check_same_scene(scenes)
+    check_rows(scenes, config.min_alpha)
     queries, decoders = {}, {}
     for name, scene in scenes.items():
         first, projection = first_queries(scene, config, training.seed)
@@ -133,7 +150,7 @@ def _train(
         "decoder": kind or "attention",
         "teachers": list(scenes),
         "spaces": {name: scene.bank.space.describe() for name, scene in scenes.items()},
-        "components": {name: len(scene.bank) for name, scene in scenes.items()},
+        "banks": {name: fingerprint_of(scene.bank) for name, scene in scenes.items()},
         "samples_per_step": training.samples_per_step(process.world_size),
     }
     trainer = Trainer(
@@ -150,6 +167,30 @@ def _train(
     state = trainer.run(track)
     assert isinstance(trainer.network, MemoryNetwork)
     return trainer.network, state
+
+
+def fingerprint_of(bank: MemoryBank) -> str:
+    """A digest of the components and of what they are compared about."""
+    digest = sha256(bank.components.tobytes())
+    digest.update(bank.mean.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def check_rows(scenes: Mapping[str, MemoryScene], min_alpha: float) -> None:
+    """Checks that there is something to compare rendered features with.
+
+    Raises:
+        InputError: no view has a row of B that is opaque enough.
+    """
+    for name, scene in scenes.items():
+        prepared = scene.prepared
+        seen = prepared.weights > 0
+        views = range(len(prepared.view_names))
+        if not any(len(sample_rows(prepared.view(view), seen, min_alpha).targets) for view in views):
+            raise InputError(
+                f"memory.min_alpha: no cell of {len(views)} views of teacher {name} is covered to {min_alpha:g} by "
+                "Gaussians with features; give a smaller one"
+            )
 
 
 def _decoder_of(

@@ -133,7 +133,7 @@ def open_memory_scene(folder: Path, made_with: Mapping[str, Any] | None = None) 
     Raises:
         InputError: missing, damaged, or prepared with other settings.
     """
-    advice = advised(f"remove {folder} to prepare the scene again")
+    advice = advised(f"give resume=false, or remove {folder}, to prepare the scene again")
     with advice, open_archive(folder / BANK_FILE) as file:
         stored = file.value("made_with", dict)
         if made_with is not None and stored != made_with:

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from splats import front_camera, one_gaussian, random_gaussians, random_rotation
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, PosePoint, from_pose
+from gsencoder.infer.draw.pose_pictures import pose_picture, view_picture
+from gsencoder.infer.localize.from_pose import MAX_RAYS, FeatureField, FromPoseConfig, PosePoint, from_pose
 from gsencoder.infer.localize.relevancy import relevancy, word_directions
 from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.memory.render import render_features
@@ -434,7 +435,7 @@ def test_a_memory_answers_as_features_where_its_attention_is_exact() -> None:
         assert b.visible
         assert a.threshold == pytest.approx(b.threshold, abs=1e-5)
         np.testing.assert_allclose(b.position, a.position, atol=0.3)
-    assert FeatureField(scene, memory=memory).stride == 4
+    assert FeatureField(scene, memory=memory).stride_in(front_camera(), 0) == 4
 
 
 def test_wrong_input_is_refused() -> None:
@@ -462,3 +463,37 @@ def test_wrong_input_is_refused() -> None:
     for options in ({"stride": 0}, {"min_alpha": 0.0}, {"min_alpha": float("nan")}):
         with pytest.raises(InputError, match=next(iter(options))):
             FromPoseConfig(**options)  # type: ignore[arg-type]
+
+
+def test_large_views_are_looked_at_in_fewer_pixels_and_drawn_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsencoder.infer.localize.from_pose.MAX_RAYS", 500)
+    monkeypatch.setattr("gsencoder.infer.draw.pose_pictures.MAX_SIDE", 40)
+    gaussians, features = two_kinds(one_gaussian((-0.7, 0, 2)), one_gaussian((0.7, 0, 2)))
+    camera = front_camera()
+    width, height = int(camera.widths[0]), int(camera.heights[0])
+    field = FeatureField(scene_of(gaussians, features))
+    stride = field.stride_in(camera, 0)
+    assert stride > 1
+    assert -(-width // stride) * -(-height // stride) <= 500 < -(-width // (stride - 1)) * -(-height // (stride - 1))
+    seen = field.at(camera)
+    (point,) = seen.find(NAMES[:1], words())
+    whole = FeatureField(scene_of(gaussians, features), config=FromPoseConfig(stride=1)).at(camera)
+    (exact,) = whole.find(NAMES[:1], words())
+    np.testing.assert_allclose(point.position, exact.position, atol=0.1)
+    rgb = view_picture(seen)
+    assert max(rgb.shape[:2]) == 40
+    (relevancy,) = seen.relevancy(NAMES[:1], words())
+    small = pose_picture(rgb, seen, point, relevancy)
+    monkeypatch.setattr("gsencoder.infer.draw.pose_pictures.MAX_SIDE", 2000)
+    large = pose_picture(view_picture(seen), seen, point, relevancy)
+    # Both are enlarged to be legible; the ring is in one place.
+    assert abs(small.shape[0] / small.shape[1] - large.shape[0] / large.shape[1]) < 0.1
+
+
+def test_a_stride_that_is_asked_for_holds_in_views_of_any_size() -> None:
+    gaussians, features = two_kinds(one_gaussian((-0.7, 0, 2)), one_gaussian((0.7, 0, 2)))
+    field = FeatureField(scene_of(gaussians, features), config=FromPoseConfig(stride=3))
+    huge = replace(front_camera(), widths=np.array([1 << 24], np.int32), heights=np.array([1], np.int32))
+    assert field.stride_in(huge, 0) == 3
+    free = FeatureField(scene_of(gaussians, features)).stride_in(huge, 0)
+    assert -(-(1 << 24) // free) <= MAX_RAYS

@@ -1,5 +1,6 @@
 """`gsencoder export weights=… out=FILE.onnx`: an encoder as one file that runs without torch."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from gsencoder.infer.onnx.export import (
 )
 from gsencoder.infer.onnx.memory import export_memory
 from gsencoder.infer.onnx.runtime import SUFFIX
+from gsencoder.types import QueryMemory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,6 +105,10 @@ class ExportConfig(CommonConfig):
             raise InputError(f"cosine: expected -1 to 1, got {self.cosine}")
         if self.memory and self.weights:
             raise InputError("memory, weights: expected one of the two, a memory or an encoder")
+        if self.space and not self.memory:
+            raise InputError("space: names a teacher of memory=; leave it out, or give memory=")
+        if self.memory and self.paths:
+            raise InputError("paths: splats are compared with encoders alone; leave them out with memory=")
         if self.memory and self.precision != "float32":
             raise InputError(f"precision: expected float32 with memory=, got {self.precision}")
 
@@ -180,10 +186,7 @@ def _export_memory(config: ExportConfig, out: Path, summary: Summary) -> None:
     """
     with summary.step("load"):
         memories = load_memories(config.memory)
-        if len(memories) > 1 and config.space not in memories:
-            names = ", ".join(str(name) for name in memories)
-            raise InputError(f"space: the folder has memories of {names}; name one of them")
-        memory = memories[config.space] if len(memories) > 1 else next(iter(memories.values()))
+        memory = _memory_of(memories, config.space)
     with summary.step("export"):
         model = export_memory(memory)
     with summary.step("write"), atomic_file(out) as stream:
@@ -194,6 +197,22 @@ def _export_memory(config: ExportConfig, out: Path, summary: Summary) -> None:
         f"{out}: {len(model) / 1e6:.1f} MB; features of {memory.space.channels} channels from queries of "
         f"{memory.channels}, by attention to {len(memory.bank):,} components"
     )
+
+
+def _memory_of(memories: Mapping[str | None, QueryMemory], space: str) -> QueryMemory:
+    """The memory of a teacher, by its name in the folder or that of its feature space.
+
+    Raises:
+        InputError: there is none of this name, or there are several and none is named.
+    """
+    by_name = {name or memory.space.name: memory for name, memory in memories.items()}
+    by_name |= {memory.space.name: memory for memory in memories.values()}
+    if not space and len(memories) == 1:
+        return next(iter(memories.values()))
+    if space not in by_name:
+        got = f", got {space!r}" if space else ""
+        raise InputError(f"space: the folder has memories of {', '.join(by_name)}; expected one of them{got}")
+    return by_name[space]
 
 
 def space_figures(encoder: TorchEncoder) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """The cameras of pose= and view=, and what they see of words: points, their JSON values and pictures."""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,7 @@ def search_from_poses(
     text: TextEncoder,
     config: LocalizeConfig,
     *,
+    absent: Mapping[str, float] = {},
     memory: QueryMemory | None = None,
     pictures: bool = True,
 ) -> Iterator[tuple[list[dict[str, Any]], list[tuple[str, Image.Image]]]]:
@@ -94,6 +95,8 @@ def search_from_poses(
         words: that `text` knows.
         text: turns words into the features' space.
         config: its mode and threshold are used.
+        absent: words that are not in the scene, with the probability that they are. They are not visible from anywhere,
+            however relevant a pixel may be.
         memory: of the Gaussians, where the features come from one.
         pictures: draw a picture for each word.
 
@@ -107,7 +110,9 @@ def search_from_poses(
     field = FeatureField(asked, memory=memory, config=FromPoseConfig(mode=config.mode, threshold=config.threshold))
     for view, name in enumerate(cameras.views):
         seen = field.at(cameras.cameras, view)
-        points = seen.find(words, text)
+        points = [
+            replace(point, visible=point.visible and point.query not in absent) for point in seen.find(words, text)
+        ]
         drawn = []
         if pictures:
             rgb = view_picture(seen)
@@ -123,12 +128,13 @@ def search_from_poses(
                     "camera": view,
                     "view": name,
                     "visible": point.visible,
+                    "absent": point.query in absent,
                     "relevancy": _finite(point.relevancy),
                     "threshold": _finite(point.threshold),
                     "alpha": _finite(point.alpha),
-                    "pixel": [_finite(value) for value in point.pixel.tolist()],
+                    "pixel": _finite_all(point.pixel.tolist()),
                     "depth": _finite(point.depth),
-                    "position": [_finite(value) for value in point.position.tolist()],
+                    "position": _finite_all(point.position.tolist()),
                 }
                 for point in points
             ],
@@ -140,11 +146,17 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
+def _finite_all(values: list[float]) -> list[float] | None:
+    return values if all(map(math.isfinite, values)) else None
+
+
 def describe_point(point: dict[str, Any]) -> str:
     """A line about one point, for people."""
     camera = f"camera {point['camera']}" if point["view"] is None else f"view {point['view']}"
     if point["relevancy"] is None:
         return f"{camera}: nothing that has features is in view"
+    if point["absent"]:
+        return f"{camera}: not visible (absent from the scene; relevancy {point['relevancy']:.2f})"
     if not point["visible"]:
         return f"{camera}: not visible (relevancy {point['relevancy']:.2f}, threshold {point['threshold']:.2f})"
     x, y = point["pixel"]

@@ -119,7 +119,14 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
                 # Heads lead into other spaces than the one in which a memory attends.
                 memory = None if config.head else memory_of(folder, asked)
                 for found, drawn in search_from_poses(
-                    asked, cameras, words, table, config.localize, memory=memory, pictures=config.pictures > 0
+                    asked,
+                    cameras,
+                    words,
+                    table,
+                    config.localize,
+                    absent=localization.absent,
+                    memory=memory,
+                    pictures=config.pictures > 0,
                 ):
                     points += found
                     for name, picture in drawn:

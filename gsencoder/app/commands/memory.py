@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, about, advised
+from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import find_scenes
@@ -116,6 +118,12 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
                 refuse_to_replace_inputs(state.path, settings(config))
                 state.take(anew=not config.resume)
+                unfinished = [path for path in state.path.glob("queries*") if path.is_dir()]
+                if unfinished and not config.optimize:
+                    raise InputError(
+                        f"optimize=false: {unfinished[0]} holds an optimization that is not finished and would be "
+                        "lost; leave optimize=false out to continue it, or give resume=false to start again"
+                    )
                 scene = _load(path, config, summary)
                 tables = _prepare(scene, words, config, state.path, summary, track)
         scenes = {name: open_memory_scene(state.path / name) for name in config.teachers_by_name}
@@ -131,6 +139,8 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
                 )
                 memories |= made
                 summary.results["steps"] = done.step
+                if folder is not None:
+                    copyfile(work / LOG_FILE, folder / (LOG_FILE if config.joint else f"log.{names[0]}.csv"))
         if folder is None or scene is None:
             return
         if not config.optimize:
@@ -266,8 +276,13 @@ def _figures(file: Path, memory: QueryMemory, errors: RenderedErrors) -> dict[st
 
 def _describe(memory: QueryMemory, errors: RenderedErrors, size: int) -> str:
     bank = memory.bank
+    covered = "every feature has" if bank.coverage == 1 else f"{bank.coverage:.3f} of the features have"
     return (
-        f"{len(bank):,} components within {bank.threshold:.3f} of {bank.coverage:.3f} of the features, queries of "
-        f"{memory.channels} channels for {int((memory.weights > 0).sum()):,} Gaussians, {size / 1e6:.3g} MB; rendered "
-        f"features have a cosine of {errors.cosine:.3f} with the teacher's, centered {errors.centered:.3f}"
+        f"{_number(len(bank), 'component')} ({covered} one within a cosine of {bank.threshold:.3f}), queries of "
+        f"{_number(memory.channels, 'channel')} for {int((memory.weights > 0).sum()):,} Gaussians, {size / 1e6:.3g} "
+        f"MB; rendered features have a cosine of {errors.cosine:.3f} with the teacher's, centered {errors.centered:.3f}"
     )
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"

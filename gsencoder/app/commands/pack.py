@@ -74,6 +74,10 @@ class PackConfig(CommonConfig):
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
         if not 0 < self.error < 1:
             raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
+        if self.error != PackConfig.error and self.form != "compact":
+            raise InputError(f"error: is the budget of form=compact, and form={self.form} has none; leave it out")
+        if self.index != IndexConfig() and self.form != "index":
+            raise InputError(f"index: has the settings of form=index, and form={self.form} takes none; leave them out")
         if self.decoded and self.form in ("compact", "index"):
             raise InputError(f"decoded=true: form={self.form} holds codes; use form=npz, safetensors or ply")
 

@@ -17,7 +17,7 @@ class WorkFolder:
     """A folder with a marker file, by which later runs recognize it.
 
     Enter it before the output folder and `take` it inside: it is then locked until the results have been renamed into
-    place, and removed after that. If the block ends early, the folder stays as it is.
+    place, and removed after that. If the block ends early, the folder stays as it is, and a note of the error says so.
 
     Attributes:
         path: of the folder, with symbolic links resolved.
@@ -94,6 +94,10 @@ class WorkFolder:
                 self._empty()
                 (self.path / MARKER_FILE).unlink(missing_ok=True)
                 self.path.rmdir()
+            elif error is not None and self._taken and any(each.name != MARKER_FILE for each in self.path.iterdir()):
+                error.add_note(
+                    f"{self.path} holds what was computed; a run with the same out= and settings continues it"
+                )
         except OSError as refused:
             raise InputError(
                 f"{self.path}: the run is finished and its results are written, but the state that it saved here "

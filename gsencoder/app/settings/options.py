@@ -191,23 +191,31 @@ def _default(item: Any) -> Any:
     return item.default_factory() if item.default_factory is not MISSING else None
 
 
-def options_of(cls: type, prefix: str = "", member: str = "") -> list[Option]:
-    """Every option of a settings class, sections included, in order of declaration."""
+def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = None) -> list[Option]:
+    """Every option of a settings class, sections included, in order of declaration.
+
+    Args:
+        cls: the class.
+        prefix: of the keys.
+        member: the member of a choice that the class is.
+        defaults: an instance whose values are the defaults, as those of a section are; None = those of the class.
+    """
     options: list[Option] = []
     annotations = field_types(cls)
     for item in fields(cls):
         key, annotation = prefix + item.name, annotations[item.name]
+        default = _default(item) if defaults is None else getattr(defaults, item.name)
         classes = section_classes(annotation)
         if classes:
             for section in classes:
                 owner = f"{key.replace('.', '/')}={member_name(section)}" if len(classes) > 1 else member
-                options += options_of(section, key + ".", owner)
+                options += options_of(section, key + ".", owner, default if isinstance(default, section) else None)
         elif not (item.name == "name" and get_origin(annotation) is Literal and len(get_args(annotation)) == 1):
             options.append(
                 Option(
                     key=key,
                     annotation=annotation,
-                    default=_default(item),
+                    default=default,
                     help=item.metadata.get("help", ""),
                     metavar=item.metadata.get("metavar", ""),
                     required=item.metadata.get("required", False),

@@ -1,7 +1,7 @@
 """Pictures of what is seen from a pose: the rendered view, relevancy over it, and the pixel marked in both."""
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from PIL import Image, ImageDraw
 
 from gsencoder.infer.draw.pictures import contact_sheet, enlarge, ink_on, label_font, legible_factor, relevancy_overlay
@@ -9,12 +9,17 @@ from gsencoder.infer.localize.from_pose import PosePoint, SeenField
 from gsencoder.render.images import render_image
 
 VISIBLE, HIDDEN = (255, 255, 255), (150, 150, 150)
+MAX_SIDE = 2000
+"""Longer side of a picture, at most."""
 
 
 def view_picture(seen: SeenField) -> UInt8[np.ndarray, "H W 3"]:
-    """The view in color, in all its pixels whatever the stride of the field is."""
-    blended = seen.b if seen.field.stride == 1 else None
-    return render_image(seen.field.gaussians, seen.cameras, seen.view, blended=blended, config=seen.field.config.blend)
+    """The view in color, whatever the stride is: in all its pixels, or reduced to a longer side of `MAX_SIDE`."""
+    cameras = seen.cameras.select([seen.view])
+    small = cameras.resized(MAX_SIDE, enlarge=False)
+    same = np.array_equal([small.widths, small.heights], [cameras.widths, cameras.heights])
+    blended = seen.b if same and seen.b.lattice.dx == 1 else None
+    return render_image(seen.field.gaussians, small, 0, blended=blended, config=seen.field.config.blend)
 
 
 def pose_picture(
@@ -30,24 +35,32 @@ def pose_picture(
         relevancy: of the word at the pixels that were looked at; NaN where there is no surface.
     """
     lattice, (height, width) = seen.b.lattice, rgb.shape[:2]
+    reduced = np.array([seen.cameras.widths[seen.view] / width, seen.cameras.heights[seen.view] / height])
     # Each pixel takes the ray of its block; pixels beyond the last block that of the last.
-    rows = np.minimum(np.arange(height) // int(lattice.dy), lattice.height - 1)
-    columns = np.minimum(np.arange(width) // int(lattice.dx), lattice.width - 1)
+    columns, rows = (
+        np.minimum(((np.arange(size) + 0.5) * factor / step).astype(np.int64), last - 1)
+        for size, factor, step, last in (
+            (width, reduced[0], lattice.dx, lattice.width),
+            (height, reduced[1], lattice.dy, lattice.height),
+        )
+    )
     factor = legible_factor(width)
     heat = relevancy_overlay(rgb, relevancy[rows[:, None], columns])
-    halves = [_marked(half, factor, point) for half in (rgb, heat)]
+    halves = [_marked(half, factor, point, point.pixel / reduced) for half in (rgb, heat)]
     titles = ("rendered", f"relevancy of {point.query!r}, threshold {point.threshold:.2f}")
     return contact_sheet(halves, titles, columns=2, width=halves[0].shape[1])
 
 
-def _marked(picture: UInt8[np.ndarray, "H W 3"], factor: int, point: PosePoint) -> UInt8[np.ndarray, "H2 W2 3"]:
-    """A picture, enlarged, with the pixel of a word in a ring, and what was found of the word."""
+def _marked(
+    picture: UInt8[np.ndarray, "H W 3"], factor: int, point: PosePoint, pixel: Float64[np.ndarray, "2"]
+) -> UInt8[np.ndarray, "H2 W2 3"]:
+    """A picture, enlarged, with the pixel of a word in a ring, and the word's relevancy and depth."""
     image = Image.fromarray(enlarge(picture, factor))
     draw = ImageDraw.Draw(image)
     if not np.isfinite(point.pixel).all():
         _write(draw, image.size, f"{point.query}: nothing with features in view", HIDDEN, None)
         return np.asarray(image)
-    at = point.pixel * factor
+    at = pixel * factor
     color = VISIBLE if point.visible else HIDDEN
     for radius, ink, line in ((15, (0, 0, 0), 6), (14, color, 3)):
         draw.ellipse([*(at - radius), *(at + radius)], outline=ink, width=line)

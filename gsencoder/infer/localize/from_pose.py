@@ -28,6 +28,8 @@ from gsencoder.text.encoder import TextEncoder, check_space
 from gsencoder.types import Cameras, QueryMemory, Scene
 
 MEMORY_STRIDE = 4
+MAX_RAYS = 1 << 21
+"""Pixels that are looked at in a view, at most, unless a stride is asked for; their blend takes about a gigabyte."""
 BLOCK_WORDS = 16
 """Words that are answered at once."""
 
@@ -43,7 +45,7 @@ class FromPoseConfig:
         min_alpha: a pixel counts where the Gaussians that have features are at least so opaque: what is fainter is
             haze, and no surface.
         stride: every so many pixels are looked at, in both directions; None = all for features, and every fourth for a
-            memory, whose attention takes longer.
+            memory, whose attention takes longer, or fewer in large views, so that there are no more than `MAX_RAYS`.
         blend: accuracy of the rendering.
     """
 
@@ -130,12 +132,17 @@ class FeatureField:
         self.memory, self.config = memory, config
         self.products = GaussianProducts(features, config.mode)
 
-    @property
-    def stride(self) -> int:
+    def stride_in(self, cameras: Cameras, view: int) -> int:
         """Every so many pixels of a view are looked at."""
         if self.config.stride is not None:
             return self.config.stride
-        return 1 if self.memory is None else MEMORY_STRIDE
+        stride, (width, height) = (
+            1 if self.memory is None else MEMORY_STRIDE,
+            (cameras.widths[view], cameras.heights[view]),
+        )
+        while math.ceil(width / stride) * math.ceil(height / stride) > MAX_RAYS:
+            stride += 1
+        return stride
 
     def at(self, cameras: Cameras, view: int = 0, *, b: Blend | None = None) -> "SeenField":
         """What one camera sees of the field, kept for many words.
@@ -148,12 +155,13 @@ class FeatureField:
         Raises:
             InputError: no such view, or the blend of other Gaussians or pixels.
         """
+        stride = self.stride_in(cameras, view)
         if b is None:
-            b = blend(self.gaussians, cameras, view, stride=self.stride, config=self.config.blend)
-        expected = strided_lattice(int(cameras.widths[view]), int(cameras.heights[view]), self.stride)
+            b = blend(self.gaussians, cameras, view, stride=stride, config=self.config.blend)
+        expected = strided_lattice(int(cameras.widths[view]), int(cameras.heights[view]), stride)
         if b.lattice != expected:
             raise InputError(
-                f"from_pose: expected a blend of {expected.width}×{expected.height} rays, every {self.stride} pixels, "
+                f"from_pose: expected a blend of {expected.width}×{expected.height} rays, every {stride} pixels, "
                 f"got {b.lattice.width}×{b.lattice.height} with {b.lattice.side**2} rays each"
             )
         return SeenField(self, cameras, view % len(cameras), b)
