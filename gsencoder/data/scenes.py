@@ -198,6 +198,10 @@ def check_names(paths: Sequence[Path]) -> None:
         first[name] = path
 
 
+FEATURES_MARK = "scene.safetensors"
+"""A folder with this file was written by a command, as features or a memory of a scene."""
+
+
 def _is_transforms(path: Path) -> bool:
     return path.suffix.lower() == ".json" and path.name != "meta.json"
 
@@ -226,6 +230,10 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
             if isinstance(error, InputError):
                 raise
             raise InputError(f"{str(given)[:200]!r} cannot be read ({type(error).__name__})") from error
+        if not inside and (given / FEATURES_MARK).is_file():
+            raise InputError(
+                f"{given}: a folder of features, not a scene; localize, views, ask, pack and evaluate features= take it"
+            )
         if not inside:
             raise InputError(
                 f"{given}: neither a scene nor a folder of scenes; a scene holds one of: {describe_layouts()}; a splat"

@@ -298,3 +298,9 @@ def test_depth_in_whole_meters_and_depth_for_photographs_are_said(tmp_path: Path
         save(tmp_path / f"images/{view:03d}.png", np.full((24, 32), 900 + view, np.uint16))
     with pytest.warns(SceneWarning, match=r"001.png has one channel of 16 bits, as depth images have; is it listed"):
         load_scene(tmp_path)
+
+
+def test_a_folder_of_features_is_named_as_such(tmp_path: Path) -> None:
+    (tmp_path / "scene.safetensors").touch()
+    with pytest.raises(InputError, match="a folder of features, not a scene; localize, views"):
+        find_scenes([tmp_path])
