@@ -148,6 +148,13 @@ def test_features_of_gaussians_are_those_of_their_queries_in_channels_and_in_a_b
     np.testing.assert_allclose(replace(memory, basis=basis).features().decode(seen), expected, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("scoring", SCORINGS)
+def test_decoded_features_have_the_mean_of_the_memory_whatever_the_bank_subtracts(scoring: Scoring) -> None:
+    memory = make_memory(scoring)
+    assert memory.bank.mean.any() == (scoring == "centered")
+    np.testing.assert_array_equal(memory.features().mean, memory.mean)
+
+
 def test_a_memory_whose_parts_do_not_fit_is_refused(no_jaxtyping: None) -> None:
     memory = make_memory()
     other = FeatureSpace(name="other", channels=24)

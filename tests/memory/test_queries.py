@@ -44,6 +44,14 @@ def test_queries_of_all_directions_stand_for_the_features(basis: bool, scoring: 
         assert queries[seen].std() == pytest.approx(1, abs=1e-5)
 
 
+@pytest.mark.parametrize("scoring", ["centered", "cosine"])
+def test_with_cosines_rows_of_the_projection_are_as_long_as_the_root_of_the_channels(scoring: Scoring) -> None:
+    features = make_features(basis=False)
+    _, projection = principal_queries(features, bank_of(features, scoring), 5, scoring)
+    directions = projection[int(scoring == "cosine") :]
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), np.sqrt(12), rtol=1e-5)
+
+
 def test_fewer_channels_keep_the_directions_in_which_the_components_differ_most() -> None:
     features = make_features(basis=False)
     bank = bank_of(features)

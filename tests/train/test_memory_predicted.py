@@ -1,0 +1,79 @@
+"""Memories of features that an encoder predicts: they take the place of fused ones if they are of the same space."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from memory_scenes import PREPARE, BlendedTeacher
+from training_scenes import scene as wall
+
+from gsencoder.app.commands.memory import in_space
+from gsencoder.core.errors import InputError
+from gsencoder.memory.bank import BankConfig
+from gsencoder.train.memory_scene import MemoryScene, prepare_memory
+from gsencoder.types import FeatureSpace, GaussianFeatures
+
+
+def predicted_features(name: str = "hidden", seed: int = 0) -> GaussianFeatures:
+    """What an encoder might say of the wall: unlike the features that a fusion gives."""
+    rng = np.random.default_rng(seed)
+    teacher = BlendedTeacher(wall(0), name)
+    weights = rng.uniform(0.5, 1, 400).astype(np.float32)
+    weights[::9] = 0
+    values = (5 * rng.normal(size=(400, 12)) + 2).astype(np.float32)
+    values[weights == 0] = 0
+    return GaussianFeatures(
+        features=values, weights=weights, mean=np.full(12, 2, np.float32), space=teacher.space
+    )  # fmt: skip
+
+
+def prepared(folder: Path, predicted: GaussianFeatures | None) -> MemoryScene:
+    scene = wall(0)
+    return prepare_memory(
+        scene, BlendedTeacher(scene), folder, BankConfig(threshold=0.9), PREPARE, predicted=predicted
+    )  # fmt: skip
+
+
+def test_predicted_features_take_the_place_of_fused_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fused(*arguments: object, **settings: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("gsencoder.train.memory_scene.fuse", fused)
+    predicted = predicted_features()
+    made = prepared(tmp_path / "made", predicted)
+    kept = made.fused_features()
+    np.testing.assert_array_equal(kept.weights, predicted.weights)
+    np.testing.assert_array_equal(kept.mean, predicted.mean)
+    np.testing.assert_array_equal(kept.features[~predicted.seen], 0)
+    np.testing.assert_allclose(kept.features, predicted.features, atol=0.01)
+    # Standard units are those of the Gaussians that have features: their mean square is one.
+    targets = made.prepared.targets(np.flatnonzero(predicted.seen))
+    assert np.square(targets.astype(np.float64)).mean() == pytest.approx(1, abs=1e-3)
+
+
+def test_a_folder_that_was_prepared_with_other_predictions_is_refused(tmp_path: Path) -> None:
+    prepared(tmp_path / "made", predicted_features())
+    prepared(tmp_path / "made", predicted_features())
+    for other in (None, predicted_features(seed=1)):
+        with pytest.raises(InputError, match="predicted="):
+            prepared(tmp_path / "made", other)
+
+
+def test_predictions_of_another_space_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"the predicted features are of \(other.*, and the teacher's of \(hidden"):
+        prepared(tmp_path, predicted_features("other"))
+
+
+def test_of_the_predictions_of_several_teachers_those_of_the_space_are_taken() -> None:
+    first, second = predicted_features("first"), predicted_features("second", seed=1)
+    both = {"a": first, "b": second}
+    assert in_space(both, second.space, "weights") is second
+    assert in_space(both, first.space, "weights") is first
+    other = replace(first.space, text_encoder="clip")
+    with pytest.raises(
+        InputError, match=r"the encoder of w gives features of \(first .*; second .*\), and the teacher"
+    ):
+        in_space(both, other, "w")
+    with pytest.raises(InputError, match=r"third"):
+        in_space(both, FeatureSpace(name="third", channels=12), "w")
