@@ -17,6 +17,7 @@ from gsencoder.memory.render import render_features
 from gsencoder.render import BlendConfig, blend
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, QueryMemory, Scene
+from gsencoder.types.memory import Scoring
 
 CHANNELS = 24
 SPACE = FeatureSpace(name="s", channels=CHANNELS, text_encoder="toy")
@@ -53,8 +54,8 @@ def scene_of(n: int = 300, *, basis: bool = False) -> Scene:
     return Scene(name="toy", gaussians=ball, features={"s": features_of(n, basis=basis)})
 
 
-def memory_in_space(n: int) -> QueryMemory:
-    memory = make_memory(components=9, gaussians=n)
+def memory_in_space(n: int, scoring: Scoring = "centered") -> QueryMemory:
+    memory = make_memory(scoring, components=9, gaussians=n)
     return replace(memory, bank=replace(memory.bank, space=SPACE))
 
 
@@ -87,16 +88,41 @@ def test_cosines_at_pixels_and_thresholds_are_centered_or_raw_as_they_are_asked_
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_memory_is_compared_by_centered_or_by_raw_cosines(mode: Mode) -> None:
+@pytest.mark.parametrize("scoring", ["centered", "cosine", "dot"])
+def test_a_memory_is_compared_by_centered_or_by_raw_cosines_however_its_queries_are(
+    mode: Mode, scoring: Scoring
+) -> None:
     scene, text = scene_of(), words()
     assert scene.gaussians is not None
-    memory = memory_in_space(len(scene.gaussians))
+    memory = memory_in_space(len(scene.gaussians), scoring)
     field = FeatureField(replace(scene, features={}), memory=memory, config=FromPoseConfig(mode=mode, stride=1))
     maps = field.at(front_camera()).relevancy(NAMES, text).reshape(len(NAMES), -1)
     opaque = np.isfinite(maps[0])
     assert opaque.sum() > 100
     rendered, _ = render_features(memory, blend(scene.gaussians, front_camera()))
     np.testing.assert_allclose(maps[:, opaque], cosines(rendered[opaque], memory.mean, mode), atol=1e-4)
+
+
+def test_cosines_of_gaussians_are_relevancies_also_in_chunks_and_near_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of features that are words, whose cosines rounding would lead beyond 1, and of features at the mean."""
+    features = features_of(295)
+    values = features.features.copy()
+    rng = np.random.default_rng(3)
+    along = words().encode(NAMES)[rng.integers(0, 3, 295)] - words().mean
+    values[:200] = features.mean + along[:200] * rng.uniform(0.5, 2, (200, 1))
+    values[200:250] = features.mean * np.float32(1 + 1e-6)
+    values[~features.seen] = 0
+    features = replace(features, features=values.astype(np.float32))
+    expected = relevancy(features, words().encode(NAMES), words().mean)
+    monkeypatch.setattr("gsencoder.infer.localize.pixel_relevancy.CHUNK_BYTES", 8 * CHANNELS * 42)
+    directions = word_directions(words().encode(NAMES), words().mean)
+    cosines = GaussianProducts(features).cosines(directions)
+    near_mean = np.arange(295) // 50 == 4
+    np.testing.assert_allclose(cosines[:, ~near_mean], expected[:, ~near_mean], atol=1e-5)
+    np.testing.assert_allclose(cosines[:, near_mean], expected[:, near_mean], atol=1e-4)
+    assert np.nanmax(np.abs(cosines[:, near_mean])) < 1e-2
+    without_mean = replace(features, mean=np.zeros(CHANNELS, np.float32), features=along * features.seen[:, None])
+    assert np.nanmax(GaussianProducts(without_mean).cosines(directions)) == 1
 
 
 def test_attended_features_much_shorter_than_the_mean_have_no_direction() -> None:
