@@ -1,4 +1,4 @@
-"""What is written in pictures of attention: the view and pixel, the views of the components, and their weights."""
+"""Pictures of attention: what is written in them, and which pixel is chosen of opaque ones, haze and the rim."""
 
 from dataclasses import replace
 
@@ -9,9 +9,13 @@ from training_scenes import scene as wall
 
 from gsencoder.infer.draw import attention_pictures as module
 from gsencoder.infer.draw.attention_pictures import attention_picture, attention_pictures
-from gsencoder.infer.draw.strongest_components import strongest_components
+from gsencoder.infer.draw.strongest_components import (
+    attention_entropy,
+    salient_pixel,
+    strongest_components,
+)
 from gsencoder.memory.bank import BankConfig
-from gsencoder.render import Blend, BlendConfig
+from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.train.memory import untrained_memory
 from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.types import QueryMemory
@@ -87,3 +91,30 @@ def test_views_are_rendered_as_accurately_as_is_asked_for(memory: QueryMemory, m
     config = BlendConfig(min_weight=1e-3)
     assert len(list(attention_pictures(memory, wall(0), views=2, config=config))) == 2
     assert asked == [config, config]
+
+
+@pytest.mark.parametrize("case", ["haze", "below the middle", "beside the middle"])
+def test_the_salient_pixel_is_opaque_and_in_the_middle_though_others_attend_to_less(
+    memory: QueryMemory, case: str
+) -> None:
+    """One Gaussian in the middle attends to all components, and another one to a single component."""
+    scene = wall(0)
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    place = {"haze": (0.4, 0.0, 3.0), "below the middle": (0.0, 0.95, 3.0), "beside the middle": (1.1, 0.0, 3.0)}[case]
+    gaussians = replace(
+        scene.gaussians.select(np.zeros(2, int)),
+        means=np.array([(0, 0, 3), place], np.float32),
+        scales=np.full((2, 3), 0.1, np.float32),
+        opacities=np.array([0.95, 0.4 if case == "haze" else 0.95], np.float32),
+    )
+    toward = np.linalg.lstsq(memory.projection.T, memory.bank.components[0] - memory.mean, rcond=None)[0]
+    queries = np.stack([np.zeros(5), toward]).astype(np.float32)
+    two = replace(memory, queries=queries, weights=np.ones(2, np.float32))
+    both, one = attention_entropy(two.attention(queries))
+    assert one < both - 0.1
+    b = blend(gaussians, scene.views.cameras, 0)
+    pixel = salient_pixel(two, b)
+    assert pixel is not None
+    assert abs(pixel[0] - 24) <= 4
+    assert abs(pixel[1] - 20) <= 4

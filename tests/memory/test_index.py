@@ -17,6 +17,7 @@ from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_index_
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.memory import index as index_module
 from gsencoder.memory.index import IndexConfig, index_features
+from gsencoder.memory.reduction import reduce_to_cover
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -73,6 +74,58 @@ def test_features_at_the_mean_have_a_row_of_their_own_and_no_cosine() -> None:
     nothing = index_features(replace(features, features=np.zeros_like(values)))
     assert len(nothing.features.features) == 1
     assert nothing.error == 0
+
+
+def test_features_at_the_mean_but_for_rounding_have_its_row() -> None:
+    features = make_features(basis=False, kinds=4)
+    values = features.features.copy()
+    at_mean = np.flatnonzero(features.seen)[:50]
+    values[at_mean] = features.mean * (1 + 1e-5 * np.random.default_rng(0).uniform(-1, 1, (50, 1)))
+    made = index_features(replace(features, features=values.astype(np.float32)), IndexConfig(threshold=0.99))
+    assert len(made.features.features) == 5
+    np.testing.assert_array_equal(made.features.stored(at_mean), np.repeat(features.mean[None], 50, axis=0))
+    assert made.error < 1e-6
+
+
+@pytest.mark.parametrize("basis", [True, False])
+def test_every_gaussian_has_the_row_that_is_nearest_to_it_and_every_row_is_used(basis: bool) -> None:
+    features = make_features(basis=basis)
+    made = index_features(features, IndexConfig(threshold=0.8)).features
+    assert made.index is not None
+    table, seen = made.features.astype(np.float64), features.seen
+    distances = np.linalg.norm(features.features[seen][:, None] - table, axis=2)
+    own = distances[np.arange(seen.sum()), made.index[seen]]
+    np.testing.assert_allclose(own, distances.min(axis=1), atol=1e-5)
+    np.testing.assert_array_equal(np.unique(made.index[seen]), np.arange(len(table)))
+    np.testing.assert_array_equal(made.weights, features.weights)
+
+
+def test_a_row_is_the_mean_of_the_gaussians_that_have_it() -> None:
+    features = make_features(kinds=7)
+    noise = 0.01 * np.random.default_rng(0).normal(size=features.features.shape)
+    values = (features.features + noise).astype(np.float32) * features.seen[:, None]
+    made = index_features(replace(features, features=values), IndexConfig(threshold=0.97)).features
+    assert made.index is not None
+    assert len(made.features) == 7
+    for row, vector in enumerate(made.features):
+        np.testing.assert_allclose(vector, values[made.index == row].mean(axis=0, dtype=np.float64), atol=1e-5)
+
+
+def test_the_threshold_that_is_stated_is_the_largest_one_whose_table_has_so_few_rows() -> None:
+    features = make_features(n=1000)
+    made = index_features(features, IndexConfig(threshold=0.0, rows=60))
+    centered = features.features[features.seen]
+    assert len(reduce_to_cover(centered, made.threshold).rows) <= 59
+    assert len(reduce_to_cover(centered, made.threshold + 2 / 4096).rows) > 59
+
+
+def test_rows_that_are_asked_for_have_room_for_features_at_the_mean() -> None:
+    features = make_features(kinds=8)
+    values = features.features.copy()
+    values[np.flatnonzero(features.seen)[:50]] = 0
+    made = index_features(replace(features, features=values), IndexConfig(threshold=0.0, rows=8))
+    assert len(made.features.features) <= 8
+    np.testing.assert_array_equal(made.features.stored(np.flatnonzero(features.seen)[:50]), 0)
 
 
 def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refused(

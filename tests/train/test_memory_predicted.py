@@ -8,11 +8,16 @@ import pytest
 from memory_scenes import PREPARE, BlendedTeacher
 from training_scenes import scene as wall
 
-from gsencoder.app.commands.memory import in_space
+from gsencoder.app.commands.memory import fit_errors, in_space
 from gsencoder.core.errors import InputError
+from gsencoder.evaluate.rendered import RenderedTally
 from gsencoder.memory.bank import BankConfig
+from gsencoder.memory.render import render_queries
+from gsencoder.render import BlendConfig, blend
+from gsencoder.train.memory import untrained_memory
+from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import MemoryScene, prepare_memory
-from gsencoder.types import FeatureSpace, GaussianFeatures
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 
 def predicted_features(name: str = "hidden", seed: int = 0) -> GaussianFeatures:
@@ -77,3 +82,42 @@ def test_of_the_predictions_of_several_teachers_those_of_the_space_are_taken() -
         in_space(both, other, "w")
     with pytest.raises(InputError, match=r"third"):
         in_space(both, FeatureSpace(name="third", channels=12), "w")
+
+
+def in_a_basis(predicted: GaussianFeatures) -> GaussianFeatures:
+    """The same features in coordinates of all directions."""
+    components = np.linalg.qr(np.random.default_rng(3).normal(size=(12, 12)))[0].T.astype(np.float32)
+    basis = FeatureBasis(mean=predicted.mean, components=components, energy_kept=1.0, space=predicted.space)
+    coordinates = ((predicted.features - predicted.mean) @ components.T).astype(np.float32)
+    return replace(predicted, features=coordinates * predicted.seen[:, None], basis=basis)
+
+
+@pytest.mark.parametrize("basis", [True, False])
+@pytest.mark.parametrize("least", [0.2, 0.5, 0.8])
+def test_the_fit_is_how_far_rendered_features_are_from_the_teachers_maps_in_all_views(
+    tmp_path: Path, basis: bool, least: float
+) -> None:
+    predicted = predicted_features()
+    made = prepared(tmp_path / "made", in_a_basis(predicted) if basis else predicted)
+    assert (made.outputs.basis is not None) == basis
+    # With products, where the length of a query matters.
+    config = MemoryConfig(channels=12, scoring="dot", temperature=20.0)
+    memory = untrained_memory(made, config)
+    scene = wall(0)
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    teacher, tally = BlendedTeacher(scene), RenderedTally(memory.mean)
+    for view in range(2):
+        target = teacher.feature_map(scene.views, view)
+        assert target.features is not None
+        truth = target.features.reshape(-1, 12)
+        b = blend(scene.gaussians, scene.views.cameras, view, like=target, config=BlendConfig(rays_per_patch=4))
+        queries, alpha = render_queries(memory, b)
+        good = (alpha >= least) & np.isfinite(truth[:, 0])
+        tally.add(memory.attend(queries[good]), truth[good])
+    expected, errors = tally.errors(), fit_errors(memory, made, least)
+    assert errors.cells == pytest.approx(expected.cells, abs=3)
+    assert (errors.pictures, errors.not_finite) == (2, 0)
+    assert errors.cosine == pytest.approx(expected.cosine, abs=2e-3)
+    assert errors.centered == pytest.approx(expected.centered, abs=5e-3)
+    assert errors.l2 == pytest.approx(expected.l2, rel=2e-2)
