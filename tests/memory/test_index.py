@@ -194,6 +194,10 @@ def test_pack_writes_an_index_that_localize_and_pack_read(
     assert f"one of {results['rows']} rows in one byte; centered cosines lose" in capsys.readouterr().out
     assert results["bytes"] == (out / PACKAGE_FILE).stat().st_size
     assert results["threshold"] == 0.8
+    made = index_features(make_features(), IndexConfig(threshold=0.8))
+    assert (results["rows"], results["row_bytes"]) == (len(made.features.features), 1)
+    assert (results["error"], results["lowest"]) == pytest.approx((made.error, made.lowest), abs=1e-3)
+    assert results["share_of_float16"] == results["bytes"] / (2 * 12 * 3000)
     assert 0 < results["error"] < 0.2
     assert cli.main(["localize", str(out), "query=mug", f"out={tmp_path / 'boxes'}", "pictures=0"]) == 0
     for form in ("compact", "npz", "index"):
