@@ -14,7 +14,7 @@ from gsencoder.evaluate.rendered import RenderedTally
 from gsencoder.memory.bank import BankConfig
 from gsencoder.memory.render import render_queries
 from gsencoder.render import BlendConfig, blend
-from gsencoder.train.memory import untrained_memory
+from gsencoder.train.memory import memory_training, train_memory, untrained_memory
 from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import MemoryScene, prepare_memory
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
@@ -55,6 +55,19 @@ def test_predicted_features_take_the_place_of_fused_ones(tmp_path: Path, monkeyp
     # Standard units are those of the Gaussians that have features: their mean square is one.
     targets = made.prepared.targets(np.flatnonzero(predicted.seen))
     assert np.square(targets.astype(np.float64)).mean() == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.parametrize("init", ["fused", "random"])
+def test_gaussians_without_a_feature_have_no_query_before_and_after_the_training(tmp_path: Path, init: str) -> None:
+    predicted = predicted_features()
+    made = prepared(tmp_path / "made", predicted)
+    config = MemoryConfig(channels=4, points=50, init=init)  # type: ignore[arg-type]
+    training = replace(memory_training(), steps=2, warmup=1, learning_rate=0.1)
+    trained = train_memory({"a": made}, config, training, work=tmp_path)[0]["a"]
+    for memory in (trained, untrained_memory(made, config)):
+        np.testing.assert_array_equal(memory.weights, predicted.weights)
+        np.testing.assert_array_equal(memory.queries[~predicted.seen], 0)
+        assert memory.queries[predicted.seen].all(axis=1).all()
 
 
 def test_a_folder_that_was_prepared_with_other_predictions_is_refused(tmp_path: Path) -> None:
