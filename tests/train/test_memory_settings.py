@@ -12,7 +12,13 @@ from training_scenes import scene as wall
 from gsencoder.core.errors import InputError
 from gsencoder.memory.bank import BankConfig
 from gsencoder.train.memory import first_queries, memory_training, train_decoder, train_memory
-from gsencoder.train.memory_network import MemoryBatch, MemoryConfig, ViewSamples, join_views
+from gsencoder.train.memory_network import (
+    MemoryBatch,
+    MemoryConfig,
+    MemoryObjective,
+    ViewSamples,
+    join_views,
+)
 from gsencoder.train.memory_scene import MemoryScene, prepare_memory
 from gsencoder.types import MemoryBank
 
@@ -64,6 +70,23 @@ def test_rows_are_at_least_as_opaque_as_is_asked_for(prepared: MemoryScene, leas
     assert alpha.min() >= least
     full = np.add.reduceat(np.append(view.weight, np.float32(0)), view.crow[:-1]) * (np.diff(view.crow) > 0)
     assert len(alpha) == (view.valid & (full >= least)).sum()
+
+
+def test_both_terms_of_the_loss_count_each_row_by_its_weight(prepared: MemoryScene) -> None:
+    batch = sample(prepared, 0, config=MemoryConfig(points=30, gaussian_weight=0.3))
+    weights, truth = batch.rows[0].row_weights.double(), batch.rows[0].targets.double()
+    assert set(weights.tolist()) == {1.0, pytest.approx(0.3)}
+    predicted = torch.linspace(-1, 2, len(truth) * 12).reshape(len(truth), 12)
+
+    class Fixed(torch.nn.Module):
+        def forward(self, rows: object) -> tuple[torch.Tensor]:
+            return (predicted,)
+
+    terms = MemoryObjective(Fixed(), MemoryConfig(), ["a"])(batch)
+    cosines = torch.nn.functional.cosine_similarity(predicted.double(), truth)
+    assert terms["cosine"].item() == pytest.approx(((1 - cosines) * weights).sum().item(), rel=1e-4)
+    squares = (predicted.double() - truth).square().mean(dim=1)
+    assert terms["l2"].item() == pytest.approx((squares * weights).sum().item(), rel=1e-5)
 
 
 def test_the_error_of_a_sample_is_that_of_its_batch(prepared: MemoryScene) -> None:
