@@ -101,6 +101,19 @@ def test_where_nothing_with_features_is_in_view_the_picture_says_so_and_marks_no
     assert not picture[LABEL_HEIGHT:].any()
 
 
+def test_a_label_says_where_the_word_is_or_why_it_is_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = []
+    monkeypatch.setattr("gsencoder.infer.draw.pose_pictures._write", lambda *given: written.append(given[2]))
+    seen = seen_from(64, 48)
+    for point in (point_at(40.5, 20.5), point_at(40.5, 20.5, visible=False), point_at(np.nan, np.nan, visible=False)):
+        drawn(seen, point)
+    assert written == [
+        "mug 0.70, depth 2",
+        "mug 0.70, not visible (needs 0.50)",
+        "mug: nothing with features in view",
+    ]
+
+
 @pytest.mark.parametrize("stride", [1, 4])
 def test_the_view_is_drawn_in_all_its_pixels_whatever_the_stride(stride: int) -> None:
     gaussians = random_gaussians(50)
