@@ -87,6 +87,7 @@ class QueryLoop:
         self.attention = MemoryAttention(
             scene.bank,
             torch.from_numpy(projection),
+            mean=scene.outputs.mean,
             scoring=setting.memory.scoring,
             temperature=setting.memory.temperature,
             values=torch.from_numpy(scene.values),

@@ -79,7 +79,7 @@ def attention_over_components(count: int) -> None:
     )
     torch.manual_seed(0)
     projection = torch.randn(QUERY_CHANNELS, CHANNELS)
-    attention = MemoryAttention(bank, projection, scoring="centered", temperature=0.05)
+    attention = MemoryAttention(bank, projection, mean=bank.mean, scoring="centered", temperature=0.05)
     queries = torch.randn(QUERIES, QUERY_CHANNELS, requires_grad=True)
     before, start = resident_megabytes(), time.perf_counter()
     attention(queries).square().mean().backward()

@@ -28,6 +28,7 @@ REMOVED_OPTIONS: Mapping[str, Removed] = {
 
 REMOVED_VALUES: Mapping[str, str] = {
     "precision=int8_static": "it was slower and less accurate than int8_dynamic, which needs no scenes to calibrate on",
+    "localize.mode=centred": "it is written centered",
 }
 """Removed values of options that exist, as they were written on the command line, with the reason."""
 

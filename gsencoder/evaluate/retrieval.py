@@ -187,4 +187,6 @@ def _check(names: Sequence[str], views: int, texts: np.ndarray, distractors: np.
 
 def _unit(vectors: Float32[np.ndarray, "n D"]) -> Float64[np.ndarray, "n D"]:
     rows = vectors.astype(np.float64)
+    # The largest entry is taken out of the root, so that short vectors have directions as well.
+    rows = rows / np.maximum(np.abs(rows).max(axis=1, initial=0, keepdims=True), np.finfo(np.float64).tiny)
     return np.asarray(rows / np.sqrt((rows**2).sum(axis=1, keepdims=True) + EPS))

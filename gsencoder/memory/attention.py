@@ -2,8 +2,9 @@
 
 import math
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
@@ -28,6 +29,7 @@ class MemoryAttention(nn.Module):
         bank: MemoryBank,
         projection: Float[Tensor, "s D"],
         *,
+        mean: Float32[np.ndarray, " D"],
         scoring: Scoring,
         temperature: float,
         values: Float[Tensor, "M C"] | None = None,
@@ -35,6 +37,7 @@ class MemoryAttention(nn.Module):
         """Args:
         bank: the components.
         projection: initial W_m.
+        mean: of the space, about which centered cosines are; that of the bank is zero where it was made without.
         scoring: how queries are compared with components.
         temperature: τ.
         values: what is averaged, such as the components in a basis; None = the components.
@@ -42,7 +45,7 @@ class MemoryAttention(nn.Module):
         super().__init__()
         self.scoring, self.temperature = scoring, temperature
         self.projection = nn.Parameter(projection)
-        keys = attention_keys(bank.components, bank.mean, scoring)
+        keys = attention_keys(bank.components, mean, scoring)
         self.register_buffer("keys", torch.from_numpy(keys), persistent=False)
         values = torch.from_numpy(bank.components) if values is None else values
         self.register_buffer("values", values, persistent=False)

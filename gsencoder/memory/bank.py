@@ -176,7 +176,13 @@ class _Builder:
                     f"bank.components={config.components:,}: {self._too_large()}; give at most {self._limit:,}"
                 )
             # One component is for features without a direction.
-            most = max(1, min(config.components, features) - self._has_undirected())
+            most = min(config.components, features) - self._has_undirected()
+            if most < 1 and any(directed.any() for _, _, directed in self._rows()):
+                raise InputError(
+                    f"bank.components={config.components}: cells at the mean need a component beside that of others; "
+                    "give 2 or more"
+                )
+            most = max(1, most)
             threshold = largest_threshold(lambda each: len(self._cover(each, most)) <= most)
             if len(self._cover(threshold, most)) > most:
                 raise InputError(

@@ -78,9 +78,11 @@ def index_features(features: GaussianFeatures, config: IndexConfig = IndexConfig
     centered = values - offset
     norms = np.sqrt(np.einsum("nc,nc->n", centered, centered, dtype=np.float64))
     directed = np.flatnonzero(norms > MIN_RELATIVE_NORM * np.linalg.norm(features.mean.astype(np.float64)))
-    threshold, leaders = _leaders(centered[directed], config)
+    # One row is for features without a direction, if there are any.
+    limit = (config.rows or MAX_ROWS) - (len(directed) < len(seen))
+    threshold, leaders = _leaders(centered[directed], config, limit)
     table = np.concatenate([centered[directed[leaders]], np.zeros_like(centered[:1])])
-    # Features without a direction have the last row, the mean of the space.
+    # Features without a direction have the last row, the mean of the space; it goes where there are none.
     number = np.full(len(seen), len(table) - 1, np.int32)
     number[directed] = _nearest(centered[directed], table[:-1])
     table[:-1] = _means(centered[directed], number[directed], table[:-1])
@@ -105,8 +107,10 @@ def index_features(features: GaussianFeatures, config: IndexConfig = IndexConfig
     )
 
 
-def _leaders(centered: Float32[np.ndarray, "n C"], config: IndexConfig) -> tuple[float, Int64[np.ndarray, " M"]]:
-    """The threshold of a cover, and its rows.
+def _leaders(
+    centered: Float32[np.ndarray, "n C"], config: IndexConfig, limit: int
+) -> tuple[float, Int64[np.ndarray, " M"]]:
+    """The threshold of a cover, and its rows, at most so many.
 
     Raises:
         InputError: more rows than the numbers of an index.
@@ -117,8 +121,6 @@ def _leaders(centered: Float32[np.ndarray, "n C"], config: IndexConfig) -> tuple
         made.add(centered, "features", limit=limit)
         return made
 
-    # One row is for features without a direction.
-    limit = (config.rows or MAX_ROWS) - 1
     threshold = config.threshold or largest_threshold(lambda each: len(cover(each, limit)) <= limit)
     made = cover(threshold, limit)
     if len(made) > limit and config.rows:

@@ -34,16 +34,7 @@ def memory_training() -> TrainerConfig:
 def first_queries(
     scene: MemoryScene, config: MemoryConfig, seed: int
 ) -> tuple[Float32[np.ndarray, "N s"], Float32[np.ndarray, "s D"]]:
-    """Queries and projection before the training: those of the fused features, or random ones.
-
-    Raises:
-        InputError: queries of more channels than the features have.
-    """
-    if config.channels > scene.bank.space.channels:
-        raise InputError(
-            f"memory.channels: expected at most the {scene.bank.space.channels} channels of the features, got "
-            f"{config.channels:,}; 16 to 64 are enough for most teachers"
-        )
+    """Queries and projection before the training: those of the fused features, or random ones."""
     if config.init == "fused":
         return principal_queries(scene.fused_features(), scene.bank, config.channels, config.scoring)
     channels, generator = scene.outputs.space.channels, torch.Generator().manual_seed(seed)
@@ -57,7 +48,7 @@ def untrained_memory(scene: MemoryScene, config: MemoryConfig, seed: int = 0) ->
     """The memory of fused features without any training.
 
     Raises:
-        InputError: no rows to compare with, or queries of more channels than the features have.
+        InputError: no rows to compare with.
     """
     check_rows({scene.bank.space.name: scene}, config.min_alpha)
     queries, projection = first_queries(scene, config, seed)
@@ -150,7 +141,8 @@ def _train(
         "decoder": kind or "attention",
         "teachers": list(scenes),
         "spaces": {name: scene.bank.space.describe() for name, scene in scenes.items()},
-        "banks": {name: fingerprint_of(scene.bank) for name, scene in scenes.items()},
+        "components": {name: len(scene.bank) for name, scene in scenes.items()},
+        "digests": {name: fingerprint_of(scene.bank) for name, scene in scenes.items()},
         "samples_per_step": training.samples_per_step(process.world_size),
     }
     trainer = Trainer(
@@ -206,6 +198,7 @@ def _decoder_of(
         return MemoryAttention(
             scene.bank,
             torch.from_numpy(projection),
+            mean=scene.outputs.mean,
             scoring=config.scoring,
             temperature=config.temperature,
             values=torch.from_numpy(scene.values),

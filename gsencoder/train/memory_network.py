@@ -26,6 +26,8 @@ from gsencoder.train.render_rows import RenderRows, gaussian_rows, join_rows, sa
 from gsencoder.types.memory import Scoring
 
 EPS = 1e-12
+MAX_CHANNELS = 1024
+"""Channels of a query, at most; 16 to 64 are enough for most teachers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,9 +63,10 @@ class MemoryConfig:
     l2: float = field(default=1.0, metadata={"help": "weight of the squared distance in standard units"})
 
     def __post_init__(self) -> None:
-        for name in ("channels", "points"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
+        if not 1 <= self.channels <= MAX_CHANNELS:
+            raise InputError(f"channels: expected 1 to {MAX_CHANNELS:,}, got {self.channels:,}")
+        if self.points < 1:
+            raise InputError(f"points: expected 1 or more, got {self.points}")
         if not 0 < self.temperature < math.inf:
             raise InputError(f"temperature: expected a positive number, got {self.temperature}")
         if not 0 < self.min_alpha <= 1:

@@ -9,7 +9,7 @@ import pytest
 from splats import random_rotation
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.camera_file import read_cameras
+from gsencoder.data.readers.camera_file import MAX_PIXELS, read_cameras
 from gsencoder.types.poses import OPENCV_FROM_OPENGL
 
 ORIGIN = np.zeros(3)
@@ -131,3 +131,22 @@ def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
         read_cameras(tmp_path / "gone.json", ORIGIN)
     with pytest.raises(InputError, match="not a readable JSON file"):
         read_cameras(tmp_path, ORIGIN)
+
+
+def test_principal_points_beside_the_picture_and_pictures_of_the_largest_size_are_read(tmp_path: Path) -> None:
+    """A crop may leave the principal point out."""
+    entry = {"cam_from_world": np.eye(4).tolist(), **INTRINSICS, "cx": -35.5, "cy": 1e6}
+    made = read_cameras(write(tmp_path / "crop.json", entry), ORIGIN)
+    assert made.Ks[0, :2, 2].tolist() == [-35.5, 1e6]
+    largest = entry | {"width": MAX_PIXELS // 1024, "height": 1024}
+    assert read_cameras(write(tmp_path / "large.json", largest), ORIGIN).widths.tolist() == [MAX_PIXELS // 1024]
+    with pytest.raises(InputError, match="pixels are too many"):
+        read_cameras(write(tmp_path / "larger.json", largest | {"width": MAX_PIXELS // 1024 + 1}), ORIGIN)
+
+
+def test_more_cameras_than_are_read_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsencoder.data.readers.camera_file.MAX_CAMERAS", 3)
+    entry = {"cam_from_world": np.eye(4).tolist(), **INTRINSICS}
+    assert len(read_cameras(write(tmp_path / "three.json", [entry] * 3), ORIGIN)) == 3
+    with pytest.raises(InputError, match="a list of 1 to 3 cameras, got 4"):
+        read_cameras(write(tmp_path / "four.json", [entry] * 4), ORIGIN)

@@ -9,6 +9,7 @@ from sklearn.metrics.pairwise import cosine_similarity
 
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.retrieval import (
+    Pooling,
     Retrieval,
     draw,
     image_to_text,
@@ -102,6 +103,23 @@ def test_the_order_of_queries_changes_nothing() -> None:
         assert np.array_equal(text_to_image(names, TEXTS[order], views, OTHERS, count=15, seed=seed).ranks, back[order])
 
 
+@pytest.mark.parametrize("pooling", ["max", "mean"])
+@pytest.mark.parametrize("seed", [0, 7])
+def test_a_pool_holds_what_the_seed_draws_for_the_name_and_is_pooled_like_the_query(
+    pooling: Pooling, seed: int
+) -> None:
+    pictures = np.stack([OTHERS, vectors(40, 55), vectors(40, 56)], axis=1)
+    there = image_to_text(NAMES, VIEWS, TEXTS, OTHERS, count=15, seed=seed, pooling=pooling)
+    back = text_to_image(NAMES, TEXTS, VIEWS, pictures, count=15, seed=seed, pooling=pooling)
+    for number, name in enumerate(NAMES):
+        drawn = draw(name, 40, 15, seed)
+        own = view_scores(VIEWS[number], TEXTS[[number]], pooling)[0]
+        assert there.ranks[number] == 1 + (view_scores(VIEWS[number], OTHERS[drawn], pooling) >= own).sum()
+        others = [view_scores(pictures[row], TEXTS[[number]], pooling)[0] for row in drawn]
+        assert back.ranks[number] == 1 + (np.array(others) >= own).sum()
+    assert not np.array_equal(there.ranks, image_to_text(NAMES, VIEWS, TEXTS, OTHERS, count=15, seed=seed + 1).ranks)
+
+
 def test_draws_are_of_different_distractors_and_depend_on_name_and_seed() -> None:
     drawn = draw("frame 1", 50, 20, 3)
     assert len(set(drawn.tolist())) == 20
@@ -151,5 +169,7 @@ def test_what_does_not_fit_is_refused() -> None:
         image_to_text(NAMES, VIEWS, TEXTS, OTHERS[:, :5], count=5)
     with pytest.raises(InputError, match="expected finite distractors"):
         image_to_text(NAMES, VIEWS, TEXTS, np.where(OTHERS > 2, np.nan, OTHERS).astype(np.float32), count=5)
+    with pytest.raises(InputError, match="expected finite texts"):
+        text_to_image(NAMES, np.where(TEXTS > 1, np.inf, TEXTS).astype(np.float32), VIEWS, OTHERS, count=5)
     with pytest.raises(InputError, match="expected cells of 6 channels"):
         image_to_text(NAMES, [VIEWS[0][:0], *VIEWS[1:]], TEXTS, OTHERS, count=5)

@@ -219,16 +219,17 @@ def test_the_mark_surrounds_the_pixel_and_does_not_hide_it(pixel: tuple[int, int
     np.testing.assert_array_equal(picture[int(y), int(x)], 90)
 
 
+@pytest.mark.parametrize("view", [0, 1])
 def test_a_picture_holds_the_view_and_the_tiles_of_the_components_and_comes_again_the_same(
-    memory: QueryMemory, scene: Scene
+    memory: QueryMemory, scene: Scene, view: int
 ) -> None:
     scene = with_photographs(scene)
     assert scene.gaussians is not None
     assert scene.views is not None
     assert scene.views.images is not None
-    picture = attention_picture(memory, scene, 0, (24, 20), count=3)
-    np.testing.assert_array_equal(picture, attention_picture(memory, scene, 0, (24, 20), count=3))
-    found = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
+    picture = attention_picture(memory, scene, view, (24, 20), count=3)
+    np.testing.assert_array_equal(picture, attention_picture(memory, scene, view, (24, 20), count=3))
+    found = strongest_components(memory, scene.gaussians, scene.views.cameras, view, (24, 20), 3)
     tiles = []
     for number, component in enumerate(found.components.tolist()):
         photograph = scene.views.images[int(memory.bank.sources[component, 0])]
@@ -239,8 +240,8 @@ def test_a_picture_holds_the_view_and_the_tiles_of_the_components_and_comes_agai
     assert not np.array_equal(tiles[0], tiles[1])
     assert not np.array_equal(tiles[1], tiles[2])
     shown = picture[HEAD : HEAD + 550, GAP : GAP + VIEW_SIDE]
-    view = render_image(scene.gaussians, scene.views.cameras, 0)
-    np.testing.assert_array_equal(shown, mark_pixel(view, (24, 20)))
+    plain = render_image(scene.gaussians, scene.views.cameras, view)
+    np.testing.assert_array_equal(shown, mark_pixel(plain, (24, 20)))
 
 
 def test_the_bar_under_a_tile_is_as_long_as_its_weight(memory: QueryMemory, scene: Scene) -> None:

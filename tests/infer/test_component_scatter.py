@@ -8,7 +8,13 @@ from memory_samples import make_memory
 from sklearn.decomposition import PCA
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.draw.component_scatter import UMAP_LEAST, component_scatter, principal_plane, umap_plane
+from gsencoder.infer.draw.component_scatter import (
+    UMAP_LEAST,
+    _title,
+    component_scatter,
+    principal_plane,
+    umap_plane,
+)
 from gsencoder.memory.raw_features import RawSample
 from gsencoder.types import FeatureSpace, MemoryBank
 
@@ -89,6 +95,48 @@ def test_a_dot_lies_where_its_coordinates_are() -> None:
     right = component_scatter(bank_of(np.array([[9.0, 0, 0]])), sample_of(raw))[150:]
     middle = left.shape[1] / 2
     assert np.nonzero(red(left))[1].mean() < middle < np.nonzero(red(right))[1].mean()
+
+
+def test_a_picture_is_the_same_wherever_the_mean_of_the_features_is() -> None:
+    raw = np.random.default_rng(1).integers(-30, 30, (200, 4)).astype(np.float64)
+    plain = component_scatter(bank_of(raw[:8]), sample_of(raw))
+    moved = component_scatter(bank_of(raw[:8] + 512), sample_of(raw + 512))
+    assert (plain != moved).mean() < 1e-3
+
+
+def test_the_title_states_how_many_features_are_drawn_and_how_many_are_covered() -> None:
+    bank = bank_of(np.eye(3))
+    assert _title(bank, sample_of(np.ones((40, 3)), 5000)) == [
+        "toy",
+        "3 components for 5,000 raw features, of which 40 are drawn",
+        "98.7 % of the raw features have a component within the threshold, a cosine of 0.900",
+    ]
+    assert _title(bank_of(np.eye(1, 3)), sample_of(np.ones((1, 3))))[1] == "1 component for 1 raw feature"
+
+
+def test_umap_is_given_the_directions_that_the_bank_compares_and_its_dots_are_told_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    mean = np.array([5, 0, 0, 0], np.float32)
+    raw, components = (rng.normal(size=(count, 4)).astype(np.float32) + mean for count in (50, 7))
+    given = []
+
+    def plane(vectors: np.ndarray, seed: int) -> np.ndarray:
+        given.append((vectors, seed))
+        return np.stack([np.arange(len(vectors)) >= 50, np.linspace(0, 1, len(vectors))], axis=1).astype(np.float32)
+
+    monkeypatch.setattr("gsencoder.infer.draw.component_scatter.umap_plane", plane)
+    monkeypatch.setattr("gsencoder.infer.draw.component_scatter.check_umap", lambda: None)
+    picture = component_scatter(replace(bank_of(components), mean=mean), sample_of(raw), umap=True, seed=3)
+    ((vectors, seed),) = given
+    local = np.concatenate([raw, components]).astype(np.float64) - mean
+    np.testing.assert_allclose(vectors, local / np.linalg.norm(local, axis=1, keepdims=True), atol=1e-6)
+    assert seed == 3
+    left, right = np.split(picture[100:, picture.shape[1] // 2 :], 2, axis=1)
+    # The legend has a dot of each color as well.
+    assert red(right).sum() > 2 * red(left).sum()
+    assert blue(left).sum() > 2 * blue(right).sum()
 
 
 @pytest.mark.parametrize(

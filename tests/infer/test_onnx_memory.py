@@ -35,13 +35,20 @@ def test_the_graph_gives_the_features_of_queries(scoring: str) -> None:
     about = json.loads(entry)
     assert about["space"]["name"] == "s"
     assert (about["kind"], about["channels"], about["threshold"]) == ("memory", 6, 0.9)
+    assert (about["coverage"], about["cosine"]) == (1.0, 0.95)
     assert {each.domain for each in onnx.load_from_string(graph).opset_import} == {""}
 
 
-def test_a_graph_that_differs_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_graph_that_differs_is_refused_also_where_no_gaussian_has_a_query(
+    monkeypatch: pytest.MonkeyPatch, seen: bool
+) -> None:
+    memory = make_memory()
+    if not seen:
+        memory = replace(memory, queries=np.zeros_like(memory.queries), weights=np.zeros_like(memory.weights))
     monkeypatch.setattr(module, "TOLERANCE", 0.0)
     with pytest.raises(InputError, match="the graph differs from numpy by"):
-        export_memory(make_memory())
+        export_memory(memory)
 
 
 def test_the_command_writes_the_memory_of_one_space(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,20 +40,20 @@ def plain_cosine(features: np.ndarray, text: np.ndarray) -> np.ndarray:
     return b @ a.T
 
 
-@pytest.mark.parametrize("mode", ["raw", "centred"])
+@pytest.mark.parametrize("mode", ["raw", "centered"])
 def test_relevancy_in_coordinates_is_the_cosine_of_decoded_vectors(rng: np.random.Generator, mode: str) -> None:
     features, text, text_mean = in_basis(rng), words(rng), rng.normal(size=24).astype(np.float32) / 9
     scores = relevancy(features, text, text_mean, mode=mode)
     seen = features.seen
     vectors = features.features.astype(np.float64) @ features.basis.components + features.basis.mean
-    centered = mode == "centred"
+    centered = mode == "centered"
     expected = plain_cosine(vectors - (features.mean if centered else 0), text - (text_mean if centered else 0))
     # A feature's length below a thousandth of the mean's fades: here that is a millionth of the square.
     np.testing.assert_allclose(scores[:, seen], expected[:, seen], atol=1e-4 if centered else 1e-6)
     assert np.isnan(scores[:, ~seen]).all()
 
 
-@pytest.mark.parametrize("mode", ["raw", "centred"])
+@pytest.mark.parametrize("mode", ["raw", "centered"])
 @pytest.mark.parametrize("with_negatives", [False, True])
 def test_features_in_a_basis_and_decoded_ones_score_alike(
     rng: np.random.Generator, mode: str, with_negatives: bool
@@ -88,7 +88,7 @@ def test_the_length_of_features_does_not_matter_at_either_end(rng: np.random.Gen
         space=SPACE,
         basis=FeatureBasis(mean=mean, components=basis.components, energy_kept=1.0, space=SPACE),
     )
-    for mode in ("raw", "centred"):
+    for mode in ("raw", "centered"):
         a = relevancy(scaled, text, text_mean, mode=mode)
         assert np.isfinite(a[:, scaled.seen]).all()
         np.testing.assert_allclose(a, relevancy(features, text, text_mean, mode=mode), atol=1e-5)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from memory_samples import make_memory
+from scipy.special import softmax
 
 from gsencoder.core.errors import InputError
 from gsencoder.memory import attention as attention_module
@@ -33,7 +34,11 @@ def equation(memory: QueryMemory, queries: np.ndarray) -> np.ndarray:
 
 def module_of(memory: QueryMemory) -> MemoryAttention:
     return MemoryAttention(
-        memory.bank, torch.from_numpy(memory.projection), scoring=memory.scoring, temperature=memory.temperature
+        memory.bank,
+        torch.from_numpy(memory.projection),
+        mean=memory.mean,
+        scoring=memory.scoring,
+        temperature=memory.temperature,
     )
 
 
@@ -108,7 +113,7 @@ def test_queries_of_any_length_give_finite_features_and_gradients(scoring: Scori
 def test_the_length_of_a_query_does_not_matter_with_cosines(scoring: Scoring) -> None:
     memory = make_memory(scoring)
     queries = memory.queries[1:7]
-    for length in (1e-3, 7.0, 1e8):
+    for length in (1e-3, 7.0, 1e8, 1e25):
         np.testing.assert_allclose(memory.attend(queries * np.float32(length)), memory.attend(queries), rtol=1e-4)
 
 
@@ -120,6 +125,50 @@ def test_components_of_any_size_are_told_apart(size: float) -> None:
     queries = memory.queries[1:7]
     np.testing.assert_allclose(scaled.attend(queries), size * memory.attend(queries), rtol=1e-4)
     assert np.isfinite(module_of(scaled)(torch.from_numpy(queries)).detach().numpy()).all()
+
+
+@pytest.mark.parametrize("scoring", SCORINGS)
+def test_a_component_without_a_direction_takes_part_with_a_score_of_zero(scoring: Scoring) -> None:
+    memory = make_memory(scoring)
+    components = memory.bank.components.copy()
+    components[3] = memory.bank.mean
+    memory = replace(memory, bank=replace(memory.bank, components=components))
+    queries = memory.queries[1:7]
+    projected = queries.astype(np.float64) @ memory.projection
+    keys = components.astype(np.float64) - memory.bank.mean
+    if scoring != "dot":
+        keys /= np.maximum(np.linalg.norm(keys, axis=1, keepdims=True), 1e-9)
+        projected /= np.linalg.norm(projected, axis=1, keepdims=True)
+    expected = softmax(projected @ keys.T / memory.temperature, axis=1)
+    np.testing.assert_allclose(memory.attention(queries), expected, rtol=1e-3, atol=1e-5)
+    features = module_of(memory)(torch.from_numpy(queries)).detach().numpy()
+    np.testing.assert_allclose(features, expected @ components, rtol=1e-3, atol=1e-4)
+
+
+def test_other_values_than_the_components_are_averaged_with_the_same_weights() -> None:
+    memory = make_memory()
+    values = np.random.default_rng(1).normal(size=(70, 5)).astype(np.float32)
+    queries = memory.queries[1:7]
+    expected = memory.attention(queries) @ values
+    np.testing.assert_allclose(memory.attend(queries, values), expected, rtol=1e-4, atol=1e-5)
+    module = MemoryAttention(
+        memory.bank,
+        torch.from_numpy(memory.projection),
+        mean=memory.mean,
+        scoring=memory.scoring,
+        temperature=memory.temperature,
+        values=torch.from_numpy(values),
+    )
+    np.testing.assert_allclose(module(torch.from_numpy(queries)).detach().numpy(), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_bank_that_was_made_without_centering_is_compared_about_the_mean_of_the_space() -> None:
+    memory = make_memory("centered")
+    raw = replace(memory, bank=replace(memory.bank, mean=np.zeros_like(memory.bank.mean)))
+    seen = raw.queries[raw.weights > 0]
+    attended = module_of(raw)(torch.from_numpy(seen)).detach().numpy()
+    np.testing.assert_allclose(attended, raw.attend(seen), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(attended, memory.attend(seen), rtol=1e-3, atol=1e-4)
 
 
 def test_a_bank_of_one_component_gives_that_component() -> None:
@@ -146,6 +195,13 @@ def test_features_of_gaussians_are_those_of_their_queries_in_channels_and_in_a_b
     components = np.linalg.qr(np.random.default_rng(0).normal(size=(24, 24)))[0].T.astype(np.float32)
     basis = FeatureBasis(mean=memory.mean, components=components, energy_kept=1.0, space=memory.space)
     np.testing.assert_allclose(replace(memory, basis=basis).features().decode(seen), expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("scoring", SCORINGS)
+def test_decoded_features_have_the_mean_of_the_memory_whatever_the_bank_subtracts(scoring: Scoring) -> None:
+    memory = make_memory(scoring)
+    assert memory.bank.mean.any() == (scoring == "centered")
+    np.testing.assert_array_equal(memory.features().mean, memory.mean)
 
 
 def test_a_memory_whose_parts_do_not_fit_is_refused(no_jaxtyping: None) -> None:

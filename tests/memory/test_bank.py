@@ -166,7 +166,7 @@ def test_a_bank_that_memory_does_not_hold_is_refused_with_what_fits(monkeypatch:
     with pytest.raises(
         InputError,
         match=r"threshold=0\.99: the bank would have more than 50 components of 16 channels, .* 50 fit: give "
-        "components=50 or less, or a smaller threshold",
+        "bank.components=50 or less, or a smaller threshold",
     ):
         build_bank(stream(maps), SPACE, mean, BankConfig(threshold=0.99))
     with pytest.raises(InputError, match=r"components=51: the bank would have more than 50 .*; give at most 50"):

@@ -17,8 +17,9 @@ from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_index_
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.memory import index as index_module
 from gsencoder.memory.index import IndexConfig, index_features
+from gsencoder.memory.reduction import reduce_to_cover
 from gsencoder.text.table import make_text_table, save_text_table
-from gsencoder.types import GaussianFeatures, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
 
 def centered_cosines(one: GaussianFeatures, other: GaussianFeatures) -> np.ndarray:
@@ -75,6 +76,58 @@ def test_features_at_the_mean_have_a_row_of_their_own_and_no_cosine() -> None:
     assert nothing.error == 0
 
 
+def test_features_at_the_mean_but_for_rounding_have_its_row() -> None:
+    features = make_features(basis=False, kinds=4)
+    values = features.features.copy()
+    at_mean = np.flatnonzero(features.seen)[:50]
+    values[at_mean] = features.mean * (1 + 1e-5 * np.random.default_rng(0).uniform(-1, 1, (50, 1)))
+    made = index_features(replace(features, features=values.astype(np.float32)), IndexConfig(threshold=0.99))
+    assert len(made.features.features) == 5
+    np.testing.assert_array_equal(made.features.stored(at_mean), np.repeat(features.mean[None], 50, axis=0))
+    assert made.error < 1e-6
+
+
+@pytest.mark.parametrize("basis", [True, False])
+def test_every_gaussian_has_the_row_that_is_nearest_to_it_and_every_row_is_used(basis: bool) -> None:
+    features = make_features(basis=basis)
+    made = index_features(features, IndexConfig(threshold=0.8)).features
+    assert made.index is not None
+    table, seen = made.features.astype(np.float64), features.seen
+    distances = np.linalg.norm(features.features[seen][:, None] - table, axis=2)
+    own = distances[np.arange(seen.sum()), made.index[seen]]
+    np.testing.assert_allclose(own, distances.min(axis=1), atol=1e-5)
+    np.testing.assert_array_equal(np.unique(made.index[seen]), np.arange(len(table)))
+    np.testing.assert_array_equal(made.weights, features.weights)
+
+
+def test_a_row_is_the_mean_of_the_gaussians_that_have_it() -> None:
+    features = make_features(kinds=7)
+    noise = 0.01 * np.random.default_rng(0).normal(size=features.features.shape)
+    values = (features.features + noise).astype(np.float32) * features.seen[:, None]
+    made = index_features(replace(features, features=values), IndexConfig(threshold=0.97)).features
+    assert made.index is not None
+    assert len(made.features) == 7
+    for row, vector in enumerate(made.features):
+        np.testing.assert_allclose(vector, values[made.index == row].mean(axis=0, dtype=np.float64), atol=1e-5)
+
+
+def test_the_threshold_that_is_stated_is_the_largest_one_whose_table_has_so_few_rows() -> None:
+    features = make_features(n=1000)
+    made = index_features(features, IndexConfig(threshold=0.0, rows=60))
+    centered = features.features[features.seen]
+    assert len(reduce_to_cover(centered, made.threshold).rows) <= 60
+    assert len(reduce_to_cover(centered, made.threshold + 2 / 4096).rows) > 60
+
+
+def test_rows_that_are_asked_for_have_room_for_features_at_the_mean() -> None:
+    features = make_features(kinds=8)
+    values = features.features.copy()
+    values[np.flatnonzero(features.seen)[:50]] = 0
+    made = index_features(replace(features, features=values), IndexConfig(threshold=0.0, rows=8))
+    assert len(made.features.features) <= 8
+    np.testing.assert_array_equal(made.features.stored(np.flatnonzero(features.seen)[:50]), 0)
+
+
 def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -85,7 +138,7 @@ def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refuse
     with pytest.raises(InputError, match=r"rows=2: the features point in more directions than that even at"):
         index_features(features, IndexConfig(threshold=0.0, rows=2))
     monkeypatch.setattr(index_module, "MAX_ROWS", 40)
-    with pytest.raises(InputError, match=r"more than 39 rows; give threshold=0\.\d+, or rows="):
+    with pytest.raises(InputError, match=r"more than 40 rows; give threshold=0\.\d+, or rows="):
         index_features(features, IndexConfig(threshold=0.99))
     with pytest.raises(InputError, match="no Gaussian has features"):
         index_features(replace(features, weights=np.zeros_like(features.weights)))
@@ -141,6 +194,10 @@ def test_pack_writes_an_index_that_localize_and_pack_read(
     assert f"one of {results['rows']} rows in one byte; centered cosines lose" in capsys.readouterr().out
     assert results["bytes"] == (out / PACKAGE_FILE).stat().st_size
     assert results["threshold"] == 0.8
+    made = index_features(make_features(), IndexConfig(threshold=0.8))
+    assert (results["rows"], results["row_bytes"]) == (len(made.features.features), 1)
+    assert (results["error"], results["lowest"]) == pytest.approx((made.error, made.lowest), abs=1e-3)
+    assert results["share_of_float16"] == results["bytes"] / (2 * 12 * 3000)
     assert 0 < results["error"] < 0.2
     assert cli.main(["localize", str(out), "query=mug", f"out={tmp_path / 'boxes'}", "pictures=0"]) == 0
     for form in ("compact", "npz", "index"):
@@ -166,3 +223,17 @@ def test_settings_of_an_index_and_another_splat_are_refused(
     save_splat(out / SPLAT_FILE, replace(splat, opacities=splat.opacities[::-1].copy()))
     with pytest.raises(InputError, match="the features belong to splat"):
         load_features(out)
+
+
+def test_two_rows_hold_two_opposite_kinds_where_nothing_lies_at_the_mean() -> None:
+    directions = np.repeat(np.float32([[1, 0, 0], [-1, 0, 0]]), 5, axis=0)
+    space, mean = FeatureSpace(name="s", channels=3), np.zeros(3, np.float32)
+    features = GaussianFeatures(features=directions, weights=np.ones(10, np.float32), mean=mean, space=space)
+    made = index_features(features, IndexConfig(threshold=0.0, rows=2))
+    assert len(made.features.features) == 2
+    np.testing.assert_allclose(made.features.stored(), directions, atol=1e-6)
+    at_mean = np.concatenate([directions, np.zeros((1, 3), np.float32)])
+    with pytest.raises(InputError, match="rows=2: the features point in more directions"):
+        index_features(
+            replace(features, features=at_mean, weights=np.ones(11, np.float32)), IndexConfig(threshold=0.0, rows=2)
+        )

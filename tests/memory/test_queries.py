@@ -44,6 +44,14 @@ def test_queries_of_all_directions_stand_for_the_features(basis: bool, scoring: 
         assert queries[seen].std() == pytest.approx(1, abs=1e-5)
 
 
+@pytest.mark.parametrize("scoring", ["centered", "cosine"])
+def test_with_cosines_rows_of_the_projection_are_as_long_as_the_root_of_the_channels(scoring: Scoring) -> None:
+    features = make_features(basis=False)
+    _, projection = principal_queries(features, bank_of(features, scoring), 5, scoring)
+    directions = projection[int(scoring == "cosine") :]
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), np.sqrt(12), rtol=1e-5)
+
+
 def test_fewer_channels_keep_the_directions_in_which_the_components_differ_most() -> None:
     features = make_features(basis=False)
     bank = bank_of(features)
@@ -55,6 +63,33 @@ def test_fewer_channels_keep_the_directions_in_which_the_components_differ_most(
         unit = projection / np.linalg.norm(projection, axis=1, keepdims=True)
         assert ((keys @ unit.T) ** 2).sum() == pytest.approx(values[:channels].sum(), rel=1e-5)
         assert queries.shape == (3000, channels)
+
+
+def test_with_cosines_the_directions_are_those_about_the_mean_of_the_features_whatever_the_bank_subtracts() -> None:
+    features = make_features(basis=False)
+    bank = bank_of(features, "cosine")
+    assert not bank.mean.any()
+    keys = (bank.components - features.mean).astype(np.float64)
+    keys /= np.linalg.norm(keys, axis=1, keepdims=True)
+    _, projection = principal_queries(features, bank, 4, "cosine")
+    unit = projection[1:] / np.linalg.norm(projection[1:], axis=1, keepdims=True)
+    expected = np.linalg.eigvalsh(keys.T @ keys)[::-1][:3].sum()
+    assert ((keys @ unit.T) ** 2).sum() == pytest.approx(expected, rel=1e-5)
+    # The first channel is the mean, and 1 for every Gaussian before all channels are divided by their spread.
+    assert projection[0] @ features.mean == pytest.approx(
+        np.linalg.norm(projection[0]) * np.linalg.norm(features.mean), rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("basis", [True, False])
+def test_a_memory_without_training_has_the_settings_basis_and_weights_that_it_was_given(basis: bool) -> None:
+    features = make_features(basis=basis)
+    memory = memory_of_features(features, bank_of(features), channels=3, scoring="dot", temperature=0.7)
+    assert (memory.channels, memory.scoring, memory.temperature) == (3, "dot", 0.7)
+    assert memory.basis is features.basis
+    np.testing.assert_array_equal(memory.weights, features.weights)
+    np.testing.assert_array_equal(memory.mean, features.mean)
+    assert memory.features().features.shape == features.features.shape
 
 
 def test_rare_kinds_are_told_apart_where_most_gaussians_are_of_one_kind() -> None:

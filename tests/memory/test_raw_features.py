@@ -66,6 +66,13 @@ def test_every_feature_is_drawn_equally_often() -> None:
     assert np.square(deviation).mean() == pytest.approx(1, abs=0.5)
 
 
+def test_a_view_is_sampled_whatever_cells_another_view_gives() -> None:
+    sample = draw_sample(stream(numbered_maps((20, 20), (20, 20))), SPACE, 200)
+    first, second = (set(sample.features[sample.features[:, 0] == view, 1].tolist()) for view in (0, 1))
+    # A quarter of all cells is drawn, and a quarter of these in the other view as well.
+    assert len(first & second) < 0.5 * min(len(first), len(second))
+
+
 def test_a_seed_gives_the_same_sample_again_and_another_seed_another_one() -> None:
     maps = stream(numbered_maps((10, 10), (10, 10)))
     first, again, other = (draw_sample(maps, SPACE, 20, seed=seed).features for seed in (3, 3, 4))

@@ -73,6 +73,24 @@ def test_every_feature_is_within_the_threshold_of_a_component_of_a_cover(
     assert among.max() < threshold + 2 * reduction.ROUNDING
 
 
+def test_a_feature_whose_cosine_only_rounds_to_the_threshold_has_a_component_of_its_own(
+    rng: np.random.Generator,
+) -> None:
+    """So that what a cover promises holds in exact arithmetic."""
+    leader = rng.normal(size=96)
+    leader /= np.linalg.norm(leader)
+    across = rng.normal(size=(150, 96))
+    across -= (across @ leader)[:, None] * leader
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    cosine = 0.5 + rng.uniform(-1e-7, 1e-7, (150, 1))
+    features = np.concatenate([leader[None], cosine * leader + np.sqrt(1 - cosine**2) * across]).astype(np.float32)
+    unit = features.astype(np.float64)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    assert ((unit @ unit[0])[1:] < 0.5).sum() > 30
+    made = reduce_to_cover(features, 0.5)
+    assert (unit @ unit[made.rows].T).max(axis=1).min() >= 0.5
+
+
 def test_a_cover_is_the_same_however_features_are_divided(rng: np.random.Generator) -> None:
     features, whole = redundant_rows(rng, 3000), CoverReduction(16, 0.8)
     whole.add(features)
@@ -93,6 +111,17 @@ def test_equal_directions_are_one_component_whatever_their_length(reduce: object
     assert reduce(features, threshold).rows.tolist() == [0]
     assert reduce(features[:1], threshold).rows.tolist() == [0]
     assert reduce(features, threshold).coverage == 1
+
+
+@pytest.mark.parametrize("reduce", [reduce_as_published, reduce_to_cover])
+def test_at_a_threshold_of_one_every_direction_is_a_component_and_in_use(
+    rng: np.random.Generator, reduce: object
+) -> None:
+    """Though the product of a row with itself may round to less than 1."""
+    assert callable(reduce)
+    made = reduce(rng.normal(size=(300, 17)).astype(np.float32), 1.0)
+    assert made.rows.tolist() == list(range(300))
+    assert made.coverage == 1
 
 
 @pytest.mark.parametrize("reduce", [reduce_as_published, reduce_to_cover])

@@ -323,7 +323,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(prepared: MemoryScene, tmp_path
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"channels": 0}, "channels: expected 1 or more"),
+        ({"channels": 0}, "channels: expected 1 to 1,024, got 0"),
         ({"points": 0}, "points: expected 1 or more"),
         ({"temperature": 0.0}, "temperature: expected a positive number"),
         ({"min_alpha": 0.0}, "min_alpha: expected a number in"),

@@ -205,13 +205,15 @@ def _memory_of(memories: Mapping[str | None, QueryMemory], space: str) -> QueryM
     Raises:
         InputError: there is none of this name, or there are several and none is named.
     """
-    by_name = {name or memory.space.name: memory for name, memory in memories.items()}
-    by_name |= {memory.space.name: memory for memory in memories.values()}
     if not space and len(memories) == 1:
         return next(iter(memories.values()))
+    by_name = {name or memory.space.name: memory for name, memory in memories.items()}
+    for memory in memories.values():
+        by_name.setdefault(memory.space.name, memory)
     if space not in by_name:
-        got = f", got {space!r}" if space else ""
-        raise InputError(f"space: the folder has memories of {', '.join(by_name)}; expected one of them{got}")
+        names = ", ".join(name or memory.space.name for name, memory in memories.items())
+        wanted = f"expected one of them, got {space!r}" if space else "name one of them"
+        raise InputError(f"space: the folder has memories of {names}; {wanted}")
     return by_name[space]
 
 

@@ -26,6 +26,7 @@ from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene
 
+DEFAULT_ERROR = 0.01
 CODED = ("compact", "index")
 """Forms whose features are codes, which gsencoder alone reads; their words are float16."""
 
@@ -55,7 +56,7 @@ class PackConfig(CommonConfig):
         },
     )
     error: float = field(
-        default=0.01,
+        default=DEFAULT_ERROR,
         metadata={
             "help": "largest mean loss of centered cosine, over Gaussians and over kinds of features, for form=compact"
         },
@@ -74,7 +75,7 @@ class PackConfig(CommonConfig):
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
         if not 0 < self.error < 1:
             raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
-        if self.error != PackConfig.error and self.form != "compact":
+        if self.error != DEFAULT_ERROR and self.form != "compact":
             raise InputError(f"error: is the budget of form=compact, and form={self.form} has none; leave it out")
         if self.index != IndexConfig() and self.form != "index":
             raise InputError(f"index: has the settings of form=index, and form={self.form} takes none; leave them out")

@@ -39,7 +39,7 @@ class FromPoseConfig:
     """How words are found in a view.
 
     Attributes:
-        mode: cosines after removing each side's mean ("centred"), or as they are ("raw").
+        mode: cosines after removing each side's mean ("centered"), or as they are ("raw").
         threshold: relevancy from which on something relevant is visible; it is taken over all Gaussians of the scene,
             so that a word whose best Gaussians are elsewhere is not visible here.
         min_alpha: a pixel counts where the Gaussians that have features are at least so opaque: what is fainter is
@@ -49,14 +49,14 @@ class FromPoseConfig:
         blend: accuracy of the rendering.
     """
 
-    mode: Mode = "centred"
+    mode: Mode = "centered"
     threshold: ThresholdConfig = field(default_factory=ThresholdConfig)
     min_alpha: float = 0.5
     stride: int | None = None
     blend: BlendConfig = field(default_factory=BlendConfig)
 
     def __post_init__(self) -> None:
-        if self.mode not in ("centred", "raw"):
+        if self.mode not in ("centered", "raw"):
             raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
         if not 0 < self.min_alpha <= 1:
             raise InputError(f"min_alpha: expected a number in (0, 1], got {self.min_alpha}")
@@ -155,6 +155,8 @@ class FeatureField:
         Raises:
             InputError: no such view, or the blend of other Gaussians or pixels.
         """
+        if not -len(cameras) <= view < len(cameras):
+            raise InputError(f"view: expected 0 to {len(cameras) - 1}, got {view}")
         stride = self.stride_in(cameras, view)
         if b is None:
             b = blend(self.gaussians, cameras, view, stride=stride, config=self.config.blend)

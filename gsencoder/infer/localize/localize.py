@@ -28,8 +28,8 @@ class LocalizeConfig:
     """How words become boxes. Relative lengths are in units of the scene's spacing
     (`gsencoder.data.seeding.spacing.scene_spacing`)."""
 
-    mode: Literal["centred", "raw"] = field(
-        default="centred", metadata={"help": "cosines after removing each side's mean, or as they are"}
+    mode: Literal["centered", "raw"] = field(
+        default="centered", metadata={"help": "cosines after removing each side's mean, or as they are"}
     )
     contrast: bool = field(
         default=False,
@@ -77,7 +77,7 @@ class LocalizeConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.mode not in ("centred", "raw"):
+        if self.mode not in ("centered", "raw"):
             raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
         if self.extent not in ("means", "sigma"):
             raise InputError(f"extent: expected means or sigma, got {self.extent!r}")

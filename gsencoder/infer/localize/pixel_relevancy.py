@@ -30,7 +30,7 @@ class GaussianProducts:
         axes: their axes.
     """
 
-    def __init__(self, features: GaussianFeatures, mode: Mode = "centred") -> None:
+    def __init__(self, features: GaussianFeatures, mode: Mode = "centered") -> None:
         self.features, self.axes = features, feature_axes(features, mode)
         self._unseen = np.flatnonzero(~features.seen)
         rows = features.features
@@ -113,10 +113,10 @@ class AttendedQueries:
 
     alpha: Float32[np.ndarray, " P"]
 
-    def __init__(self, memory: QueryMemory, b: Blend, mode: Mode = "centred") -> None:
+    def __init__(self, memory: QueryMemory, b: Blend, mode: Mode = "centered") -> None:
         queries, self.alpha = render_queries(memory, b)
         mean = memory.mean.astype(np.float64)
-        removed = mean if mode == "centred" else np.zeros_like(mean)
+        removed = mean if mode == "centered" else np.zeros_like(mean)
         # The weights of the components sum to 1, so that the mean can be taken off the components.
         local = memory.bank.components - removed
         # Features are means of the components: so many axes hold them.
@@ -137,7 +137,7 @@ PixelFeatures = BlendedFeatures | AttendedQueries
 
 
 def pixel_features(
-    products: GaussianProducts, b: Blend, *, memory: QueryMemory | None = None, mode: Mode = "centred"
+    products: GaussianProducts, b: Blend, *, memory: QueryMemory | None = None, mode: Mode = "centered"
 ) -> PixelFeatures:
     """The features at the pixels of a view: of a memory if one is given, else of the Gaussians.
 

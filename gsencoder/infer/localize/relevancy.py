@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64
 from gsencoder.core.errors import InputError
 from gsencoder.types import GaussianFeatures
 
-Mode = Literal["centred", "raw"]
+Mode = Literal["centered", "raw"]
 CHUNK_BYTES = 1 << 25
 MIN_RELATIVE_NORM = 1e-3
 """Share of the mean's norm below which a centered feature is rounding, not direction (float16 files keep 5e-4)."""
@@ -51,10 +51,10 @@ class FeatureAxes:
         return directions if self.axes is None else directions @ self.axes
 
 
-def feature_axes(features: GaussianFeatures, mode: Mode = "centred") -> FeatureAxes:
+def feature_axes(features: GaussianFeatures, mode: Mode = "centered") -> FeatureAxes:
     """The axes of features less their mean, or of raw ones."""
     centered = features.mean.astype(np.float64)
-    removed = centered if mode == "centred" else np.zeros_like(centered)
+    removed = centered if mode == "centered" else np.zeros_like(centered)
     floor = EPS + MIN_RELATIVE_NORM**2 * float(removed @ removed)
     if features.basis is None:
         return FeatureAxes(matrix=None, offset=-removed, axes=None, floor=floor)
@@ -65,10 +65,10 @@ def feature_axes(features: GaussianFeatures, mode: Mode = "centred") -> FeatureA
 
 
 def word_directions(
-    words: Float32[np.ndarray, "Q D"], text_mean: Float32[np.ndarray, " D"], mode: Mode = "centred"
+    words: Float32[np.ndarray, "Q D"], text_mean: Float32[np.ndarray, " D"], mode: Mode = "centered"
 ) -> Float64[np.ndarray, "Q D"]:
     """Words as unit vectors, less the mean of the text side unless `mode` is "raw"."""
-    directions = words.astype(np.float64) - (text_mean if mode == "centred" else 0.0)
+    directions = words.astype(np.float64) - (text_mean if mode == "centered" else 0.0)
     return np.asarray(directions / np.sqrt((directions**2).sum(axis=1, keepdims=True) + EPS))
 
 
@@ -79,7 +79,7 @@ def relevancy(
     *,
     negatives: Float32[np.ndarray, "M D"] | None = None,
     temperature: float = 0.1,
-    mode: Mode = "centred",
+    mode: Mode = "centered",
 ) -> Float32[np.ndarray, "Q N"]:
     """Cosine of every Gaussian's feature with every word, or its contrast with negative words.
 
@@ -115,7 +115,7 @@ def relevancy(
         )
     if not (np.isfinite(words).all() and np.isfinite(text_mean).all()):
         raise InputError("relevancy: expected finite word vectors and text mean, got NaN or Inf")
-    if mode not in ("centred", "raw") or not 0 < temperature < math.inf:
+    if mode not in ("centered", "raw") or not 0 < temperature < math.inf:
         raise InputError(f"relevancy: expected mode centered or raw, temperature > 0, got {mode!r} and {temperature}")
     directions = word_directions(words, text_mean, mode)
     axes = feature_axes(features, mode)

@@ -26,7 +26,9 @@ class _Attention(nn.Module):
     def __init__(self, memory: QueryMemory) -> None:
         super().__init__()
         projection = torch.from_numpy(memory.projection)
-        attention = MemoryAttention(memory.bank, projection, scoring=memory.scoring, temperature=memory.temperature)
+        attention = MemoryAttention(
+            memory.bank, projection, mean=memory.mean, scoring=memory.scoring, temperature=memory.temperature
+        )
         self.cosines = memory.scoring != "dot"
         self.register_buffer("keys", (projection @ attention.keys.T) / memory.temperature)
         self.register_buffer("gram", projection @ projection.T)

@@ -36,16 +36,14 @@ def test_the_defaults_that_help_shows_are_those_of_the_command() -> None:
         assert options[f"train.{name}"].default == getattr(training, name)
 
 
-def test_rows_that_nothing_covers_and_queries_wider_than_features_are_refused(
+def test_rows_that_nothing_covers_and_queries_of_any_width_are_refused(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["memory", str(room), f"out={tmp_path / 'out'}", "teacher=palette", "train.steps=2", "pictures=0"]
     assert "memory.min_alpha: no cell of 2 views of teacher palette is covered to 1" in refusal(
         capsys, *words, "memory.min_alpha=1"
     )
-    assert "memory.channels: expected at most the 11 channels of the features, got 12;" in refusal(
-        capsys, *words, "memory.channels=12", "optimize=false"
-    )
+    assert "memory.channels: expected 1 to 1,024, got 100,000" in refusal(capsys, *words, "memory.channels=100000")
     assert not (tmp_path / "out").exists()
 
 
