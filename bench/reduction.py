@@ -5,12 +5,13 @@
 
 Raw features are those of the teacher's maps of all views, evenly thinned to --rows. The transcription compares chunks
 of 5,000 rows with all others by float32 matrix products on all cores. Each figure of a reduction is the fastest of
---repeats. --maps keeps the teacher's maps for the next time. With --replicas K the cover is made of K noisy copies
-of the features that are given view by view, and its peak memory is printed.
+--repeats. --maps keeps the teacher's maps for the next time. With --replicas K, both reductions are of K noisy copies
+of the features that are given part by part, and their memory is printed.
 """
 
 import argparse
 import resource
+import threading
 import time
 from pathlib import Path
 
@@ -19,11 +20,19 @@ import numpy as np
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.even_indices import even_indices
+from gsencoder.core.files.row_file import RowFile
 from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers.build import build_teacher, words_of
-from gsencoder.memory.reduction import CoverReduction, Reduction, reduce_as_published, reduce_to_cover
+from gsencoder.memory.reduction import (
+    CoverReduction,
+    Reduction,
+    reduce_as_published,
+    reduce_to_cover,
+    reduce_units_as_published,
+    unit_rows,
+)
 
 CHUNK = 5000
 
@@ -79,6 +88,7 @@ def main() -> None:
     print(f"{len(features):,} features of {features.shape[1]} channels")
     if arguments.replicas:
         of_many(features, arguments.thresholds, arguments.replicas)
+        of_many_as_published(features, arguments.thresholds, arguments.replicas)
         return
     print("| θ | algorithm | seconds | × | components | coverage | mean cosine | same set |")
     print("|---|---|---|---|---|---|---|---|")
@@ -118,6 +128,51 @@ def of_many(features: np.ndarray, thresholds: list[float], replicas: int) -> Non
             f"θ = {threshold}: {replicas * len(features):,} features to {len(cover):,} components in "
             f"{time.perf_counter() - start:.1f} s; peak {peak_memory():.0f} MB, {before:.0f} MB before"
         )
+
+
+def of_many_as_published(features: np.ndarray, thresholds: list[float], replicas: int) -> None:
+    """Algorithm 1 over many features in a file that is mapped into memory. Pages of the file are the system's, which
+    drops them when memory is short; what the process holds itself is measured beside them."""
+    for threshold in thresholds:
+        rng, start = np.random.default_rng(0), time.perf_counter()
+        deviation = 0.1 * features.std(axis=0)
+        with RowFile(features.shape[1]) as file:
+            for _ in range(replicas):
+                for part in np.array_split(features, 50):
+                    file.append(unit_rows(part + rng.standard_normal(part.shape, np.float32) * deviation))
+            before = own_memory()
+            watch = MemoryWatch()
+            with watch:
+                made = reduce_units_as_published(file.array(), threshold)
+        print(
+            f"θ = {threshold}, paper: {replicas * len(features):,} features to {len(made.rows):,} components in "
+            f"{time.perf_counter() - start:.1f} s; own memory at most {watch.highest:.0f} MB, {before:.0f} MB before",
+            flush=True,
+        )
+
+
+class MemoryWatch:
+    """The largest own memory of this process while it runs, looked at ten times a second."""
+
+    def __enter__(self) -> "MemoryWatch":
+        self.highest, self._stop = own_memory(), threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+        return self
+
+    def _look(self) -> None:
+        while not self._stop.wait(0.1):
+            self.highest = max(self.highest, own_memory())
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def own_memory() -> float:
+    """Megabytes of this process that are not pages of a file."""
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(status["RssAnon"].split()[0]) / 1e3
 
 
 def peak_memory() -> float:

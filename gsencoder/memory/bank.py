@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.even_indices import even_indices
+from gsencoder.core.files.row_file import RowFile
 from gsencoder.core.runtime.free_memory import free_memory
 from gsencoder.memory.raw_features import MapStream, raw_features
 from gsencoder.memory.reduction import (
@@ -16,7 +17,7 @@ from gsencoder.memory.reduction import (
     CoverReduction,
     check_threshold,
     largest_threshold,
-    reduce_as_published,
+    reduce_units_as_published,
     unit_rows,
 )
 from gsencoder.types import FeatureSpace, MemoryBank
@@ -101,7 +102,7 @@ def build_bank(
     """Reduces the raw features of all maps to a bank.
 
     A cover reads the maps view by view and holds nothing but the bank. The published algorithm compares each feature
-    with all others, and holds all of them.
+    with all others, and keeps all of them in a temporary file.
 
     Args:
         maps: of the scene.
@@ -255,17 +256,27 @@ class _Builder:
         return components + self._mean, np.stack(sources).astype(np.int32)
 
     def _published(self, threshold: float) -> tuple[Float32[np.ndarray, "M D"], Int32[np.ndarray, "M 3"]]:
-        parts = [(rows[directed], cells[directed]) for rows, cells, directed in self._rows()]
-        rows = np.concatenate([np.zeros((0, self._space.channels), np.float32), *(part[0] for part in parts)])
-        sources = np.concatenate([np.zeros((0, 3), np.int32), *(part[1] for part in parts)])
-        if not len(rows):
+        # Each feature is compared with all others: they are in a file, so that no more than a block is held.
+        with RowFile(self._space.channels) as file:
+            for rows, _, directed in self._rows():
+                file.append(unit_rows(rows[directed]))
+            unit = file.array()
+            count = len(unit)
+            chosen = reduce_units_as_published(unit, threshold, drop_last=self._config.drop_last).rows
+            del unit
+        if not count:
             raise self._no_features()
-        chosen = reduce_as_published(rows, threshold, drop_last=self._config.drop_last).rows
         if not len(chosen):
             raise InputError(
-                f"bank.drop_last={self._config.drop_last}: all {len(rows):,} features are in the last, incomplete chunk"
+                f"bank.drop_last={self._config.drop_last}: all {count:,} features are in the last, incomplete chunk"
             )
-        return rows[chosen] + self._mean, sources[chosen]
+        components, sources, start = [], [], 0
+        for rows, cells, directed in self._rows():
+            within = chosen[(chosen >= start) & (chosen < start + int(directed.sum()))] - start
+            components.append(rows[directed][within] + self._mean)
+            sources.append(cells[directed][within])
+            start += int(directed.sum())
+        return np.concatenate(components), np.concatenate(sources)
 
     def _score(
         self, components: Float32[np.ndarray, "M D"], threshold: float

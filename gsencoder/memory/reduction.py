@@ -86,7 +86,13 @@ def reduce_as_published(
         InputError: a threshold outside of (0, 1], or rows without a direction.
     """
     check_threshold(threshold)
-    unit = unit_rows(features)
+    return reduce_units_as_published(unit_rows(features), threshold, drop_last=drop_last, seed=seed)
+
+
+def reduce_units_as_published(
+    unit: Float32[np.ndarray, "n D"], threshold: float, *, drop_last: int = 0, seed: int = 0
+) -> Reduction:
+    """`reduce_as_published` of rows of unit length, such as those of a file that is mapped into memory."""
     count = len(unit)
     candidates = count - count % drop_last if drop_last else count
     used = np.zeros(count, bool)
