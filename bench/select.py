@@ -10,8 +10,8 @@ printed, for its first box and for what it has grown to:
 
     IoU       of the selected and the true Gaussians, over those with a weight of one pixel or more,
     weighted  the same, each Gaussian counting with its weight,
-    kept      the blending weight that true Gaussians have in the object's pixels after the removal of the selected ones,
-              as a share of what they had before,
+    kept      the blending weight that true Gaussians have in the object's pixels after the removal of the selected
+              ones, as a share of what they had before,
     PSNR      between renders before and after, outside of the object's mask dilated by three pixels, over the views
               that were left out and are changed.
 

@@ -1,21 +1,15 @@
 """From the Gaussians of boxes to those of objects."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.infer.select.seeds import Parts
-from gsencoder.infer.select.settings import SelectConfig
+from gsencoder.infer.select.selection import SelectConfig, Votes
 from gsencoder.infer.select.shares import NEIGHBORS, object_shares
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians
-
-if TYPE_CHECKING:
-    from gsencoder.infer.select.votes import Votes
 
 Labels = Int32[np.ndarray, " N"]
 NO_SHARE = -1e9

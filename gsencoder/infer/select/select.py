@@ -13,7 +13,7 @@ from gsencoder.fusion.orbit_views import with_views
 from gsencoder.infer.localize.localize import LocalizeConfig, localize, select_features
 from gsencoder.infer.select.grow import grow
 from gsencoder.infer.select.seeds import box_parts, labels_of_parts, threshold_parts
-from gsencoder.infer.select.settings import SelectConfig, Selection
+from gsencoder.infer.select.selection import SelectConfig, Selection
 from gsencoder.text.encoder import TextEncoder
 from gsencoder.types import Localization, Scene
 

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int32
+from jaxtyping import Int32
 
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.infer.select.selection import Votes
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians
 
@@ -65,20 +66,6 @@ def pixel_labels(b: Blend, labels: Int32[np.ndarray, " N"], count: int) -> Int32
     """The label that dominates each pixel of a view, 0 = none of them."""
     mass, best = label_masses(b, labels, count).max(dim=1)
     return torch.where(mass > DOMINANT * b.alpha, best + 1, 0).int()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Votes:
-    """Blending weight of each Gaussian over the pixels of each label, summed over views; pixels of the whole picture.
-
-    Attributes:
-        present: as the scene is.
-        removed: as it is without the Gaussians that have a label; zeros for these. The pixels keep the labels that
-            they had with them.
-    """
-
-    present: Float32[np.ndarray, "N labels"]
-    removed: Float32[np.ndarray, "N labels"]
 
 
 def votes(

@@ -1,10 +1,10 @@
-"""Settings of a selection, and what a selection is."""
+"""Settings of a selection, what a selection is, and what views tell of Gaussians."""
 
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Int32
+from jaxtyping import Bool, Float32, Int32
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.orbit_views import check_orbits
@@ -89,3 +89,17 @@ class Selection:
     def rest(self) -> Bool[np.ndarray, " N"]:
         """The Gaussians of no word."""
         return np.asarray(self.labels == 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Votes:
+    """Blending weight of each Gaussian over the pixels of each label, summed over views; pixels of the whole picture.
+
+    Attributes:
+        present: as the scene is.
+        removed: as it is without the Gaussians that have a label; zeros for these. The pixels keep the labels that
+            they had with them.
+    """
+
+    present: Float32[np.ndarray, "N labels"]
+    removed: Float32[np.ndarray, "N labels"]
