@@ -14,6 +14,9 @@ from gsencoder.types import Cameras, GaussianFeatures, Gaussians
 Labels = Int32[np.ndarray, " N"]
 NO_SHARE = -1e9
 """Stands for the share of a Gaussian without a feature: below that of every other one."""
+PARTLY, GHOST_WEIGHT = 0.7, 2.0
+"""See `labels_by_pixels`. The smaller both are, the less is left of an object that is taken out, and the more of its
+surroundings goes with it: docs/measurements.md."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,25 +77,37 @@ def labels_by_pixels(
 ) -> Labels:
     """Labels by features, corrected by where the blending weight of the Gaussians falls.
 
-    A Gaussian within reach of a word is taken if the share `config.only` of its weight is on pixels that the word
-    dominates, and loses the word if less than 1 − `config.only` is. One whose feature is to half of `config.share` or
-    more that of the object is also taken if, were the object taken out, most of its weight would be on these pixels:
-    it is a rest of the object, such as a rim or what lies below its surface. A Gaussian without a feature has the label
-    on whose pixels more than half of its weight is. What no view shows stays as it is.
+    A Gaussian with a good part of an object in its feature (`PARTLY` of `config.share` or more) is taken if the share
+    `config.only` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
+    if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much as
+    Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its weight is
+    there. A Gaussian without a feature has the label on whose pixels more than half of its weight is. What no view
+    shows stays as it is.
     """
     labels, possible = candidates.labels, candidates.possible
     rows = np.flatnonzero(possible > 0)
     own, total = _own(votes.present, rows, possible)
     left, total_left = _own(votes.removed, rows, possible)
+    usual = _usual_weights(votes.present, labels)[possible[rows]]
     is_in, known = labels[rows] == possible[rows], seen[rows]
-    rest_of = ~is_in & (total_left > 0) & (left > 0.5) & (candidates.shares[rows] > config.share / 2)
+    partly = known & (candidates.shares[rows] > PARTLY * config.share)
+    ghost = (left > 0.5) & (left * total_left >= GHOST_WEIGHT * usual) & (total_left > 0)
     enough = (total > 0) & np.where(known, own >= config.only, own > 0.5)
     lost = is_in & (total > 0) & np.where(known, own < 1 - config.only, own <= 0.5)
     corrected = labels.copy()
-    taken = rows[enough | rest_of]
+    taken = rows[(partly & (enough | ghost)) | (enough & ~known)]
     corrected[taken] = possible[taken]
     corrected[rows[lost]] = 0
     return corrected
+
+
+def _usual_weights(present: Float32[np.ndarray, "N labels"], labels: Labels) -> Float64[np.ndarray, " labels"]:
+    """The median weight that the Gaussians of each label have on the pixels of their label."""
+    usual = np.zeros(present.shape[1])
+    for label in range(1, present.shape[1]):
+        members = present[labels == label, label]
+        usual[label] = np.median(members) if len(members) else 0.0
+    return usual
 
 
 def _own(weights: Float32[np.ndarray, "N labels"], rows: np.ndarray, possible: Labels) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.infer.localize.localize import describe_absent
 from gsencoder.types import Box, Localization
 
-Parts = tuple[tuple[Int64[np.ndarray, " n"], ...], ...]
+Parts = tuple[tuple[Int64[np.ndarray, " _"], ...], ...]
 """For each word the rows of each of its parts, ascending; a part is a box, or all that is above a threshold."""
 
 

@@ -39,8 +39,8 @@ class SelectConfig:
     only: float = field(
         default=0.9,
         metadata={
-            "help": "a Gaussian within reach is taken, whatever its feature, if so much of its blending weight over "
-            "the views falls on pixels that the object dominates"
+            "help": "a Gaussian whose feature is partly object is taken if so much of its blending weight over the "
+            "views falls on pixels that the object dominates, and lost if no more than the rest of 1 does"
         },
     )
     views: int = field(default=48, metadata={"help": "so many views, evenly spaced, are looked at; 0 = none"})
