@@ -131,9 +131,8 @@ def test_gaussians_without_features_go_with_the_pixels_that_they_are_in() -> Non
 
 
 def test_what_no_view_shows_goes_with_what_is_around_it() -> None:
-    scene = with_more(
-        SCENE, np.concatenate([[MUG + [0.0, 0.0, 0.03]], [MUG * [1, 1, 0] + [0, 0, -0.02]]]), opacity=0.99
-    )
+    inside, below = MUG + np.array([0.0, 0.0, 0.03]), MUG * np.array([1, 1, 0]) - np.array([0.0, 0.0, 0.02])
+    scene = with_more(SCENE, np.stack([inside, below]), opacity=0.99)
     assert chosen(scene).labels[-2:].tolist() == [1, 0]
     # Nor do features and places alone tell anything else.
     assert chosen(scene, config=SelectConfig(views=0)).labels[-2:].tolist() == [1, 0]

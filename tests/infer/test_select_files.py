@@ -38,7 +38,7 @@ def test_labels_read_back_with_names_counts_and_boxes(written: Path) -> None:
     assert [each.file for each in made.names] == [None, "mug.ply", None]
     assert made.names[0].aabb_min is None
     for each in made.names[1:]:
-        members = SCENE.gaussians.means[LABELS == each.label] + SCENE.origin
+        members = SCENE.gaussians.means[np.flatnonzero(each.label == LABELS)] + SCENE.origin
         assert each.aabb_min is not None
         assert each.aabb_max is not None
         assert np.allclose(each.aabb_min, members.min(axis=0), atol=1e-6)

@@ -64,7 +64,7 @@ def test_objects_and_rest_are_the_whole_scene(features: Path, tmp_path: Path) ->
 
 
 def test_the_parts_that_are_asked_for_are_written(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run(features, tmp_path / "a", "query=mug", "write=objects", "format=spz")
     assert names_in(tmp_path / "a") == ["mug.spz", "summary.json"]
@@ -74,7 +74,8 @@ def test_the_parts_that_are_asked_for_are_written(
     assert names_in(tmp_path / "c") == ["labels.json", "labels.ply", "summary.json"]
     assert [each.file for each in read_labels(tmp_path / "c").names] == [None, None]
     capsys.readouterr()
-    assert cli.main(["select", str(features), "query=mug,lamp", f"out={tmp_path / 'd'}"]) == 0
+    monkeypatch.chdir(tmp_path)  # Lines are cut at 200 columns.
+    assert cli.main(["select", str(features), "query=mug,lamp", "out=d"]) == 0
     mug, lamp, where = capsys.readouterr().out.splitlines()[-3:]
     assert mug.startswith("mug: ")
     assert mug.endswith("to start with, mug.ply")
@@ -97,26 +98,17 @@ def test_packages_and_memories_are_selected_from_like_features(features: Path, t
         assert cli.main(["pack", str(features), f"form={form}", f"out={packed}", "quiet=true"]) == 0
         expected[form] = packed
     memory = tmp_path / "memory"
-    bank = MemoryBank(
-        components=EMBEDDINGS,
-        mean=EMBEDDINGS[:3].mean(axis=0),
-        sources=np.full((4, 3), -1, np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (4, 1, 1)),
-        threshold=0.5,
-        coverage=1.0,
-        cosine=1.0,
-        space=SPACE,
-    )
     given = SCENE.features["names"]
+    bank = MemoryBank(
+        components=EMBEDDINGS, sources=np.zeros((4, 3), np.int32), threshold=0.9, mean=given.mean,
+        grid_from_image=np.tile(np.eye(2, 3), (4, 1, 1)), coverage=1.0, cosine=1.0, space=SPACE,
+    )  # fmt: skip
     queries = QueryMemory(
-        queries=given.features[:, :4].copy(),
-        weights=given.weights,
-        projection=np.eye(4, 8, dtype=np.float32),
-        bank=bank,
-        scoring="dot",
-        temperature=0.1,
-    )
-    save_memories(memory, SCENE, queries)
+        queries=given.features - given.mean, weights=given.weights, projection=np.eye(8, dtype=np.float32), bank=bank,
+        scoring="centered", temperature=0.1, mean=given.mean,
+    )  # fmt: skip
+    memory.mkdir()
+    save_memories(memory, replace(SCENE, features={}), {"labels": queries})
     save_text_table(memory / WORDS_FILE, words())
     expected["memory"] = memory
     for form, folder in expected.items():
