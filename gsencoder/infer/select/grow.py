@@ -14,9 +14,9 @@ from gsencoder.types import Cameras, GaussianFeatures, Gaussians
 Labels = Int32[np.ndarray, " N"]
 NO_SHARE = -1e9
 """Stands for the share of a Gaussian without a feature: below that of every other one."""
-PARTLY, GHOST_WEIGHT = 0.7, 2.0
+PARTLY, GHOST_WEIGHT = 0.7, 1.0
 """See `labels_by_pixels`. The smaller both are, the less is left of an object that is taken out, and the more of its
-surroundings goes with it: docs/measurements.md."""
+surroundings goes with it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,8 +79,8 @@ def labels_by_pixels(
 
     A Gaussian with a good part of an object in its feature (`PARTLY` of `config.share` or more) is taken if the share
     `config.only` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
-    if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much as
-    Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its weight is
+    if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much
+    there as Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its weight is
     there. A Gaussian without a feature has the label on whose pixels more than half of its weight is. What no view
     shows stays as it is.
     """

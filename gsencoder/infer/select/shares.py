@@ -20,6 +20,9 @@ GAP = 1.0
 """Gaussians nearer to a part than so many spacings are rims, and do not stand for its surroundings."""
 SURROUNDINGS = 2.0
 """Surroundings go as far as so many times the reach."""
+RIM = 2.0
+"""Gaussians of a part that are farther than so many spacings from all others are inside of the object, whatever their
+feature: the surface of a real table has features of many things."""
 NEIGHBORS = 8
 """So many nearest Gaussians give the feature of the object, or of its surroundings, at a place."""
 BLOCK_BYTES = 1 << 26
@@ -47,8 +50,8 @@ def object_shares(
         same: the Gaussians of all parts of the word, which are no surroundings.
 
     Returns:
-        The candidates, ascending, and their shares: about 0 to 1, NaN for those without features. Where there are no
-        surroundings with features the share is 1: nothing else is there.
+        The candidates, ascending, and their shares: about 0 to 1, NaN for those without features. It is 1 for what is
+        inside of the part, and where there are no surroundings with features: nothing else is there.
     """
     from scipy.spatial import cKDTree
 
@@ -63,12 +66,18 @@ def object_shares(
     candidates = near[distances <= reach * spacing]
     around = (distances > GAP * spacing) & (distances <= margin) & (features.weights[near] > 0)
     surroundings = np.setdiff1d(near[around], same, assume_unique=True)
+    # What is as relevant as the part, but too small or sparse for a box of its own, does not stand for something else.
+    surroundings = surroundings[relevancy[surroundings] < relevancy[core].min()]
     shares = np.full(len(candidates), np.nan)
     known = np.flatnonzero(features.weights[candidates] > 0)
     if not len(surroundings):
         shares[known] = 1.0
         return candidates, shares
-    core = core[relevancy[core] >= np.quantile(relevancy[core], CORE_QUANTILE)]
+    others = np.setdiff1d(near, same, assume_unique=True)
+    depths = np.asarray(cKDTree(points[others]).query(points[rows])[0])
+    inside = rows[depths > RIM * spacing]
+    pure = core[relevancy[core] >= np.quantile(relevancy[core], CORE_QUANTILE)]
+    core = np.union1d(pure, np.intersect1d(core, inside))
     trees = [(cKDTree(points[pure]), pure) for pure in (core, surroundings)]
     step = max(1, BLOCK_BYTES // (8 * NEIGHBORS * features.features.shape[1]))
     for start in range(0, len(known), step):
@@ -81,6 +90,7 @@ def object_shares(
         # Where object and surroundings have one feature, a Gaussian is what it started as.
         alike = np.isin(asked, rows).astype(np.float64)
         shares[block] = np.divide(along, length, out=alike, where=length > 1e-12 * (a**2 + b**2).sum(axis=1))
+    shares[np.isin(candidates, inside)] = 1.0
     return candidates, shares
 
 
