@@ -110,6 +110,42 @@ def test_shares_do_not_change_when_features_are_scaled_and_shifted() -> None:
     assert np.allclose(shares(features), shares(moved), atol=1e-4)
 
 
+def test_what_is_inside_of_an_object_stays_and_what_is_as_relevant_is_no_surroundings() -> None:
+    rng = np.random.default_rng(2)
+    side = np.arange(0.0, 1.0, 0.02)
+    table = np.stack([*np.meshgrid(side, side), np.zeros((50, 50))], axis=-1).reshape(-1, 3)
+    table += rng.normal(size=table.shape) * 0.0005
+    taken = table[:, 0] < 0.5
+    vectors = np.where(taken[:, None], np.eye(4)[0], np.eye(4)[1])
+    relevancy = vectors[:, 0].copy()
+    # In the middle of the object are a few Gaussians with the feature of something else, that were taken,
+    stain = np.linalg.norm(table - [0.25, 0.5, 0], axis=1) < 0.05
+    vectors[stain] = np.eye(4)[2]
+    # and beside it some with its own, that were not.
+    spot = (np.abs(table[:, 0] - 0.54) < 0.02) & (np.abs(table[:, 1] - 0.5) < 0.1)
+    vectors[spot], relevancy[spot] = np.eye(4)[0], 1.0
+    space = replace(SCENE.features["names"].space, channels=4)
+    features = GaussianFeatures(
+        features=vectors.astype(np.float32),
+        weights=np.ones(len(table), np.float32),
+        mean=np.zeros(4, np.float32),
+        space=space,
+    )
+    rows = np.flatnonzero(taken)
+    candidates, shares = object_shares(
+        features,
+        table.astype(np.float32),
+        rows,
+        relevancy.astype(np.float32),
+        spacing=0.02,
+        reach=4.0,
+        same=rows,
+    )
+    found = np.zeros(len(table), bool)
+    found[candidates] = shares > 0.5
+    assert (found == (taken | spot)).all()
+
+
 def test_an_object_with_nothing_around_it_is_all_object() -> None:
     features, gaussians = SCENE.features["names"], SCENE.gaussians
     assert gaussians is not None

@@ -80,9 +80,9 @@ def labels_by_pixels(
     A Gaussian with a good part of an object in its feature (`PARTLY` of `config.share` or more) is taken if the share
     `config.only` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
     if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much
-    there as Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its weight is
-    there. A Gaussian without a feature has the label on whose pixels more than half of its weight is. What no view
-    shows stays as it is.
+    there as Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its
+    weight is there. A Gaussian without a feature has the label on whose pixels more than half of its weight is. What no
+    view shows stays as it is.
     """
     labels, possible = candidates.labels, candidates.possible
     rows = np.flatnonzero(possible > 0)

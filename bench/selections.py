@@ -1,12 +1,12 @@
 """Selected Gaussians beside the true ones of labeled rooms, and what is left of an object that was taken out.
 
-    python bench/select.py ROOM … [--weights house_cpu] [--every 4] [--alone]
+    python bench/selections.py ROOM … [--weights house_cpu] [--every 4] [--alone]
 
 Every n-th view of a room is left out; the others give seeds, and features of the labels teacher, and of an encoder.
-The names of the small objects that are seen well enough are selected together, each by its first box (--alone: each by
-a call of its own). The truth of a Gaussian is the instance on whose pixels most of its blending weight falls in the
-views that were left out; as in fusion, entries that measured depth says are hidden do not count. For each object are
-printed, for its first box and for what it has grown to:
+The names of the small objects that are seen well enough are selected together (--alone: each by a call of its own), and
+compared with the objects of that name. The truth of a Gaussian is the instance on whose pixels most of its blending
+weight falls in the views that were left out; as in fusion, entries that measured depth says are hidden do not count.
+For each object are printed, for its first box and for what it has grown to:
 
     IoU       of the selected and the true Gaussians, over those with a weight of one pixel or more,
     weighted  the same, each Gaussian counting with its weight,
@@ -133,16 +133,15 @@ def score(
     asked = replace(scene, features={features.space.name: features})
     names = list(dict.fromkeys(target.name for target in targets if target.name))
     found = {}
-    # A word without a box has no box of number 0; its object counts with an IoU of 0.
     for group in [[name] for name in names] if alone else [names]:
-        selection, localization = select(asked, group, words, boxes=())
+        selection, localization = select(asked, group, words)
         for number, name in enumerate(group):
             first = [box for box in localization.boxes if box.query == name][:1]
             seeds = np.zeros(len(scene.gaussians), bool)
             if first:
                 seeds[first[0].rows] = True
             found[name] = (seeds, selection.labels == number + 1)
-    figures = defaultdict(list)
+    figures: dict[str, list[float]] = defaultdict(list)
     for target in targets:
         assert target.name is not None
         true = truth.labels == target.id
