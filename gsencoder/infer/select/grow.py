@@ -81,8 +81,8 @@ def labels_by_pixels(
     `config.only` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
     if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much
     there as Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its
-    weight is there. A Gaussian without a feature has the label on whose pixels more than half of its weight is. What no
-    view shows stays as it is.
+    weight is there. A Gaussian without a feature has the label on whose pixels more than half of its weight is, or,
+    where no view shows it, would be if the objects were taken out. What no view would show stays as it is.
     """
     labels, possible = candidates.labels, candidates.possible
     rows = np.flatnonzero(possible > 0)
@@ -92,10 +92,12 @@ def labels_by_pixels(
     is_in, known = labels[rows] == possible[rows], seen[rows]
     partly = known & (candidates.shares[rows] > PARTLY * config.share)
     ghost = (left > 0.5) & (left * total_left >= GHOST_WEIGHT * usual) & (total_left > 0)
-    enough = (total > 0) & np.where(known, own >= config.only, own > 0.5)
+    shown = (total > 0) & (own >= config.only)
+    # What is hidden now is judged by the views in which it would appear.
+    featureless = ~known & (np.where(total > 0, own, left) > 0.5)
     lost = is_in & (total > 0) & np.where(known, own < 1 - config.only, own <= 0.5)
     corrected = labels.copy()
-    taken = rows[(partly & (enough | ghost)) | (enough & ~known)]
+    taken = rows[(partly & (shown | ghost)) | featureless]
     corrected[taken] = possible[taken]
     corrected[rows[lost]] = 0
     return corrected
@@ -175,6 +177,6 @@ def grow(
         chosen = sampling(cameras, views=config.views, pixels=config.pixels)
         found = votes(gaussians, cameras, labels, len(parts), chosen, spacing=spacing, track=track)
         labels = labels_by_pixels(candidates, features.seen, found, config)
-        unknown = unknown & (found.present.sum(axis=1) == 0)
+        unknown = unknown & (found.present.sum(axis=1) + found.removed.sum(axis=1) == 0)
         looked = len(chosen.views)
     return labels_of_hidden(gaussians, labels, candidates.possible, unknown, spacing), looked
