@@ -272,7 +272,7 @@ def test_a_mug_on_a_table_that_ends_below_it_leaves_a_hole() -> None:
     ("asked", "options", "message"),
     [
         (("mug",), {"boxes": (0,), "threshold": 0.5}, "box= and threshold= are two ways"),
-        (("mug",), {"boxes": (7,)}, r"box=7: 'mug' has 1 boxes, 0 to 0"),
+        (("mug",), {"boxes": (7,)}, r"box=7: 'mug' has one box, number 0"),
         (("mug",), {"boxes": (-1,)}, "box=-1"),
         (("lamp",), {"boxes": (0,)}, r"box=0: 'lamp' has no box: absent"),
         (("mug",), {"threshold": 1.5}, r"threshold: expected a relevancy in \[-1, 1\]"),

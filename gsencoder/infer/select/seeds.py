@@ -30,7 +30,8 @@ def box_parts(localization: Localization, ranks: Sequence[int], *, probable: flo
         boxes = [box for box in localization.boxes if box.query == word]
         for rank in ranks:
             if not 0 <= rank < len(boxes):
-                has = f"{len(boxes)} boxes, 0 to {len(boxes) - 1}" if boxes else "no box"
+                several = f"{len(boxes)} boxes, 0 to {len(boxes) - 1}"
+                has = "no box" if not boxes else "one box, number 0" if len(boxes) == 1 else several
                 why = "" if boxes else f": {describe_absent(localization.absent[word])}"
                 raise InputError(f"box={rank}: {word!r} has {has}{why}")
         chosen = [boxes[rank] for rank in dict.fromkeys(ranks)] if ranks else _probable(boxes, probable)

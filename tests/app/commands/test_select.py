@@ -147,7 +147,7 @@ def test_names_of_objects_lead_to_safe_names_of_files(tmp_path: Path) -> None:
     [
         ([], "query= is missing"),
         (["query=mug", "box=0", "threshold=0.5"], "box= and threshold= are two ways"),
-        (["query=mug", "box=3"], "box=3: 'mug' has 1 boxes, 0 to 0"),
+        (["query=mug", "box=3"], "box=3: 'mug' has one box, number 0"),
         (["query=mug", "box=-1"], "box: expected numbers from 0, got -1"),
         (["query=mug", "threshold=2"], "threshold: expected a relevancy in [-1, 1], got 2"),
         (["query=mug", "threshold=-1", "select.grow=false"], "is selected, so nothing is left"),
