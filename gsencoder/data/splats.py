@@ -23,7 +23,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.data.splat_formats.compressed_ply import is_compressed, morton_order, packed_bytes, read_compressed
 from gsencoder.data.splat_formats.dotsplat import read_dotsplat
-from gsencoder.data.splat_formats.ply import read_header, read_inria, write_inria
+from gsencoder.data.splat_formats.ply import read_header, read_inria, read_property, write_inria
 from gsencoder.data.splat_formats.raw import (
     RawSplat,
     logits_from_opacities,
@@ -35,7 +35,7 @@ from gsencoder.data.splat_formats.sog import read_sog_folder, read_sog_zip
 from gsencoder.data.splat_formats.spz import GZIP_MAGIC, MAGIC, read_spz, write_spz
 from gsencoder.types import Gaussians
 
-__all__ = ["RawSplat", "fingerprint", "gaussians_from_raw", "load_splat", "read_raw", "save_splat"]
+__all__ = ["RawSplat", "fingerprint", "gaussians_from_raw", "load_property", "load_splat", "read_raw", "save_splat"]
 
 READABLE = ".ply, .compressed.ply, .spz, .splat, .sog or a SOG folder"
 WRITABLE = ".ply, .compressed.ply or .spz"
@@ -161,6 +161,28 @@ def _read_file(path: Path, size: int) -> RawSplat:
     known = {".ply": "'ply'", ".spz": "'NGSP' or gzip", ".sog": "a zip"}
     expected = f"a {suffix} starts with {known[suffix]}" if suffix in known else f"expected {READABLE}"
     raise InputError(f"{path}: starts with {start!r}, which no known splat format does; {expected}")
+
+
+def load_property(path: str | Path, name: str) -> Float64[np.ndarray, " N"]:
+    """One value for each Gaussian that a .ply holds beside those of a splat (see `further` of `save_splat`).
+
+    Args:
+        path: a .ply file.
+        name: of the property.
+
+    Raises:
+        InputError: no such file or property, or it is damaged.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as stream:
+            if stream.read(4)[:3] != b"ply":
+                raise InputError(f"{path}: is no .ply, and only these have further properties")
+            stream.seek(0)
+            size = os.fstat(stream.fileno()).st_size
+            return read_property(path, stream, read_header(path, stream), size, name)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def save_splat(

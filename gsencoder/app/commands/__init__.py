@@ -63,6 +63,11 @@ COMMANDS = {
             name="localize", config="LocalizeCommandConfig", help="find words in a scene: boxes, scores and pictures"
         ),
         Command(
+            name="select",
+            config="SelectCommandConfig",
+            help="write the Gaussians of words as splats of their own, the scene without them, and labels",
+        ),
+        Command(
             name="views",
             config="ViewsCommandConfig",
             help="choose and render the views that show best what a word stands for",

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splat_formats.raw import SH_COEFFICIENTS, RawSplat
@@ -169,6 +169,28 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
         sh=sh,
         format=f"INRIA .ply, {header.encoding}",
     )
+
+
+def read_property(path: Path, stream: BinaryIO, header: PlyHeader, size: int, name: str) -> Float64[np.ndarray, " N"]:
+    """One property of the element `vertex`.
+
+    Raises:
+        InputError: there is none of this name, or the file is truncated.
+    """
+    vertex = header.element("vertex")
+    if vertex is None or vertex.dtype is None or name not in (vertex.dtype.names or ()):
+        raise InputError(f"{path}: the .ply has no property {name!r}")
+    if header.encoding == "ascii":
+        return np.asarray(_ascii_rows(path, stream, header, vertex, size)[name], np.float64)
+    stream.seek(element_start(path, header, "vertex", size))
+    values = np.empty(vertex.count, np.float64)
+    for start in range(0, vertex.count, _BLOCK):
+        stop = min(start + _BLOCK, vertex.count)
+        block = np.fromfile(stream, vertex.dtype, stop - start)
+        if len(block) < stop - start:
+            raise InputError(f"{path}: ended while it was read, at row {start + len(block):,} of {vertex.count:,}")
+        values[start:stop] = block[name]
+    return values
 
 
 def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElement, size: int) -> np.ndarray:

@@ -1,0 +1,209 @@
+"""Selected Gaussians beside the true ones of labeled rooms, and what is left of an object that was taken out.
+
+    python bench/selections.py ROOM … [--weights house_cpu] [--every 4] [--alone]
+
+Every n-th view of a room is left out; the others give seeds, and features of the labels teacher, and of an encoder.
+The names of the small objects that are seen well enough are selected together (--alone: each by a call of its own), and
+compared with the objects of that name. The truth of a Gaussian is the instance on whose pixels most of its blending
+weight falls in the views that were left out; as in fusion, entries that measured depth says are hidden do not count.
+For each object are printed, for its first box and for what it has grown to:
+
+    IoU       of the selected and the true Gaussians, over those with a weight of one pixel or more,
+    weighted  the same, each Gaussian counting with its weight,
+    kept      the blending weight that true Gaussians have in the object's pixels after the removal of the selected
+              ones, as a share of what they had before,
+    PSNR      between renders before and after, outside of the object's mask dilated by three pixels, over the views
+              that were left out and are changed.
+
+`other views` is the IoU that the views that were not left out reach themselves, if their own instance maps label the
+Gaussians: no selection from features of these views can be expected to be better.
+"""
+
+import argparse
+import time
+import warnings
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_dilation
+
+from gsencoder.core.errors import SceneWarning
+from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.seed import with_gaussians
+from gsencoder.data.seeding.spacing import unit_of
+from gsencoder.evaluate.boxes import queryable_objects
+from gsencoder.fusion.fuse import fuse
+from gsencoder.fusion.teachers.build import build_teacher, words_of
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
+from gsencoder.infer.load_encoder import load_encoder
+from gsencoder.infer.select.select import select
+from gsencoder.render import Blend, blend
+from gsencoder.render.images import render_image
+from gsencoder.text.build import Words
+from gsencoder.types import GaussianFeatures, Gaussians, Scene, SceneObject, Views
+
+MIN_WEIGHT = 1.0
+"""Pixels that a Gaussian must cover for its label to count."""
+MARGIN = 3
+"""Pixels by which masks are dilated."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Truth:
+    """What some views say of the Gaussians.
+
+    Attributes:
+        labels: the instance of each, 0 = none.
+        weights: its visible blending weight, pixels.
+    """
+
+    labels: np.ndarray
+    weights: np.ndarray
+
+
+def truth_of(gaussians: Gaussians, views: Views, blends: Sequence[Blend] | None, instances: int) -> Truth:
+    """The instance on whose pixels most of each Gaussian's visible blending weight falls."""
+    assert views.instances is not None
+    assert views.depths is not None
+    sums = torch.zeros(len(gaussians), instances)
+    for view in range(len(views)):
+        b = blends[view] if blends is not None else blend(gaussians, views.cameras, view)
+        codes = torch.from_numpy(np.asarray(views.instances[view]).astype(np.int32).ravel())
+        keep_visible(b, views.depths[view], VisibilityConfig()).lift_codes_into(codes, sums)
+    found = sums.numpy()
+    return Truth(labels=found.argmax(axis=1), weights=found.sum(axis=1))
+
+
+def ious(selected: np.ndarray, true: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
+    """IoU over the Gaussians that are shown well enough, and weighted IoU over all."""
+    shown = weights >= MIN_WEIGHT
+    count = (selected & true & shown).sum() / max(1, ((selected | true) & shown).sum())
+    return float(count), float(weights[selected & true].sum() / max(weights[selected | true].sum(), 1e-9))
+
+
+def removal(
+    gaussians: Gaussians, views: Views, blends: Sequence[Blend], selected: np.ndarray, true: np.ndarray, instance: int
+) -> tuple[float, float]:
+    """What is kept of an object, and the PSNR outside of it."""
+    assert views.instances is not None
+    rest = gaussians.select(~selected)
+    left = torch.from_numpy(true[~selected].astype(np.float32))
+    marked, given = (torch.from_numpy(each.astype(np.float32)) for each in (true, selected))
+    before = after = error = 0.0
+    pixels = 0
+    for view, b in enumerate(blends):
+        mask = np.asarray(views.instances[view]) == instance
+        inside = torch.from_numpy(mask.ravel())
+        before += float(b.render(marked)[inside].sum())
+        if not (b.render(given) > 1e-3).any():
+            after += float(b.render(marked)[inside].sum())
+            continue
+        without = blend(rest, views.cameras, view)
+        after += float(without.render(left)[inside].sum())
+        outside = ~binary_dilation(mask, iterations=MARGIN) if mask.any() else ~mask
+        pictures = [
+            render_image(splat, views.cameras, view, blended=each).astype(np.float64) / 255
+            for splat, each in ((gaussians, b), (rest, without))
+        ]
+        error += float(((pictures[0] - pictures[1])[outside] ** 2).mean(axis=1).sum())
+        pixels += int(outside.sum())
+    psnr = 10 * np.log10(max(pixels, 1) / max(error, 1e-12 * max(pixels, 1)))
+    return after / max(before, 1e-9), float(psnr)
+
+
+def score(
+    scene: Scene,
+    left_out: Views,
+    features: GaussianFeatures,
+    words: Words,
+    targets: Sequence[SceneObject],
+    truth: Truth,
+    blends: Sequence[Blend],
+    *,
+    alone: bool,
+) -> dict[str, list[float]]:
+    """The figures of each object, by their name."""
+    assert scene.gaussians is not None
+    asked = replace(scene, features={features.space.name: features})
+    names = list(dict.fromkeys(target.name for target in targets if target.name))
+    found = {}
+    for group in [[name] for name in names] if alone else [names]:
+        selection, localization = select(asked, group, words)
+        for number, name in enumerate(group):
+            first = [box for box in localization.boxes if box.query == name][:1]
+            seeds = np.zeros(len(scene.gaussians), bool)
+            if first:
+                seeds[first[0].rows] = True
+            found[name] = (seeds, selection.labels == number + 1)
+    figures: dict[str, list[float]] = defaultdict(list)
+    for target in targets:
+        assert target.name is not None
+        true = truth.labels == target.id
+        for kind, selected in zip(("first box", "selected"), found[target.name], strict=True):
+            count, weighted = ious(selected, true, truth.weights)
+            figures[f"{kind}, IoU"].append(count)
+            figures[f"{kind}, weighted"].append(weighted)
+        kept, psnr = removal(scene.gaussians, left_out, blends, selected, true, target.id)
+        figures["kept"].append(kept)
+        figures["PSNR"].append(psnr)
+    return dict(figures)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("rooms", nargs="+", type=Path)
+    parser.add_argument("--weights", default="house_cpu")
+    parser.add_argument("--every", type=int, default=4)
+    parser.add_argument("--alone", action="store_true")
+    arguments = parser.parse_args()
+    retain_freed_memory()
+    warnings.simplefilter("ignore", SceneWarning)
+    words, encoder = words_of(LabelsConfig()), load_encoder(arguments.weights)
+    assert words is not None
+    totals: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for path in arguments.rooms:
+        start = time.perf_counter()
+        scene = load_scene(path)
+        assert scene.views is not None
+        out = list(range(arguments.every // 2, len(scene.views), arguments.every))
+        left_out = scene.views.select(out)
+        kept = [view for view in range(len(scene.views)) if view not in out]
+        scene = with_gaussians(replace(scene, views=scene.views.select(kept)))
+        assert scene.gaussians is not None
+        assert scene.views is not None
+        targets = queryable_objects(scene.objects)
+        blends = [blend(scene.gaussians, left_out.cameras, view) for view in range(len(left_out))]
+        instances = max(each.id for each in scene.objects) + 1
+        truth = truth_of(scene.gaussians, left_out, blends, instances)
+        others = truth_of(scene.gaussians, scene.views, None, instances)
+        for target in targets:
+            count, weighted = ious(others.labels == target.id, truth.labels == target.id, truth.weights)
+            totals["other views"]["IoU"].append(count)
+            totals["other views"]["weighted"].append(weighted)
+        unit = unit_of(scene, encoder.voxel)
+        sources = {
+            "fused": fuse(scene, build_teacher(LabelsConfig(), scene, words)).features,
+            "encoded": encoder.encode(scene.gaussians, metres_per_unit=unit),
+        }
+        for name, features in sources.items():
+            figures = score(scene, left_out, features, words, targets, truth, blends, alone=arguments.alone)
+            for key, values in figures.items():
+                totals[name][key] += values
+            listing = ", ".join(f"{key} {np.mean(values):.3f}" for key, values in figures.items())
+            print(f"{scene.name} {name}: {len(targets)} objects, {listing}", flush=True)
+        print(f"{scene.name}: {time.perf_counter() - start:.0f} s", flush=True)
+    print("\n| features | figure | mean | median | worst |\n|---|---|---|---|---|")
+    for name, table in totals.items():
+        for key, values in table.items():
+            worst = max(values) if key == "kept" else min(values)
+            print(f"| {name} | {key} | {np.mean(values):.3f} | {np.median(values):.3f} | {worst:.3f} |")
+
+
+if __name__ == "__main__":
+    main()

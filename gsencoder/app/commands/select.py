@@ -1,0 +1,214 @@
+"""`gsencoder select FEATURES query=…`: objects as splats of their own, the scene without them, and labels."""
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.printable import one_line
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.json_values import write_json
+from gsencoder.core.runtime.threads import import_ahead
+from gsencoder.data.splats import save_splat
+from gsencoder.data.up import with_up
+from gsencoder.fusion.store.folder import load_features
+from gsencoder.infer.localize.localization_json import words_to_json
+from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent
+from gsencoder.infer.select.file_names import file_stems
+from gsencoder.infer.select.labels_file import LABELS_JSON, LABELS_PLY, labels_to_json, write_labels
+from gsencoder.infer.select.select import select
+from gsencoder.infer.select.selection import SelectConfig, Selection
+from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.types import Scene
+
+Part = Literal["objects", "rest", "labels"]
+Format = Literal["ply", "compressed.ply", "spz"]
+REST, HOLES = "rest", "holes.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SelectCommandConfig(CommonConfig):
+    """Settings of `select`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
+    )
+    query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
+    queries: str = field(default="", metadata={"help": "a text file with one query a line"})
+    box: tuple[int, ...] = field(
+        default=(),
+        metadata={
+            "help": "numbers of the boxes of each word that are taken, best first from 0, as in boxes.json; empty = "
+            "the most probable one, and those nearly as probable"
+        },
+    )
+    threshold: float | None = field(
+        default=None, metadata={"help": "all Gaussians from this relevancy on, instead of boxes"}
+    )
+    write: tuple[Part, ...] = field(
+        default=("objects", "rest", "labels"),
+        metadata={
+            "help": "objects = a splat of each word alone; rest = the scene without them, and the holes that they "
+            "leave; labels = the whole scene with the property label, and labels.json"
+        },
+    )
+    format: Format = field(default="ply", metadata={"help": "of the objects and the rest: ply, compressed.ply or spz"})
+    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
+    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
+    head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
+            "features themselves are"
+        },
+    )
+    select: SelectConfig = field(default_factory=SelectConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
+
+    def __post_init__(self) -> None:
+        if len(self.paths) > 1:
+            raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        if not self.write or not set(self.write) <= set(get_args(Part)):
+            raise InputError(
+                f"write: expected some of {', '.join(get_args(Part))}, got {', '.join(self.write) or 'none'}"
+            )
+        if self.format not in get_args(Format):
+            raise InputError(f"format: expected one of {', '.join(get_args(Format))}, got {self.format!r}")
+        if self.box and self.threshold is not None:
+            raise InputError("box= and threshold= are two ways to choose where a selection starts; give one of them")
+        if self.threshold is not None and not -1 <= self.threshold <= 1:
+            raise InputError(f"threshold: expected a relevancy in [-1, 1], got {self.threshold}")
+        if any(number < 0 for number in self.box):
+            raise InputError(f"box: expected numbers from 0, got {', '.join(map(str, self.box))}")
+
+
+def run(config: SelectCommandConfig, summary: Summary) -> None:
+    """Finds the Gaussians of each word and writes them, what is left, and the labels."""
+    folder = Path(config.paths[0])
+    words = query_words(config.query, config.queries)
+    import_ahead("torch")
+    with summary.step("load"):
+        scene = load_features(folder)
+        # Features of earlier versions may lie in a scene whose up nobody estimated.
+        scene, _ = with_up(scene)
+        asked, table = asked_scene(
+            scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
+        )
+    track = Progress(quiet=config.quiet)
+    with summary.step("select"):
+        selection, localization = select(
+            asked,
+            words,
+            table,
+            config.select,
+            boxes=config.box,
+            threshold=config.threshold,
+            localization=config.localize,
+            track=track,
+        )
+    out = config.out or Path("outputs") / scene.name / "selection"
+    files = _files(selection, config)
+    summary.results.update(
+        space=next(iter(asked.features.values())).space.describe(),
+        metres_per_unit=scene.metres_per_unit,
+        words=words_to_json(localization),
+        seeds=[int((selection.seeds == number + 1).sum()) for number in range(len(words))],
+        views=selection.views,
+        placed_cameras=selection.placed,
+        selection=labels_to_json(scene, selection, files),
+    )
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
+        with summary.step("write"):
+            _write(target, scene, selection, files, config)
+        if "rest" in config.write and scene.views is not None and config.select.views:
+            with summary.step("holes"):
+                summary.results["holes"] = _holes(scene, selection, config.select, track)
+            write_json(target / HOLES, summary.results["holes"])
+    screen = console(config.quiet)
+    for number, word in enumerate(words):
+        screen.print(f"{one_line(word)}: {_describe(selection, number, localization.absent, files)}")
+    screen.print(f"{out}: {_listing(selection, config, files, summary.results.get('holes'))}")
+
+
+def _files(selection: Selection, config: SelectCommandConfig) -> dict[int, str]:
+    """The name of the splat of each label that has Gaussians, of those that are written."""
+    names = {}
+    if "rest" in config.write:
+        names[0] = f"{REST}.{config.format}"
+    if "objects" in config.write:
+        stems = file_stems(selection.words, taken=(REST, Path(LABELS_PLY).stem, Path(HOLES).stem, "summary"))
+        names |= {
+            number + 1: f"{stem}.{config.format}" for number, stem in enumerate(stems) if len(selection.rows(number))
+        }
+    return names
+
+
+def _write(
+    target: Path, scene: Scene, selection: Selection, files: dict[int, str], config: SelectCommandConfig
+) -> None:
+    assert scene.gaussians is not None
+    for label, name in files.items():
+        save_splat(target / name, scene.gaussians.select(selection.labels == label), origin=scene.origin)
+    if "labels" in config.write:
+        write_labels(target, scene, selection, files)
+
+
+def _holes(scene: Scene, selection: Selection, config: SelectConfig, track: Progress) -> dict[str, Any]:
+    """The holes of each view that has one, and of all views together, as JSON values."""
+    # The matrix of a view needs torch.
+    from gsencoder.infer.select.holes import find_holes
+    from gsencoder.infer.select.votes import sampling
+
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    chosen = sampling(scene.views.cameras, views=config.views, pixels=config.pixels)
+    holes = find_holes(scene.gaussians, scene.views.cameras, ~selection.rest, chosen, track=track)
+    rows = [asdict(hole) | {"view": scene.views.names[hole.view]} for hole in holes if hole.pixels]
+    return {
+        "views": len(chosen.views),
+        "views_with_objects": len(holes),
+        "views_with_holes": len(rows),
+        "pixels": sum(hole.pixels for hole in holes),
+        "removed": sum(hole.removed for hole in holes),
+        "largest_area": max((hole.area for hole in holes), default=0.0),
+        "by_view": rows,
+    }
+
+
+def _describe(selection: Selection, number: int, absent: dict[str, float], files: dict[int, str]) -> str:
+    count = len(selection.rows(number))
+    if not count:
+        word = selection.words[number]
+        return describe_absent(absent[word]) if word in absent else "no Gaussians"
+    seeds = int(np.count_nonzero(selection.seeds == number + 1))
+    named = f", {files[number + 1]}" if number + 1 in files else ""
+    return f"{count:,} Gaussians, from {seeds:,} to start with{named}"
+
+
+def _listing(
+    selection: Selection, config: SelectCommandConfig, files: dict[int, str], holes: dict[str, Any] | None
+) -> str:
+    parts = []
+    if "objects" in config.write:
+        objects = sum(label > 0 for label in files)
+        parts.append("1 object" if objects == 1 else f"{objects} objects")
+    if "rest" in config.write:
+        parts.append(f"{files[0]} of {int(selection.rest.sum()):,} Gaussians")
+    if "labels" in config.write:
+        parts.append(f"{LABELS_PLY} and {LABELS_JSON}")
+    text = ", ".join(parts)
+    if holes is not None:
+        share = holes["pixels"] / max(holes["removed"], 1)
+        text += (
+            f"; nothing is behind {share:.0%} of the removed pixels in {holes['views_with_objects']} views, at most "
+            f"{holes['largest_area']:.3g} square units in one"
+        )
+    return text

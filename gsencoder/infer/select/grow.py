@@ -1,0 +1,182 @@
+"""From the Gaussians of boxes to those of objects."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32
+
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.infer.select.seeds import Parts
+from gsencoder.infer.select.selection import SelectConfig, Votes
+from gsencoder.infer.select.shares import NEIGHBORS, object_shares
+from gsencoder.types import Cameras, GaussianFeatures, Gaussians
+
+Labels = Int32[np.ndarray, " N"]
+NO_SHARE = -1e9
+"""Stands for the share of a Gaussian without a feature: below that of every other one."""
+PARTLY, GHOST_WEIGHT = 0.7, 1.0
+"""See `labels_by_pixels`. The smaller both are, the less is left of an object that is taken out, and the more of its
+surroundings goes with it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidates:
+    """What features and places say of each Gaussian.
+
+    Attributes:
+        labels: by the features.
+        possible: the label that it could have by its place; 0 = out of reach of every word.
+        shares: of the object of that label in its feature; −∞ where no label is possible, `NO_SHARE` without a feature.
+    """
+
+    labels: Labels
+    possible: Labels
+    shares: Float64[np.ndarray, " N"]
+
+
+def labels_by_features(
+    gaussians: Gaussians,
+    features: GaussianFeatures,
+    parts: Parts,
+    relevancy: Float32[np.ndarray, "Q N"],
+    config: SelectConfig,
+    spacing: float,
+) -> Candidates:
+    """The label of each Gaussian by its feature, and the label that it could have by its place.
+
+    A Gaussian has the word of whose objects its feature has the largest share, if that is above `config.share`. By its
+    place it could be of a word of which a part is within reach; of several, that whose share is the largest, or the
+    first where it has no feature.
+    """
+    count = len(gaussians)
+    labels, possible = np.zeros(count, np.int32), np.zeros(count, np.int32)
+    best = np.full(count, -np.inf)
+    for number, groups in enumerate(parts):
+        same = np.unique(np.concatenate(groups)) if groups else np.zeros(0, np.int64)
+        for rows in groups:
+            candidates, shares = object_shares(
+                features,
+                gaussians.means,
+                rows,
+                relevancy[number],
+                spacing=spacing,
+                reach=config.reach,
+                same=same,
+            )
+            shares = np.nan_to_num(shares, nan=NO_SHARE)
+            better = shares > best[candidates]
+            chosen = candidates[better]
+            best[chosen], possible[chosen] = shares[better], number + 1
+    taken = best > config.share
+    labels[taken] = possible[taken]
+    return Candidates(labels=labels, possible=possible, shares=best)
+
+
+def labels_by_pixels(
+    candidates: Candidates, seen: Bool[np.ndarray, " N"], votes: Votes, config: SelectConfig
+) -> Labels:
+    """Labels by features, corrected by where the blending weight of the Gaussians falls.
+
+    A Gaussian with a good part of an object in its feature (`PARTLY` of `config.share` or more) is taken if the share
+    `config.only` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
+    if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much
+    there as Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its
+    weight is there. A Gaussian without a feature has the label on whose pixels more than half of its weight is, or,
+    where no view shows it, would be if the objects were taken out. What no view would show stays as it is.
+    """
+    labels, possible = candidates.labels, candidates.possible
+    rows = np.flatnonzero(possible > 0)
+    own, total = _own(votes.present, rows, possible)
+    left, total_left = _own(votes.removed, rows, possible)
+    usual = _usual_weights(votes.present, labels)[possible[rows]]
+    is_in, known = labels[rows] == possible[rows], seen[rows]
+    partly = known & (candidates.shares[rows] > PARTLY * config.share)
+    ghost = (left > 0.5) & (left * total_left >= GHOST_WEIGHT * usual) & (total_left > 0)
+    shown = (total > 0) & (own >= config.only)
+    # What is hidden now is judged by the views in which it would appear.
+    featureless = ~known & (np.where(total > 0, own, left) > 0.5)
+    lost = is_in & (total > 0) & np.where(known, own < 1 - config.only, own <= 0.5)
+    corrected = labels.copy()
+    taken = rows[(partly & (shown | ghost)) | featureless]
+    corrected[taken] = possible[taken]
+    corrected[rows[lost]] = 0
+    return corrected
+
+
+def _usual_weights(present: Float32[np.ndarray, "N labels"], labels: Labels) -> Float64[np.ndarray, " labels"]:
+    """The median weight that the Gaussians of each label have on the pixels of their label."""
+    usual = np.zeros(present.shape[1])
+    for label in range(1, present.shape[1]):
+        members = present[labels == label, label]
+        usual[label] = np.median(members) if len(members) else 0.0
+    return usual
+
+
+def _own(weights: Float32[np.ndarray, "N labels"], rows: np.ndarray, possible: Labels) -> tuple[np.ndarray, np.ndarray]:
+    """The share of the weight that is on the pixels of the label that is possible, 0 without weight; and the weight."""
+    total = weights[rows].sum(axis=1)
+    own = weights[rows, possible[rows]]
+    return np.divide(own, total, out=np.zeros_like(own), where=total > 0), total
+
+
+def labels_of_hidden(
+    gaussians: Gaussians, labels: Labels, possible: Labels, unknown: Bool[np.ndarray, " N"], spacing: float
+) -> Labels:
+    """Labels in which Gaussians that neither features nor views tell anything of have the label of those around them.
+
+    A Gaussian of `unknown` within reach of a word gets the word if more than half of its nearest Gaussians that are
+    known have it and the nearest of these is within two spacings.
+    """
+    from scipy.spatial import cKDTree
+
+    rows = np.flatnonzero(unknown & (possible > 0))
+    known = np.flatnonzero(~unknown)
+    if not len(rows) or not len(known):
+        return labels
+    points = gaussians.means.astype(np.float64)
+    distances, nearest = cKDTree(points[known]).query(points[rows], k=min(NEIGHBORS, len(known)))
+    distances, nearest = distances.reshape(len(rows), -1), nearest.reshape(len(rows), -1)
+    agreeing = (labels[known[nearest]] == possible[rows][:, None]).mean(axis=1)
+    corrected = labels.copy()
+    taken = (agreeing > 0.5) & (distances[:, 0] <= 2 * spacing)
+    corrected[rows] = np.where(taken, possible[rows], 0)
+    return corrected
+
+
+def grow(
+    gaussians: Gaussians,
+    features: GaussianFeatures,
+    cameras: Cameras | None,
+    parts: Parts,
+    relevancy: Float32[np.ndarray, "Q N"],
+    config: SelectConfig,
+    spacing: float,
+    *,
+    track: Track = untracked,
+) -> tuple[Labels, int]:
+    """The labels of all Gaussians, and how many views were looked at.
+
+    Args:
+        gaussians: the splat.
+        features: of the space in which the words were asked.
+        cameras: that look at it; None = features and places alone decide.
+        parts: what each word's selection starts with.
+        relevancy: of each word.
+        config: see there.
+        spacing: of the scene, world units.
+        track: progress over the views.
+    """
+    candidates = labels_by_features(gaussians, features, parts, relevancy, config, spacing)
+    labels = candidates.labels
+    unknown = ~features.seen
+    looked = 0
+    if cameras is not None and config.views and len(cameras):
+        # The matrix of a view needs torch, which all else does without.
+        from gsencoder.infer.select.votes import sampling, votes
+
+        chosen = sampling(cameras, views=config.views, pixels=config.pixels)
+        found = votes(gaussians, cameras, labels, len(parts), chosen, spacing=spacing, track=track)
+        labels = labels_by_pixels(candidates, features.seen, found, config)
+        unknown = unknown & (found.present.sum(axis=1) + found.removed.sum(axis=1) == 0)
+        looked = len(chosen.views)
+    return labels_of_hidden(gaussians, labels, candidates.possible, unknown, spacing), looked

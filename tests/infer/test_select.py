@@ -1,0 +1,315 @@
+"""Selections of Gaussians by words: laws, and what is taken along or left."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from selected_rooms import BOOK, MUG, NAMES, circling, permuted, selected_room, splat_of, with_more, words
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.orbits import looking_cameras
+from gsencoder.infer.select.holes import find_holes
+from gsencoder.infer.select.seeds import labels_of_parts, threshold_parts
+from gsencoder.infer.select.select import select
+from gsencoder.infer.select.selection import SelectConfig, Selection
+from gsencoder.infer.select.shares import object_shares
+from gsencoder.infer.select.votes import sampling, votes
+from gsencoder.render import blend
+from gsencoder.types import FeatureBasis, GaussianFeatures, Scene
+
+SCENE, KINDS = selected_room()
+
+
+def chosen(scene: Scene = SCENE, *asked: str, config: SelectConfig = SelectConfig(), **options: object) -> Selection:
+    return select(scene, asked or ("mug",), words(), config, **options)[0]  # type: ignore[arg-type]
+
+
+def test_an_object_is_selected_with_its_rims_and_without_what_it_stands_on() -> None:
+    selection = chosen()
+    assert ((selection.labels == 1) == (KINDS == 0)).all()
+    assert selection.views == 8
+    assert not selection.placed
+
+
+def test_several_words_give_a_labelling_of_the_scene_and_none_where_no_word_fits() -> None:
+    selection = chosen(SCENE, "book", "mug")
+    assert (selection.labels == np.array([2, 1, 0])[KINDS]).all()
+    everything_but_the_mug = chosen(SCENE, "table", "book")
+    assert (everything_but_the_mug.labels[KINDS == 0] == 0).all()
+
+
+def test_the_order_of_the_gaussians_does_not_matter() -> None:
+    order = np.random.default_rng(3).permutation(len(KINDS))
+    moved = chosen(permuted(SCENE, order), "book", "mug")
+    assert (moved.labels == chosen(SCENE, "book", "mug").labels[order]).all()
+
+
+def test_the_order_of_the_words_changes_numbers_alone() -> None:
+    one, other = chosen(SCENE, "book", "mug").labels, chosen(SCENE, "mug", "book").labels
+    assert (np.array([0, 2, 1])[one] == other).all()
+
+
+def test_a_larger_threshold_never_selects_more_seeds() -> None:
+    config = SelectConfig(grow=False)
+    before = np.ones(len(KINDS), bool)
+    for threshold in (-1.0, 0.0, 0.2, 0.4, 0.6, 0.8, 0.94):
+        try:
+            seeds = chosen(SCENE, config=config, threshold=threshold).labels > 0
+        except InputError as error:
+            assert threshold == -1.0
+            assert "every one of the" in str(error)
+            continue
+        assert not (seeds & ~before).any()
+        before = seeds
+    assert before.any()
+    assert not before.all()
+
+
+@pytest.mark.parametrize("basis", [False, True])
+def test_shares_of_mixtures_are_the_shares_that_were_mixed(basis: bool) -> None:
+    rng = np.random.default_rng(7)
+    n = 400
+    means = rng.uniform(size=(n, 3)).astype(np.float32) * [4, 1, 1]
+    true = np.clip((means[:, 0] - 1) / 2, 0, 1)
+    a, b = rng.normal(size=(2, 8))
+    features = SCENE.features["names"]
+    mixed = (true[:, None] * a + (1 - true[:, None]) * b).astype(np.float32)
+    space = features.space
+    axes = np.eye(8, dtype=np.float32)
+    made = GaussianFeatures(
+        features=mixed,
+        weights=np.ones(n, np.float32),
+        mean=np.zeros(8, np.float32),
+        space=space,
+        basis=FeatureBasis(mean=np.zeros(8, np.float32), components=axes, energy_kept=1.0, space=space)
+        if basis
+        else None,
+    )
+    rows = np.flatnonzero(true > 0.6)
+    candidates, shares = object_shares(
+        made, means.astype(np.float32), rows, true.astype(np.float32), spacing=0.4, reach=5.0, same=rows
+    )
+    pure = (true[candidates] == 1) | (true[candidates] == 0)
+    assert np.allclose(shares[pure], true[candidates][pure], atol=0.35)
+    order = np.argsort(true[candidates])
+    assert np.corrcoef(shares[order], true[candidates][order])[0, 1] > 0.95
+
+
+def test_shares_do_not_change_when_features_are_scaled_and_shifted() -> None:
+    features, gaussians = SCENE.features["names"], SCENE.gaussians
+    assert gaussians is not None
+    rows = np.flatnonzero(KINDS == 0)
+    relevancy = features.features[:, 0]
+
+    def shares(made: GaussianFeatures) -> np.ndarray:
+        return object_shares(made, gaussians.means, rows, relevancy, spacing=0.02, reach=4.0, same=rows)[1]
+
+    moved = replace(features, features=(features.features * 3 + np.arange(8)).astype(np.float32))
+    assert np.allclose(shares(features), shares(moved), atol=1e-4)
+
+
+def test_what_is_inside_of_an_object_stays_and_what_is_as_relevant_is_no_surroundings() -> None:
+    rng = np.random.default_rng(2)
+    side = np.arange(0.0, 1.0, 0.02)
+    table = np.stack([*np.meshgrid(side, side), np.zeros((50, 50))], axis=-1).reshape(-1, 3)
+    table += rng.normal(size=table.shape) * 0.0005
+    taken = table[:, 0] < 0.5
+    vectors = np.where(taken[:, None], np.eye(4)[0], np.eye(4)[1])
+    relevancy = vectors[:, 0].copy()
+    # In the middle of the object are a few Gaussians with the feature of something else, that were taken,
+    stain = np.linalg.norm(table - [0.25, 0.5, 0], axis=1) < 0.05
+    vectors[stain] = np.eye(4)[2]
+    # and beside it some with its own, that were not.
+    spot = (np.abs(table[:, 0] - 0.54) < 0.02) & (np.abs(table[:, 1] - 0.5) < 0.1)
+    vectors[spot], relevancy[spot] = np.eye(4)[0], 1.0
+    space = replace(SCENE.features["names"].space, channels=4)
+    features = GaussianFeatures(
+        features=vectors.astype(np.float32),
+        weights=np.ones(len(table), np.float32),
+        mean=np.zeros(4, np.float32),
+        space=space,
+    )
+    rows = np.flatnonzero(taken)
+    candidates, shares = object_shares(
+        features,
+        table.astype(np.float32),
+        rows,
+        relevancy.astype(np.float32),
+        spacing=0.02,
+        reach=4.0,
+        same=rows,
+    )
+    found = np.zeros(len(table), bool)
+    found[candidates] = shares > 0.5
+    assert (found == (taken | spot)).all()
+
+
+def test_an_object_with_nothing_around_it_is_all_object() -> None:
+    features, gaussians = SCENE.features["names"], SCENE.gaussians
+    assert gaussians is not None
+    rows = np.flatnonzero(KINDS == 0)
+    alone = replace(features, features=features.features[rows], weights=features.weights[rows])
+    one = np.arange(len(rows))
+    _, shares = object_shares(
+        alone, gaussians.means[rows], one, np.ones(len(rows), np.float32), spacing=0.02, reach=4.0, same=one
+    )
+    assert (shares == 1).all()
+
+
+def test_gaussians_without_features_go_with_the_pixels_that_they_are_in() -> None:
+    mug = MUG + np.array([[0.0, 0.0, 0.075]])  # A half-transparent floater above the mug,
+    table = np.array([[-0.1, -0.1, 0.01]])  # one on the table within reach of it,
+    far = np.array([[-0.35, -0.35, 0.01]])  # and one out of reach.
+    scene = with_more(SCENE, np.concatenate([mug, table, far]), opacity=0.3)
+    assert chosen(scene).labels[-3:].tolist() == [1, 0, 0]
+
+
+def test_what_no_view_shows_goes_with_what_is_around_it() -> None:
+    inside, below = MUG + np.array([0.0, 0.0, 0.03]), MUG * np.array([1, 1, 0]) - np.array([0.0, 0.0, 0.02])
+    scene = with_more(SCENE, np.stack([inside, below]), opacity=0.99)
+    assert chosen(scene).labels[-2:].tolist() == [1, 0]
+    # Nor do features and places alone tell anything else.
+    assert chosen(scene, config=SelectConfig(views=0)).labels[-2:].tolist() == [1, 0]
+
+
+def test_without_growing_the_gaussians_of_the_boxes_are_taken() -> None:
+    selection, found = select(SCENE, ("mug", "book"), words(), SelectConfig(grow=False))
+    assert (selection.labels == selection.seeds).all()
+    assert selection.views == 0
+    for number in (0, 1):
+        boxes = [box.rows for box in found.boxes if box.query == selection.words[number]]
+        assert set(selection.rows(number).tolist()) <= set(np.concatenate(boxes).tolist())
+
+
+def test_a_gaussian_that_several_words_take_goes_to_the_most_relevant_one_and_the_first_of_equal_ones() -> None:
+    relevancy = np.array([[0.9, 0.4, 0.7, np.nan], [0.8, 0.6, 0.7, np.nan]], np.float32)
+    parts = threshold_parts(("a", "b"), relevancy, 0.3)
+    assert labels_of_parts(parts, relevancy).tolist() == [1, 2, 1, 0]
+
+
+def test_a_splat_without_views_is_looked_at_from_placed_cameras() -> None:
+    with pytest.warns(SceneWarning, match="has no views; the selection is checked from 6 cameras"):
+        selection = chosen(replace(SCENE, views=None), config=SelectConfig(orbits=6))
+    assert selection.placed
+    assert ((selection.labels == 1) == (KINDS == 0)).mean() > 0.99
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        alone = chosen(replace(SCENE, views=None), config=SelectConfig(views=0))
+    assert alone.views == 0
+    assert ((alone.labels == 1) == (KINDS == 0)).mean() > 0.99
+
+
+def test_votes_are_the_blending_weights_of_the_views() -> None:
+    gaussians, cameras = SCENE.gaussians, circling(count=3)
+    assert gaussians is not None
+    every = sampling(cameras, views=3, pixels=10_000)
+    found = votes(gaussians, cameras, (KINDS == 0).astype(np.int32), 1, every, spacing=np.inf)
+    expected = sum(blend(gaussians, cameras, view).lift(torch.ones(96 * 72)) for view in range(3))
+    assert np.allclose(found.present.sum(axis=1), np.asarray(expected), rtol=1e-4, atol=1e-4)
+    # What has no label covers no less when that which has one is gone; what has one is gone.
+    left = KINDS != 0
+    assert (found.removed.sum(axis=1)[left] >= found.present.sum(axis=1)[left] - 1e-3).all()
+    assert not found.removed[~left].any()
+    # Without a label nothing is removed.
+    nothing = votes(gaussians, cameras, np.zeros(len(KINDS), np.int32), 1, every, spacing=0.02)
+    assert (nothing.present == nothing.removed).all()
+    assert not nothing.present[:, 1].any()
+
+
+def test_fewer_pixels_give_about_the_same_votes() -> None:
+    gaussians, cameras = SCENE.gaussians, circling(count=3)
+    assert gaussians is not None
+    labels = (KINDS == 0).astype(np.int32)
+    fine, coarse = (
+        votes(gaussians, cameras, labels, 1, sampling(cameras, views=3, pixels=pixels), spacing=0.02).present.sum(
+            axis=0
+        )
+        for pixels in (10_000, 2_000)
+    )
+    assert np.allclose(fine, coarse, rtol=0.1)
+
+
+def test_a_hole_is_what_was_opaque_and_is_not_with_its_area_at_the_depth_that_it_had() -> None:
+    side = np.arange(-0.2, 0.2001, 0.01)
+    square = np.stack([*np.meshgrid(side, side), np.zeros((41, 41))], axis=-1).reshape(-1, 3)
+    wall = np.stack([*np.meshgrid(side * 6, side * 6), np.full((41, 41), -0.5)], axis=-1).reshape(-1, 3)
+    camera = looking_cameras(
+        np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]]), np.array([0.0, 1.0, 0.0]), 100.0, 100, 80
+    )
+    gaussians = replace(splat_of(square), scales=np.full((len(square), 3), 0.006, np.float32))
+    every = sampling(camera, views=1, pixels=10_000)
+    (hole,) = find_holes(gaussians, camera, square[:, 0] > -0.199, every)
+    # Seen from above, 0.4 × 0.4 units; the Gaussians at the edge reach a little beyond.
+    assert hole.area == pytest.approx(0.16, rel=0.1)
+    assert hole.pixels == pytest.approx(1600, rel=0.1)
+    assert hole.pixels * 1e-4 == pytest.approx(hole.area, rel=1e-3)
+    behind = splat_of(np.concatenate([square, wall]))
+    behind = replace(behind, scales=np.repeat(np.float32([[0.006], [0.06]]), len(square), axis=0).repeat(3, axis=1))
+    removed = np.arange(len(behind)) < len(square)
+    (covered,) = find_holes(behind, camera, removed, every)
+    assert covered.pixels == 0
+    assert covered.area == 0
+    assert covered.removed == pytest.approx(1700, rel=0.1)
+    assert find_holes(behind, camera, np.zeros(len(behind), bool), every) == []
+
+
+def test_a_mug_on_a_table_that_ends_below_it_leaves_a_hole() -> None:
+    open_table, kinds = selected_room(under=False)
+    assert open_table.gaussians is not None
+    assert open_table.views is not None
+    cameras = open_table.views.cameras
+    every = sampling(cameras, views=8, pixels=10_000)
+    holes = find_holes(open_table.gaussians, cameras, kinds == 0, every)
+    assert sum(hole.pixels for hole in holes) > 100
+    assert SCENE.gaussians is not None
+    closed = find_holes(SCENE.gaussians, cameras, KINDS == 0, every)
+    assert sum(hole.pixels for hole in closed) < 0.1 * sum(hole.pixels for hole in holes)
+
+
+@pytest.mark.parametrize(
+    ("asked", "options", "message"),
+    [
+        (("mug",), {"boxes": (0,), "threshold": 0.5}, "box= and threshold= are two ways"),
+        (("mug",), {"boxes": (7,)}, r"box=7: 'mug' has one box, number 0"),
+        (("mug",), {"boxes": (-1,)}, "box=-1"),
+        (("lamp",), {"boxes": (0,)}, r"box=0: 'lamp' has no box: absent"),
+        (("mug",), {"threshold": 1.5}, r"threshold: expected a relevancy in \[-1, 1\]"),
+        (("lamp",), {"threshold": 0.99}, "no Gaussian is as relevant; the best are 'lamp'"),
+        (("lamp",), {}, r"no Gaussian of table is selected; absent: 'lamp' \(probability"),
+        (("mug",), {"threshold": -1.0}, "every one of the .* Gaussians of table is selected"),
+        (("teapot",), {}, "teapot"),
+        (tuple(f"word {number}" for number in range(65)), {}, "at most 64 words"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_what_cannot_be_selected_is_refused(asked: tuple[str, ...], options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        chosen(SCENE, *asked, config=SelectConfig(grow=False), **options)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"share": 0.0},
+        {"share": 1.0},
+        {"share": float("nan")},
+        {"probable": 1.1},
+        {"only": 0.4},
+        {"reach": -1.0},
+        {"reach": float("inf")},
+        {"views": -1},
+        {"pixels": 0},
+        {"orbits": 0},
+    ],
+)
+def test_settings_out_of_their_range_are_refused(settings: dict[str, float]) -> None:
+    (name,) = settings
+    with pytest.raises(InputError, match=name):
+        SelectConfig(**settings)  # type: ignore[arg-type]
+
+
+def test_the_names_that_the_tests_use_are_those_of_the_scene() -> None:
+    assert NAMES[:3] == ("mug", "book", "table")
+    assert not np.allclose(MUG, BOOK)

@@ -1,0 +1,109 @@
+"""A table with two boxes on it, whose features fade at their edges, that tests of selections stand on."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsencoder.data.orbits import looking_cameras
+from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
+
+NAMES = ("mug", "book", "table", "lamp")
+EMBEDDINGS = np.eye(4, 8, dtype=np.float32)
+STEP = 0.02
+UP = np.array([0.0, 0.0, 1.0])
+MUG, BOOK = np.array([0.0, 0.0, 0.05]), np.array([0.25, 0.1, 0.04])
+SPACE = FeatureSpace(name="names", channels=8, teacher="labels", text_encoder="table")
+
+
+def words() -> TextTable:
+    return make_text_table(NAMES, EMBEDDINGS, "table")
+
+
+def shell(center: np.ndarray, half: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
+    """Points on the surface of a box without a bottom, a little off a grid, so that no two distances are equal."""
+    axes = [np.arange(-size, size + 1e-9, STEP) for size in half]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    outer = (np.abs(grid[:, :2]) >= np.array(half[:2]) - STEP / 2).any(axis=1) | (grid[:, 2] >= half[2] - STEP / 2)
+    return center + grid[outer] + rng.normal(size=(outer.sum(), 3)) * STEP / 40
+
+
+def splat_of(means: np.ndarray, opacities: np.ndarray | float = 0.99) -> Gaussians:
+    n = len(means)
+    return Gaussians(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        scales=np.full((n, 3), 0.6 * STEP, np.float32),
+        opacities=np.broadcast_to(np.float32(opacities), (n,)).copy(),
+        sh=np.random.default_rng(1).normal(size=(n, 1, 3)).astype(np.float32),
+    )
+
+
+def circling(center: np.ndarray = MUG, count: int = 8, distance: float = 0.7) -> Cameras:
+    """Cameras above the table, around a point."""
+    turns = 2 * np.pi * (np.arange(count) + 0.3) / count
+    offsets = np.stack([np.cos(turns), np.sin(turns), np.full(count, 0.8)], axis=1) * distance
+    forward = -offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    return looking_cameras(center + offsets, forward, UP, 90.0, 96, 72)
+
+
+def selected_room(*, under: bool = True) -> tuple[Scene, np.ndarray]:
+    """The scene, and the name of each Gaussian as a number; `under`: whether the table goes on below the boxes."""
+    rng = np.random.default_rng(0)
+    mug, book = shell(MUG, (0.04, 0.04, 0.05), rng), shell(BOOK, (0.06, 0.04, 0.03), rng)
+    side = np.arange(-0.4, 0.6, STEP)
+    table = np.stack([*np.meshgrid(side, side), np.zeros((len(side), len(side)))], axis=-1).reshape(-1, 3)
+    table += rng.normal(size=table.shape) * STEP / 40
+    if not under:
+        table = table[np.abs(table[:, :2] - MUG[:2]).max(axis=1) > 0.05]
+    means = np.concatenate([mug, book, table])
+    kinds = np.repeat([0, 1, 2], [len(mug), len(book), len(table)])
+    vectors = EMBEDDINGS[kinds].astype(np.float64)
+    # The table has some of the mug near it, and the lowest Gaussians of the mug some of the table.
+    near = (kinds == 2) & (np.linalg.norm(means - MUG * [1, 1, 0], axis=1) < 0.07)
+    low = (kinds == 0) & (means[:, 2] < 0.015)
+    vectors[near] = 0.3 * EMBEDDINGS[0] + 0.7 * EMBEDDINGS[2]
+    vectors[low] = 0.65 * EMBEDDINGS[0] + 0.35 * EMBEDDINGS[2]
+    features = GaussianFeatures(
+        features=vectors.astype(np.float32),
+        weights=np.ones(len(means), np.float32),
+        mean=EMBEDDINGS[:3].mean(axis=0),
+        space=SPACE,
+    )
+    cameras = circling()
+    views = Views(cameras=cameras, names=tuple(f"frame {number:02d}" for number in range(len(cameras))))
+    scene = Scene(
+        name="table",
+        gaussians=splat_of(means),
+        views=views,
+        features={"names": features},
+        origin=np.array([1000.0, -20.0, 3.0]),
+        up=UP,
+        metres_per_unit=1.0,
+    )
+    return scene, kinds
+
+
+def with_more(scene: Scene, means: np.ndarray, *, opacity: float) -> Scene:
+    """The scene with further Gaussians that have no features, at the end."""
+    gaussians, features = scene.gaussians, scene.features["names"]
+    assert gaussians is not None
+    more = splat_of(means, opacity)
+    joined = {
+        name: np.concatenate([getattr(gaussians, name), getattr(more, name)])
+        for name in ("means", "quats", "scales", "opacities", "sh")
+    }
+    padded = replace(
+        features,
+        features=np.concatenate([features.features, np.zeros((len(means), 8), np.float32)]),
+        weights=np.concatenate([features.weights, np.zeros(len(means), np.float32)]),
+    )
+    return replace(scene, gaussians=Gaussians(**joined), features={"names": padded})
+
+
+def permuted(scene: Scene, order: np.ndarray) -> Scene:
+    """The same scene with its Gaussians in another order."""
+    assert scene.gaussians is not None
+    features = scene.features["names"]
+    moved = replace(features, features=features.features[order], weights=features.weights[order])
+    return replace(scene, gaussians=scene.gaussians.select(order), features={"names": moved})
