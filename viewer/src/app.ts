@@ -248,7 +248,8 @@ export class App {
     const rows = this.shown.flatMap((shown) =>
       shown.boxes.map((box) => ({
         text: several ? `${shown.scene.meta.title}: ${box.word}` : box.word,
-        detail: detailOf(box, shown.scene),
+        side: box.probability === null ? "" : box.probability.toFixed(2),
+        detail: sizeOf(box, shown.scene),
         chosen: box === this.chosenBox,
         choose: () => void this.chooseBox(box),
       })),
@@ -349,7 +350,8 @@ export class App {
     const step = Math.max(1, Math.ceil(rows.length / SAMPLED_ROWS));
     rows = rows.filter((_, place) => place % step === 0);
     const radius = Math.hypot(...box.size) / 2;
-    const detail = `${this.position(shown, box.center)} · ${detailOf(box, shown.scene)}`;
+    const probable = box.probability === null ? "" : `\nprobability ${box.probability.toFixed(2)}, score ${box.score.toFixed(2)}`;
+    const detail = `${this.position(shown, box.center)}\n${sizeOf(box, shown.scene)}${probable}`;
     await this.describe(shown, rows, box.center, radius, box.word, detail);
   }
 
@@ -429,9 +431,8 @@ function holds(box: FoundBox, point: ArrayLike<number>): boolean {
   });
 }
 
-function detailOf(box: FoundBox, scene: Scene): string {
+function sizeOf(box: FoundBox, scene: Scene): string {
   const unit = scene.meta.metresPerUnit;
-  const size = box.size.map((side) => (unit ? side * unit : side).toFixed(2)).join(" × ") + (unit ? " m" : "");
-  const probable = box.probability === null ? "" : ` · probability ${box.probability.toFixed(2)}`;
-  return `${size}${probable}`;
+  const sides = box.size.map((side) => (unit ? side * unit : side).toFixed(2)).join(" × ");
+  return `${sides}${unit ? " m" : ""}, ${box.count.toLocaleString("en")} Gaussians`;
 }

@@ -109,9 +109,9 @@ export function paintWord(
     const at = 4 * row;
     const grey = 0.299 * (base[at] as number) + 0.587 * (base[at + 1] as number) + 0.114 * (base[at + 2] as number);
     // NaN compares false: what was never seen stays grey.
-    const mix = value >= threshold ? 0.85 : value > 0 ? 0.3 : 0;
-    const color = table[Math.max(0, Math.min(LEVELS - 1, Math.round((mix ? value : 0) * (LEVELS - 1))))] as Rgb;
-    const dim = mix > 0.5 ? grey : 0.55 * grey;
+    const mix = value >= threshold ? 0.85 : value > 0 ? 0.4 * (value / threshold) ** 2 : 0;
+    const color = table[Math.max(0, Math.min(LEVELS - 1, Math.round((value > 0 ? value : 0) * (LEVELS - 1))))] as Rgb;
+    const dim = value >= threshold ? grey : 0.6 * grey;
     rgba[at] = mix * color[0] + (1 - mix) * dim;
     rgba[at + 1] = mix * color[1] + (1 - mix) * dim;
     rgba[at + 2] = mix * color[2] + (1 - mix) * dim;

@@ -16,6 +16,7 @@ export function make<K extends keyof HTMLElementTagNameMap>(
 
 export interface BoxRow {
   text: string;
+  side: string;
   detail: string;
   chosen: boolean;
   choose: () => void;
@@ -60,7 +61,7 @@ export class Panel {
   private readonly modes = new Map<Mode, HTMLButtonElement>();
   private readonly legend = make("div", "legend");
   private readonly boxList = make("div", "list");
-  private readonly chosen = make("section", "chosen");
+  private readonly chosen = make("section", "selected");
   private readonly viewSelect = make("select");
   private readonly moves = new Map<Move, HTMLButtonElement>();
 
@@ -256,7 +257,7 @@ export class Panel {
     for (const row of rows) {
       const button = make("button", row.chosen ? "box chosen" : "box");
       button.type = "button";
-      button.append(make("bdi", "", row.text), make("span", "faint", row.detail));
+      button.append(make("bdi", "", row.text), make("span", "side", row.side), make("span", "faint", row.detail));
       button.addEventListener("click", row.choose);
       this.boxList.append(button);
     }

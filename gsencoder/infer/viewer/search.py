@@ -27,6 +27,8 @@ UNSEEN = -32768
 NO_LABEL = 65535
 LABELS = 40
 """Words that Gaussians are labeled with: those that are the best word of the most weight."""
+LEAST_LABEL = 0.3
+"""A Gaussian whose best word has a smaller cosine than this is like none of them."""
 BEST_WORDS = 5
 LABEL_BLOCK = 4096
 """Gaussians whose words are compared at once."""
@@ -49,11 +51,11 @@ class Answer:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Labels:
-    """The best word of every Gaussian.
+    """The best word of every Gaussian that is like one.
 
     Attributes:
         names: the words, most weight first.
-        numbers: for each Gaussian the place of its word in `names`, or `NO_LABEL`.
+        numbers: for each Gaussian the place of its word in `names`, or `NO_LABEL` where none comes near.
     """
 
     names: tuple[str, ...]
@@ -144,22 +146,24 @@ class SceneSearch:
         features, table = self.shown.features, closed_table(self.words)
         targets = self.products.axes.project(word_directions(table.embeddings, self.words.mean)).astype(np.float32)
         rows = np.flatnonzero(features.seen)
-        best = self._best_of(rows, targets)
-        totals = np.bincount(best, features.weights[rows], len(table))
+        best, cosines = self._best_of(rows, targets)
+        totals = np.bincount(best, features.weights[rows] * (cosines >= LEAST_LABEL), len(table))
         kept = np.argsort(-totals, kind="stable")[:LABELS]
         kept = kept[totals[kept] > 0]
-        if len(kept) < np.count_nonzero(totals):
-            best = kept[self._best_of(rows, targets[kept])]
-        place = np.full(len(table), NO_LABEL, np.uint16)
-        place[kept] = np.arange(len(kept))
         numbers = np.full(len(features), NO_LABEL, np.uint16)
-        numbers[rows] = place[best]
+        if len(kept):
+            best, cosines = self._best_of(rows, targets[kept])
+            numbers[rows] = np.where(cosines >= LEAST_LABEL, best, NO_LABEL)
         return Labels(names=tuple(table.names[row] for row in kept), numbers=numbers)
 
-    def _best_of(self, rows: Int64[np.ndarray, " n"], targets: Float32[np.ndarray, "C S"]) -> Int64[np.ndarray, " n"]:
-        best = np.zeros(len(rows), np.int64)
+    def _best_of(
+        self, rows: Int64[np.ndarray, " n"], targets: Float32[np.ndarray, "C S"]
+    ) -> tuple[Int64[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+        """For each Gaussian which word is nearest, and its cosine."""
+        best, cosines = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.float32)
         for start in range(0, len(rows), LABEL_BLOCK):
-            block = rows[start : start + LABEL_BLOCK]
-            local = self.products.axes.directions_of(self.shown.features.stored(block)).astype(np.float32)
-            best[start : start + LABEL_BLOCK] = (local @ targets.T).argmax(axis=1)
-        return best
+            block = slice(start, start + LABEL_BLOCK)
+            local = self.products.axes.directions_of(self.shown.features.stored(rows[block])).astype(np.float32)
+            products = local @ targets.T
+            best[block], cosines[block] = products.argmax(axis=1), products.max(axis=1)
+        return best, cosines
