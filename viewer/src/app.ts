@@ -155,6 +155,14 @@ export class App {
     this.controls.lookFrom(from, center);
   }
 
+  /** Where a point of a scene is seen on the page; null behind the camera. */
+  placeOf(number: number, point: [number, number, number]): { x: number; y: number } | null {
+    const pane = this.shown[number]?.pane;
+    const place = pane?.place(new THREE.Vector3(...point));
+    const corner = pane?.element.getBoundingClientRect();
+    return place && corner ? { x: place.x + corner.left, y: place.y + corner.top } : null;
+  }
+
   // Words.
 
   async ask(word: string): Promise<void> {
@@ -365,13 +373,21 @@ export class App {
   ): Promise<void> {
     const { scene, answers } = shown;
     if (!scene.geometry) return;
-    const list = rows.length ? await answers.bestWords(rows) : [];
     const several = this.shown.length > 1;
+    // Two scenes of one splat have the same Gaussians.
+    const others = this.shown.filter((each) => each === shown || each.scene.count === scene.count);
+    const words = await Promise.all(
+      others.map(async (each) => ({
+        of: several ? each.scene.meta.title : "",
+        list: rows.length ? await each.answers.bestWords(rows) : [],
+      })),
+    );
+    const list = words[others.indexOf(shown)]?.list ?? [];
     const views = bestViews(scene.views, scene.geometry, center, radius, BEST_VIEWS);
     const chosen: Chosen = {
       title: title || (list[0]?.[0] ?? "no features"),
       detail,
-      words: [{ of: several ? scene.meta.title : "", list }],
+      words,
       views: await Promise.all(
         views.map(async ({ view }) => ({
           name: scene.views[view]?.name ?? "",

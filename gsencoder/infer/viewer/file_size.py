@@ -12,6 +12,7 @@ from gsencoder.infer.viewer.page_scene import FileOptions, file_container
 from gsencoder.infer.viewer.search import SceneSearch
 from gsencoder.infer.viewer.shown import shown_scene
 from gsencoder.text.build import Words, closed_table
+from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.types import Scene, SceneObject
 
 FEWEST_GAUSSIANS = 1000
@@ -75,9 +76,12 @@ def fitting_page(
                 f"Spherical harmonics above degree {degree} of {highest} are left out: colors depend less on the "
                 f"direction. megabytes= larger than {max_bytes / 1e6:g} keeps them."
             )
-        # A word outside of the table needs the tower, which no file holds.
         known = max(len(closed_table(words)) for _, _, words in scenes)
-        notes.append(f"This file knows {known:,} words; `gsencoder view` with the folder takes any phrase.")
+        # Other phrases need the tower, which no file holds.
+        phrases = any(isinstance(words, OpenVocabulary) for _, _, words in scenes)
+        notes.append(
+            f"This file knows {known:,} words" + (", and gsencoder view FEATURES takes any phrase." if phrases else ".")
+        )
         made = [
             _container(scene, title, words, config, objects, replace(options, sh_degree=degree), limit)
             for scene, title, words in scenes
