@@ -17,7 +17,7 @@ from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 HOSTILE = "<img src=x onerror=\"document.title='harmed'\"></script><script>document.title='harmed'</script>\u202e&amp;'"
 STUB = Bundle(script="'use strict';", style="body { margin: 0; }")
 CHANNELS = 32
-NOISE = 0.1
+NOISE = 0.4
 
 
 def room_scene() -> Scene:
