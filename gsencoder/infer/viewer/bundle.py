@@ -17,12 +17,16 @@ class Bundle:
     style: str
 
 
-def load_bundle(folder: Path = STATIC) -> Bundle:
+def load_bundle(folder: Path | None = None) -> Bundle:
     """Reads the bundle.
+
+    Args:
+        folder: where it lies; None = `STATIC`.
 
     Raises:
         InputError: it was not built.
     """
+    folder = STATIC if folder is None else folder
     try:
         return Bundle(
             script=(folder / SCRIPT).read_text(encoding="utf-8"), style=(folder / STYLE).read_text(encoding="utf-8")

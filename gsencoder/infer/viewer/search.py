@@ -3,7 +3,7 @@
 import threading
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,7 @@ class SceneSearch:
     products: GaussianProducts = field(init=False)
     spacing: float = field(init=False)
     _lock: threading.Lock = field(init=False, default_factory=threading.Lock)
+    _boxes_lock: threading.Lock = field(init=False, default_factory=threading.Lock)
     _labels: Labels | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
@@ -112,9 +113,11 @@ class SceneSearch:
         Raises:
             InputError: as `ask` does.
         """
-        with self._lock, warnings.catch_warnings():
+        # The spacing, which takes most of the time, is known; what is asked meanwhile does not wait.
+        config = replace(self.config, eps=self.eps)
+        with self._boxes_lock, warnings.catch_warnings():
             warnings.simplefilter("ignore", SceneWarning)
-            found = localize(self.shown.scene, [word], self.words, self.config)
+            found = localize(self.shown.scene, [word], self.words, config)
         return {"boxes": localization_to_json(found), "probability": float(found.probabilities[0])}
 
     def best_words(self, rows: Sequence[int]) -> list[tuple[str, float]]:
@@ -133,7 +136,7 @@ class SceneSearch:
 
     def labels(self) -> Labels:
         """The best known word of every Gaussian, of the `LABELS` words that are the best of most weight."""
-        with self._lock:
+        with self._boxes_lock:
             if self._labels is None:
                 self._labels = self._find_labels()
             return self._labels
