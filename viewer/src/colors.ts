@@ -103,18 +103,20 @@ export function paintWord(
   threshold: number,
   word: string,
 ): Legend {
-  const table = Array.from({ length: LEVELS }, (_, level) => turbo(level / (LEVELS - 1)));
+  const table = new Uint8Array(Array.from({ length: LEVELS }, (_, level) => turbo(level / (LEVELS - 1))).flat());
   for (let row = 0; row < scene.count; row++) {
     const value = relevancy[row] as number;
     const at = 4 * row;
     const grey = 0.299 * (base[at] as number) + 0.587 * (base[at + 1] as number) + 0.114 * (base[at + 2] as number);
     // NaN compares false: what was never seen stays grey.
-    const mix = value >= threshold ? 0.85 : value > 0 ? 0.4 * (value / threshold) ** 2 : 0;
-    const color = table[Math.max(0, Math.min(LEVELS - 1, Math.round((value > 0 ? value : 0) * (LEVELS - 1))))] as Rgb;
-    const dim = value >= threshold ? grey : 0.6 * grey;
-    rgba[at] = mix * color[0] + (1 - mix) * dim;
-    rgba[at + 1] = mix * color[1] + (1 - mix) * dim;
-    rgba[at + 2] = mix * color[2] + (1 - mix) * dim;
+    const picked = value >= threshold;
+    const share = value > 0 ? value : 0;
+    const mix = picked ? 0.85 : 0.4 * (share / Math.max(threshold, 1e-6)) ** 2;
+    const dim = (1 - mix) * (picked ? grey : 0.6 * grey);
+    const color = 3 * Math.min(LEVELS - 1, Math.round(share * (LEVELS - 1)));
+    rgba[at] = mix * (table[color] as number) + dim;
+    rgba[at + 1] = mix * (table[color + 1] as number) + dim;
+    rgba[at + 2] = mix * (table[color + 2] as number) + dim;
   }
   return {
     kind: "ramp",

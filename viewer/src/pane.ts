@@ -101,12 +101,17 @@ export class Pane {
 
   showCameras(shown: boolean): void {
     this.overlay.camerasShown = shown;
-    this.dirty();
+    this.drawOverlay();
   }
 
   showBoxes(boxes: ShownBox[]): void {
     this.overlay.setBoxes(boxes);
-    this.dirty();
+    this.drawOverlay();
+  }
+
+  /** Over the frame that is shown; the splat is not drawn again. */
+  private drawOverlay(): void {
+    this.overlay.draw(this.camera, this.offset, this.element.clientWidth, this.element.clientHeight);
   }
 
   /** Draws a frame, and resolves when it is drawn, to whether it was as fine as a resting picture can be. */
@@ -120,7 +125,7 @@ export class Pane {
     controls.apply(this.camera, width / height, this.size);
     const begin = performance.now();
     this.renderer.render(this.world, this.camera);
-    this.overlay.draw(this.camera, this.offset, width, height);
+    this.drawOverlay();
     await drawn(this.gl);
     this.quality.measured(performance.now() - begin, width * height * ratio * ratio);
     return ratio >= this.quality.ratio(width * height, false);

@@ -53,7 +53,11 @@ export class ServerAnswers implements Answers {
     );
     const steps = arrayOf(sent, "relevancy", Int16Array);
     const { step, unseen, threshold } = sent.meta;
-    const relevancy = Float32Array.from(steps, (value) => (value === unseen ? NaN : value * step));
+    const relevancy = new Float32Array(steps.length);
+    for (let row = 0; row < steps.length; row++) {
+      const value = steps[row] as number;
+      relevancy[row] = value === unseen ? NaN : value * step;
+    }
     return { word, relevancy, threshold };
   }
 
