@@ -151,7 +151,7 @@ export class App {
     const up = new THREE.Vector3(...first.scene.up).normalize();
     const side = new THREE.Vector3(0.7, -0.6, 0.3);
     side.addScaledVector(up, -side.dot(up)).normalize();
-    const from = center.clone().addScaledVector(side, 1.1 * first.pane.size).addScaledVector(up, 0.9 * first.pane.size);
+    const from = center.clone().addScaledVector(side, 0.85 * first.pane.size).addScaledVector(up, 0.7 * first.pane.size);
     this.controls.lookFrom(from, center);
   }
 
