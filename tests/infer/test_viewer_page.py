@@ -309,6 +309,19 @@ def test_a_threshold_that_pages_do_not_compute_is_refused(search: SceneSearch) -
         file_container(SceneSearch(shown=search.shown, words=search.words, config=config), (), OPTIONS)
 
 
+def test_features_without_words_are_shown_and_say_that_none_lead_into_them(search: SceneSearch) -> None:
+    features = search.shown.features
+    space = replace(features.space, name="dense", text_encoder="")
+    scene = replace(search.shown.scene, features={"dense": replace(features, space=space)})
+    mute = SceneSearch(shown=shown_scene(scene, "t", max_gaussians=10**6), words=None, config=LocalizeConfig())
+    with pytest.raises(InputError, match="no words lead into"):
+        mute.ask("mug")
+    assert mute.best_words([0]) == []
+    page = read_container(file_container(mute, (), OPTIONS).to_bytes())
+    assert page.meta["words"] == page.meta["labels"] == []
+    np.testing.assert_array_equal(page.arrays["pca"], scene_container(search, ()).arrays["pca"])
+
+
 def test_a_bundle_that_was_not_built_is_one_line_that_says_how(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="make viewer"):
         load_bundle(tmp_path)

@@ -3,7 +3,7 @@
 import sys
 import webbrowser
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gsencoder.app.commands.query_words import asked_scene
@@ -17,7 +17,7 @@ from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize.localize import LocalizeConfig, select_features
 from gsencoder.infer.viewer.bundle import Bundle, load_bundle
 from gsencoder.infer.viewer.file_size import fitting_page
 from gsencoder.infer.viewer.page import served_page
@@ -130,10 +130,15 @@ def run(config: ViewConfig, summary: Summary) -> None:
         _serve(config, bundle, loaded, titles, objects)
 
 
-def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple[Scene, Words]:
+def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple[Scene, Words | None]:
     scene, _ = with_up(load_features(folder))
     if photographed is not None:
         scene = with_photographs(scene, photographed)
+    if not (config.head or config.words) and isinstance(config.text, TableTextConfig):
+        _, features = select_features(scene, config.space or None)
+        if not features.space.text_encoder:
+            # Features such as DINOv2's can be looked at.
+            return replace(scene, features={features.space.name: features}), None
     return asked_scene(scene, folder, head=config.head, space=config.space, given=config.words, text=config.text)
 
 
@@ -146,7 +151,7 @@ def _titles(folders: Sequence[Path]) -> list[str]:
 def _serve(
     config: ViewConfig,
     bundle: Bundle,
-    loaded: Sequence[tuple[Scene, Words]],
+    loaded: Sequence[tuple[Scene, Words | None]],
     titles: Sequence[str],
     objects: tuple[SceneObject, ...],
 ) -> None:
@@ -175,7 +180,7 @@ def _write(
     out: Path,
     config: ViewConfig,
     bundle: Bundle,
-    loaded: Sequence[tuple[Scene, Words]],
+    loaded: Sequence[tuple[Scene, Words | None]],
     titles: Sequence[str],
     objects: tuple[SceneObject, ...],
     summary: Summary,

@@ -44,7 +44,7 @@ class MadePage:
 
 def fitting_page(
     bundle: Bundle,
-    scenes: Sequence[tuple[Scene, str, Words]],
+    scenes: Sequence[tuple[Scene, str, Words | None]],
     config: LocalizeConfig,
     objects: tuple[SceneObject, ...],
     options: FileOptions,
@@ -76,7 +76,7 @@ def fitting_page(
                 f"Spherical harmonics above degree {degree} of {highest} are left out: colors depend less on the "
                 f"direction. megabytes= larger than {max_bytes / 1e6:g} keeps them."
             )
-        known = max(len(closed_table(words)) for _, _, words in scenes)
+        known = max(0 if words is None else len(closed_table(words)) for _, _, words in scenes)
         # Other phrases need the tower, which no file holds.
         phrases = any(isinstance(words, OpenVocabulary) for _, _, words in scenes)
         notes.append(
@@ -118,7 +118,7 @@ def _degree(scene: Scene) -> int:
 def _container(
     scene: Scene,
     title: str,
-    words: Words,
+    words: Words | None,
     config: LocalizeConfig,
     objects: tuple[SceneObject, ...],
     options: FileOptions,

@@ -16,7 +16,6 @@ from gsencoder.infer.localize.relevancy import feature_axes, word_directions
 from gsencoder.infer.viewer.container import Container
 from gsencoder.infer.viewer.search import SceneSearch
 from gsencoder.infer.viewer.shown import object_numbers, pca_bytes, spz_bytes, weight_bytes
-from gsencoder.text.build import closed_table
 from gsencoder.types import SceneObject, Views
 
 OBJECT_MARGIN = 0.5
@@ -70,7 +69,7 @@ def scene_container(search: SceneSearch, objects: tuple[SceneObject, ...], *, sh
         "weights": [lightest, heaviest],
         "views": [] if scene.views is None else list(scene.views.names),
         "photographs": scene.views is not None and scene.views.images is not None,
-        "words": list(closed_table(search.words).names),
+        "words": [] if search.table is None else list(search.table.names),
         "localize": {
             "eps": search.eps,
             "minSamples": config.min_samples,
@@ -113,8 +112,10 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
         raise InputError("localize.threshold.kind=otsu: a page does not compute it; use another, or leave out= out")
     base = scene_container(search, objects, sh_degree=options.sh_degree)
     made = compact(search.shown.features, error=options.error)
-    table = closed_table(search.words)
-    directions = word_directions(table.embeddings, search.words.mean)
+    table = search.table
+    directions = np.zeros((0, made.space.channels))
+    if table is not None:
+        directions = word_directions(table.embeddings, table.mean)
     seen = np.zeros(made.total, bool)
     seen[made.rows] = True
     labels = search.labels()
@@ -132,7 +133,7 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
         "floor": feature_axes(search.shown.features).floor,
         "featureError": made.error,
         "synonyms": near,
-        "trained": [table.is_trained(name) for name in table.names] if table.trained is not None else None,
+        "trained": None if table is None or table.trained is None else [table.is_trained(name) for name in table.names],
         "presence": {
             "unknown": dict(presence.WITH_RIVALS),
             "trained": dict(presence.TRAINED),

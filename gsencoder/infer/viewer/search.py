@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int16, Int64, UInt16
 
-from gsencoder.core.errors import SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.spacing import scene_spacing
 from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.localization_json import localization_to_json
@@ -19,6 +19,7 @@ from gsencoder.infer.localize.threshold import threshold
 from gsencoder.infer.viewer.shown import ShownScene
 from gsencoder.text.build import Words, closed_table
 from gsencoder.text.encoder import check_space
+from gsencoder.text.table import TextTable
 
 RELEVANCY_STEP = 1 / 32767
 """Relevancies are sent in such steps, as 16-bit integers."""
@@ -68,12 +69,12 @@ class SceneSearch:
 
     Attributes:
         shown: the scene.
-        words: turn words into the space of its features.
+        words: turn words into the space of its features; None where none lead into it.
         config: how words become boxes; the cosines are centered.
     """
 
     shown: ShownScene
-    words: Words
+    words: Words | None
     config: LocalizeConfig
     products: GaussianProducts = field(init=False)
     spacing: float = field(init=False)
@@ -82,7 +83,8 @@ class SceneSearch:
     _labels: Labels | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        check_space(self.shown.features.space, self.words.space)
+        if self.words is not None:
+            check_space(self.shown.features.space, self.words.space)
         self.products = GaussianProducts(self.shown.features)
         self.spacing = scene_spacing(self.shown.gaussians.means) or float(np.median(self.shown.gaussians.scales))
 
@@ -91,16 +93,29 @@ class SceneSearch:
         """Radius of the clusters, world units."""
         return self.config.eps if self.config.eps is not None else self.config.eps_spacings * self.spacing
 
+    @property
+    def table(self) -> TextTable | None:
+        """The known words; None where there are none."""
+        return None if self.words is None else closed_table(self.words)
+
+    def _encoder(self) -> Words:
+        if self.words is None:
+            raise InputError(
+                f"no words lead into these features ({self.shown.features.space.describe()}); they can be looked at"
+            )
+        return self.words
+
     def ask(self, word: str) -> Answer:
         """The relevancy of a word.
 
         Raises:
-            InputError: the word is empty, or unknown and there is no text tower.
+            InputError: the word is empty, or unknown and there is no text tower; or no words lead into the features.
         """
         # A tower is loaded when the first phrase needs it.
+        words = self._encoder()
         with self._lock:
-            vector = self.words.encode([word])
-        scores = self.products.cosines(word_directions(vector, self.words.mean))[0]
+            vector = words.encode([word])
+        scores = self.products.cosines(word_directions(vector, words.mean))[0]
         cutoff = threshold(scores, self.config.threshold)
         steps = np.full(len(scores), UNSEEN, np.int16)
         seen = np.isfinite(scores)
@@ -113,11 +128,12 @@ class SceneSearch:
         Raises:
             InputError: as `ask` does.
         """
+        words = self._encoder()
         # The spacing, which takes most of the time, is known; what is asked meanwhile does not wait.
         config = replace(self.config, eps=self.eps)
         with self._boxes_lock, warnings.catch_warnings():
             warnings.simplefilter("ignore", SceneWarning)
-            found = localize(self.shown.scene, [word], self.words, config)
+            found = localize(self.shown.scene, [word], words, config)
         return {"boxes": localization_to_json(found), "probability": float(found.probabilities[0])}
 
     def best_words(self, rows: Sequence[int]) -> list[tuple[str, float]]:
@@ -125,12 +141,12 @@ class SceneSearch:
         features = self.shown.features
         chosen = np.asarray(rows, np.int64)
         chosen = chosen[features.seen[chosen]]
-        if not len(chosen):
+        table = self.table
+        if table is None or not len(chosen):
             return []
-        table = closed_table(self.words)
         weights = features.weights[chosen].astype(np.float64)
         mean = (weights / weights.sum()) @ self.products.axes.directions_of(features.stored(chosen))
-        cosines = word_directions(table.embeddings, self.words.mean) @ self._in_channels(mean)
+        cosines = word_directions(table.embeddings, table.mean) @ self._in_channels(mean)
         best = np.argsort(-cosines, kind="stable")[:BEST_WORDS]
         return [(table.names[row], float(cosines[row])) for row in best]
 
@@ -146,8 +162,10 @@ class SceneSearch:
         return local if axes is None else axes @ local
 
     def _find_labels(self) -> Labels:
-        features, table = self.shown.features, closed_table(self.words)
-        targets = self.products.axes.project(word_directions(table.embeddings, self.words.mean)).astype(np.float32)
+        features, table = self.shown.features, self.table
+        if table is None:
+            return Labels(names=(), numbers=np.full(len(features), NO_LABEL, np.uint16))
+        targets = self.products.axes.project(word_directions(table.embeddings, table.mean)).astype(np.float32)
         rows = np.flatnonzero(features.seen)
         best, cosines = self._best_of(rows, targets)
         totals = np.bincount(best, features.weights[rows] * (cosines >= LEAST_LABEL), len(table))
