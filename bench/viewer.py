@@ -30,7 +30,7 @@ from gsencoder.infer.viewer.shown import rows_of_features, shown_scene
 WORDS = ("mug", "chair", "table", "window", "book")
 SCRIPT = """async (words) => {
   const app = gsencoderViewer, [shown] = app.shown, ms = {frame: [], ask: [], paint: [], boxes: [], pick: []};
-  for (let k = 0; k < 5; k++) { app.controls.turn(0.02, 0); await app.frame(); ms.frame.push(app.timings.frame); }
+  for (let k = 0; k < 5; k++) { app.controls.turn(0.02, 0); await app.frame(); ms.frame.push(app.frames.last); }
   app.dirty = shown.pane.dirty = () => {};  // what follows is the script alone
   app.mode = "word";
   const timed = async (name, work) => {

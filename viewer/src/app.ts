@@ -1,10 +1,12 @@
 // What happens on the page: words, thresholds, colors, clicks, and the camera that all panes share.
 
 import * as THREE from "three";
+import { holds, rowsIn, sizeOf } from "./box_facts";
 import { boxAround } from "./boxes";
 import { findClusters } from "./clusters";
 import { paintLabels, paintObjects, paintPca, paintWeights, paintWord, type Legend, type Mode } from "./colors";
 import { Controls, type Move } from "./controls";
+import { Frames } from "./frames";
 import { Pane } from "./pane";
 import { Panel, make, type Chosen } from "./panel";
 import { bestViews } from "./picking";
@@ -13,8 +15,6 @@ import type { Answer, Answers, FoundBox, Judged, Labels, PageSettings } from "./
 
 const BEST_VIEWS = 4;
 const SAMPLED_ROWS = 1000;
-/** Milliseconds without a move after which the picture is drawn finely. */
-const REST = 220;
 
 interface Shown {
   pane: Pane;
@@ -29,8 +29,8 @@ interface Shown {
 
 export class App {
   mode: Mode = "photo";
-  /** Seconds that the last word took, from Enter to the frame that shows it. */
-  readonly timings = { ask: 0, paint: 0, frame: 0 };
+  /** Milliseconds of the last word until it was answered, and until the frame that shows it was drawn. */
+  readonly timings = { ask: 0, paint: 0 };
   readonly shown: Shown[];
   private readonly panel: Panel;
   private readonly controls: Controls;
@@ -38,12 +38,7 @@ export class App {
   private boxesShown = true;
   private chosenBox: FoundBox | null = null;
   private asked = 0;
-  private drawing = false;
-  private wanted = false;
-  private readonly waiting: (() => void)[] = [];
-  private lastMove = -Infinity;
-  private resting: ReturnType<typeof setTimeout> | undefined;
-  private lastFrame = 0;
+  private readonly frames: Frames;
   private fast = false;
 
   constructor(
@@ -55,9 +50,15 @@ export class App {
     if (!first) throw new Error("There is no scene on this page.");
     this.controls = new Controls(new THREE.Vector3(...first.up).normalize(), 1, () => {
       this.panel.showView(null);
-      this.lastMove = performance.now();
-      this.dirty();
+      this.frames.moved();
     });
+    this.frames = new Frames(
+      (seconds) => this.controls.step(seconds, this.fast),
+      async (moving) => {
+        const fine = await Promise.all(this.shown.map(({ pane }) => pane.render(this.controls, moving)));
+        return fine.every(Boolean);
+      },
+    );
     this.shown = scenes.map(({ scene, answers }) => {
       const pane = new Pane(scene, () => this.dirty(), (box) => void this.chooseBox(box));
       const [a, b] = [scene.meta.origin, first.meta.origin];
@@ -348,15 +349,7 @@ export class App {
     if (!shown || !geometry) return;
     this.chosenBox = box;
     this.showBoxes();
-    let rows = box.rows ? [...box.rows] : [];
-    if (!box.rows && shown.answer) {
-      const cutoff = this.cutoff(shown);
-      shown.answer.relevancy.forEach((value, row) => {
-        if (value >= cutoff && holds(box, geometry.means.subarray(3 * row, 3 * row + 3))) rows.push(row);
-      });
-    }
-    const step = Math.max(1, Math.ceil(rows.length / SAMPLED_ROWS));
-    rows = rows.filter((_, place) => place % step === 0);
+    const rows = rowsIn(box, geometry.means, shown.answer?.relevancy ?? null, this.cutoff(shown), SAMPLED_ROWS);
     const radius = Math.hypot(...box.size) / 2;
     const probable = box.probability === null ? "" : `\nprobability ${box.probability.toFixed(2)}, score ${box.score.toFixed(2)}`;
     const detail = `${this.position(shown, box.center)}\n${sizeOf(box, shown.scene)}${probable}`;
@@ -403,52 +396,11 @@ export class App {
   // Frames.
 
   dirty(): void {
-    this.wanted = true;
-    if (this.drawing) return;
-    this.drawing = true;
-    requestAnimationFrame((now) => void this.draw(now));
-  }
-
-  /** One frame at a time: what cannot keep up draws less often, and never falls behind. */
-  private async draw(now: number): Promise<void> {
-    this.wanted = false;
-    const waiting = this.waiting.splice(0);
-    const moved = this.controls.step(Math.min(0.1, (now - this.lastFrame) / 1000), this.fast);
-    this.lastFrame = now;
-    if (moved) this.lastMove = now;
-    const moving = performance.now() - this.lastMove < REST;
-    const begin = performance.now();
-    const fine = await Promise.all(this.shown.map(({ pane }) => pane.render(this.controls, moving)));
-    this.timings.frame = performance.now() - begin;
-    this.drawing = false;
-    for (const resolve of waiting) resolve();
-    if (moved || this.wanted) this.dirty();
-    else if (!fine.every(Boolean)) {
-      clearTimeout(this.resting);
-      this.resting = setTimeout(() => this.dirty(), REST);
-    }
+    this.frames.dirty();
   }
 
   /** Draws a frame, and resolves when it is drawn. */
   frame(): Promise<void> {
-    return new Promise((resolve) => {
-      this.waiting.push(resolve);
-      this.dirty();
-    });
+    return this.frames.frame();
   }
-}
-
-function holds(box: FoundBox, point: ArrayLike<number>): boolean {
-  const slack = 1e-4 * Math.hypot(...box.size);
-  return [0, 1, 2].every((axis) => {
-    let along = 0;
-    for (let k = 0; k < 3; k++) along += (box.rotation[3 * k + axis] ?? 0) * ((point[k] ?? 0) - (box.center[k] ?? 0));
-    return Math.abs(along) <= (box.size[axis] ?? 0) / 2 + slack;
-  });
-}
-
-function sizeOf(box: FoundBox, scene: Scene): string {
-  const unit = scene.meta.metresPerUnit;
-  const sides = box.size.map((side) => (unit ? side * unit : side).toFixed(2)).join(" × ");
-  return `${sides}${unit ? " m" : ""}, ${box.count.toLocaleString("en")} Gaussians`;
 }
