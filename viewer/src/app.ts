@@ -2,30 +2,18 @@
 
 import * as THREE from "three";
 import { holds, rowsIn, sizeOf } from "./box_facts";
-import { boxAround } from "./boxes";
-import { findClusters } from "./clusters";
-import { paintLabels, paintObjects, paintPca, paintWeights, paintWord, type Legend, type Mode } from "./colors";
+import type { Legend, Mode } from "./colors";
 import { Controls, type Move } from "./controls";
 import { Frames } from "./frames";
 import { Pane } from "./pane";
 import { Panel, make, type Chosen } from "./panel";
 import { bestViews } from "./picking";
 import type { Scene } from "./scene";
-import type { Answer, Answers, FoundBox, Judged, Labels, PageSettings } from "./types";
+import { Shown } from "./shown";
+import type { Answers, FoundBox, PageSettings } from "./types";
 
 const BEST_VIEWS = 4;
 const SAMPLED_ROWS = 1000;
-
-interface Shown {
-  pane: Pane;
-  scene: Scene;
-  answers: Answers;
-  answer: Answer | null;
-  judged: Judged | null;
-  boxes: FoundBox[];
-  labels: Labels | null;
-  problem: string;
-}
 
 export class App {
   mode: Mode = "photo";
@@ -63,7 +51,7 @@ export class App {
       const pane = new Pane(scene, () => this.dirty(), (box) => void this.chooseBox(box));
       const [a, b] = [scene.meta.origin, first.meta.origin];
       pane.offset.set(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
-      return { pane, scene, answers, answer: null, judged: null, boxes: [], labels: null, problem: "" };
+      return new Shown(pane, scene, answers);
     });
     const words = [...new Set(this.shown.flatMap(({ scene }) => scene.meta.words))];
     const several = this.shown.length > 1;
@@ -211,22 +199,8 @@ export class App {
     this.searchBoxes();
   }
 
-  private cutoff({ answer }: Shown): number {
-    return this.threshold ?? answer?.threshold ?? Infinity;
-  }
-
   private searchBoxes(): void {
-    for (const shown of this.shown) {
-      const { answer, scene } = shown;
-      if (!answer || !scene.geometry) shown.boxes = [];
-      else if (this.threshold === null && shown.judged) shown.boxes = shown.judged.boxes;
-      else {
-        const weight = (row: number): number => scene.weight(row);
-        const clusters = findClusters(answer.relevancy, this.cutoff(shown), scene.geometry.means, weight, scene.meta.localize);
-        const means = scene.geometry.means;
-        shown.boxes = clusters.map((each, rank) => boxAround(answer.word, rank, each, means, scene.up));
-      }
-    }
+    for (const shown of this.shown) shown.findBoxes(this.threshold);
     this.showBoxes();
     this.showStatus();
   }
@@ -238,7 +212,7 @@ export class App {
       if (shown.problem) return [{ text: before + shown.problem, bad: true }];
       const { answer, judged, boxes } = shown;
       if (!answer) return [];
-      const cutoff = this.cutoff(shown);
+      const cutoff = shown.cutoff(this.threshold);
       let picked = 0;
       for (const value of answer.relevancy) if (value >= cutoff) picked++;
       if (judged && this.threshold === null && !judged.boxes.length) {
@@ -249,7 +223,7 @@ export class App {
     });
     this.panel.showStatus(lines);
     const first = this.shown.find(({ answer }) => answer?.threshold != null);
-    this.panel.showThreshold(first ? this.cutoff(first) : null, this.threshold === null);
+    this.panel.showThreshold(first ? first.cutoff(this.threshold) : null, this.threshold === null);
   }
 
   private showBoxes(): void {
@@ -292,23 +266,10 @@ export class App {
   }
 
   private repaint(): void {
-    let legend: Legend = { kind: "none", title: "" };
-    for (const shown of this.shown) {
-      const { pane, scene, answer, labels } = shown;
-      const { mode } = this;
-      if (mode === "word" && answer) {
-        pane.paint((rgba) => {
-          legend = paintWord(rgba, scene, pane.base, answer.relevancy, this.cutoff(shown), answer.word);
-        });
-      } else if (mode === "pca") pane.paint((rgba) => (legend = paintPca(rgba, scene)));
-      else if (mode === "weight") pane.paint((rgba) => (legend = paintWeights(rgba, scene)));
-      else if (mode === "label" && labels) pane.paint((rgba) => (legend = paintLabels(rgba, scene, labels)));
-      else if (mode === "object" && scene.objects) pane.paint((rgba) => (legend = paintObjects(rgba, scene)));
-      else {
-        pane.paint(null);
-        if (mode === "word" && !shown.problem) legend = { kind: "none", title: "Type a word to color by its relevancy." };
-      }
-    }
+    const legends = this.shown.flatMap((shown) => shown.paint(this.mode, this.threshold) ?? []);
+    const waits = this.mode === "word" && this.shown.every(({ problem }) => !problem);
+    const none: Legend = { kind: "none", title: waits ? "Type a word to color by its relevancy." : "" };
+    const legend = legends.at(-1) ?? none;
     const asks = this.mode === "label" || this.mode === "object";
     this.panel.showLegend(legend, asks ? (word) => void this.ask(word) : null);
   }
@@ -329,7 +290,7 @@ export class App {
     const center = means.subarray(3 * hit.row, 3 * hit.row + 3);
     const radius = Math.max(...scales.subarray(3 * hit.row, 3 * hit.row + 3), shown.scene.meta.spacing);
     const within = shown.boxes.find((box) => box.rows?.includes(hit.row) || holds(box, center));
-    if (within && (shown.answer?.relevancy[hit.row] ?? 0) >= this.cutoff(shown)) {
+    if (within && (shown.answer?.relevancy[hit.row] ?? 0) >= shown.cutoff(this.threshold)) {
       await this.chooseBox(within);
       return;
     }
@@ -349,7 +310,7 @@ export class App {
     if (!shown || !geometry) return;
     this.chosenBox = box;
     this.showBoxes();
-    const rows = rowsIn(box, geometry.means, shown.answer?.relevancy ?? null, this.cutoff(shown), SAMPLED_ROWS);
+    const rows = rowsIn(box, geometry.means, shown.answer?.relevancy ?? null, shown.cutoff(this.threshold), SAMPLED_ROWS);
     const radius = Math.hypot(...box.size) / 2;
     const probable = box.probability === null ? "" : `\nprobability ${box.probability.toFixed(2)}, score ${box.score.toFixed(2)}`;
     const detail = `${this.position(shown, box.center)}\n${sizeOf(box, shown.scene)}${probable}`;
