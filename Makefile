@@ -11,11 +11,14 @@ SLOW = $(shell grep -rl --include='*.py' '^pytestmark = pytest.mark.slow' tests)
 # Compiling the tests and the package takes ten seconds in each process; the results are cached.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-fast lint check clean
+VIEWER := gsencoder/infer/viewer/static/viewer.js
+VIEWER_SOURCES := $(wildcard viewer/src/* viewer/*.json viewer/*.mjs viewer/*.py)
+
+.PHONY: help setup viewer demo test test-fast lint check clean
 help:            ## what can be made
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
 
-setup: $(VENV)/.ready ## the virtual environment alone
+setup: $(VENV)/.ready $(VIEWER) ## the virtual environment, and the page of `gsencoder view`
 
 # The stamp is made last, so that an interrupted installation is done again.
 $(VENV)/.ready: pyproject.toml constraints.txt
@@ -23,6 +26,13 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	@$(BIN)/python -c "import open3d" 2>/dev/null || echo "note: open3d cannot be loaded here (it needs Debian's libusb-1.0-0 and libgl1, or their like); only seeds.source=tsdf and a few tests use it, and the tests are skipped"
 	@touch $@
+
+viewer: $(VENV)/.ready ## the page of `gsencoder view`, with its types checked
+	$(BIN)/python viewer/build.py --check
+
+# Without a network the rest goes on; the page is tried again the next time.
+$(VIEWER): $(VENV)/.ready $(VIEWER_SOURCES)
+	@$(BIN)/python viewer/build.py --optional
 
 demo: setup      ## a built-in scene through the whole pipeline; ends in outputs/demo/report.html
 	$(BIN)/gsencoder demo out=outputs/demo overwrite=true

@@ -72,6 +72,11 @@ COMMANDS = {
             config="ViewsCommandConfig",
             help="choose and render the views that show best what a word stands for",
         ),
+        Command(
+            name="view",
+            config="ViewConfig",
+            help="look at a scene and its features in a browser, and search it; or write that as one file",
+        ),
         Command(name="ask", config="AskCommandConfig", help="ask a vision-language model about such views"),
         Command(name="evaluate", config="EvaluateConfig", help="compute metrics on labeled scenes"),
         Command(

@@ -9,6 +9,7 @@ open3d do; a tool that turns the axes on export has to be turned back by the cal
 Reference: nianticlabs/spz.
 """
 
+import io
 import struct
 import warnings
 import zlib
@@ -156,7 +157,7 @@ def _decode(data: bytes, count: int, degree: int, bits: int, version: int) -> Ra
     )
 
 
-def write_spz(path: Path, stream: BinaryIO, raw: RawSplat, *, version: int) -> None:
+def write_spz(path: Path, stream: BinaryIO | io.BytesIO, raw: RawSplat, *, version: int) -> None:
     """Writes version 3 (gzip) or 4 (zstd).
 
     Precision: positions ±2⁻ᵇ/2 with b = 12 fractional bits, more where all coordinates are small (a step is at most

@@ -19,7 +19,8 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.grounding import GroundedPair, ground, grounding_scores
 from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.infer.localize.pixel_relevancy import GaussianProducts, pixel_features
+from gsencoder.infer.localize.gaussian_products import GaussianProducts
+from gsencoder.infer.localize.pixel_relevancy import pixel_features
 from gsencoder.infer.localize.relevancy import word_directions
 from gsencoder.render import blend
 from gsencoder.render.rays import strided_lattice

@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.localize import select_features
-from gsencoder.infer.localize.pixel_relevancy import GaussianProducts, pixel_features
+from gsencoder.infer.localize.pixel_relevancy import pixel_features
 from gsencoder.infer.localize.relevancy import Mode, word_directions
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
 from gsencoder.render import Blend, BlendConfig, blend

@@ -1,0 +1,218 @@
+"""`gsencoder view FEATURES`: a page over a scene and its features, served while it is looked at, or as one file."""
+
+import sys
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from gsencoder.app.commands.query_words import asked_scene
+from gsencoder.app.runs.output_folder import refuse_existing
+from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.json_values import write_json
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.up import with_up
+from gsencoder.fusion.store.folder import load_features
+from gsencoder.infer.localize.localize import LocalizeConfig, select_features
+from gsencoder.infer.viewer.bundle import Bundle, load_bundle
+from gsencoder.infer.viewer.file_size import fitting_page
+from gsencoder.infer.viewer.page import served_page
+from gsencoder.infer.viewer.page_scene import FileOptions, scene_container
+from gsencoder.infer.viewer.search import SceneSearch
+from gsencoder.infer.viewer.server import ViewServer
+from gsencoder.infer.viewer.shown import shown_scene
+from gsencoder.infer.views.photographs import with_photographs
+from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.types import Scene, SceneObject
+
+SUFFIX = ".html"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewConfig(CommonConfig):
+    """Settings of `view`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "help": "a folder written by fuse, encode, pack or memory; two folders of one scene are shown side by side",
+            "metavar": "FEATURES",
+            "required": True,
+        },
+    )
+    out: Path | None = field(
+        default=None,
+        metadata={
+            "help": "an .html file that holds page and scene, and opens without a server; empty = serve the page",
+            "metavar": "FILE",
+        },
+    )
+    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
+    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
+    head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
+            "features themselves are"
+        },
+    )
+    photos: str = field(
+        default="", metadata={"help": "the scene that was fused; its photographs and labeled objects are shown"}
+    )
+    max_gaussians: int = field(
+        default=1_000_000,
+        metadata={"help": "of more Gaussians so many are drawn and searched, evenly chosen and enlarged"},
+    )
+    port: int = field(default=0, metadata={"help": "of the server; 0 = any that is free"})
+    host: str = field(
+        default="127.0.0.1",
+        metadata={"help": "address that the server listens on; others than 127.0.0.1 open it to a network"},
+    )
+    open: bool | None = field(
+        default=None, metadata={"help": "open a browser; empty = if standard output is a terminal"}
+    )
+    megabytes: float = field(
+        default=25.0,
+        metadata={
+            "help": "largest size of out=; spherical harmonics, then Gaussians are left out, and the page says so"
+        },
+    )
+    error: float = field(
+        default=0.01, metadata={"help": "largest mean loss of centered cosine of the quantized features in out="}
+    )
+    photographs: int = field(default=24, metadata={"help": "largest number of photographs in out="})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
+
+    def __post_init__(self) -> None:
+        if len(self.paths) > 2:
+            raise InputError(f"paths: expected one or two folders of features, got {len(self.paths)}")
+        if self.max_gaussians < 1:
+            raise InputError(f"max_gaussians: expected 1 or more, got {self.max_gaussians}")
+        if not 0 <= self.port < 1 << 16:
+            raise InputError(f"port: expected 0 to 65535, got {self.port}")
+        if self.host in ("", "0.0.0.0", "::"):
+            raise InputError(
+                f"host: expected one address, such as 127.0.0.1 or that of a network, got {self.host!r}; requests for "
+                "other addresses are refused"
+            )
+        if not 0 < self.megabytes < 2000:
+            raise InputError(f"megabytes: expected a size above 0, got {self.megabytes}")
+        if not 0 < self.error < 1:
+            raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
+        if self.photographs < 0:
+            raise InputError(f"photographs: expected 0 or more, got {self.photographs}")
+        if self.localize.contrast or self.localize.mode != "centered":
+            raise InputError("localize.contrast, localize.mode: the page compares centered cosines; leave them out")
+        if self.out is not None and self.out.suffix.lower() != SUFFIX:
+            raise InputError(f"out: expected a file that ends in {SUFFIX}, got {self.out.name}")
+
+
+def run(config: ViewConfig, summary: Summary) -> None:
+    """Serves the page until it is interrupted, or writes it."""
+    bundle = load_bundle()
+    if config.out is not None:
+        for path in (config.out, Path(f"{config.out}.summary.json")):
+            refuse_existing(path, config.overwrite)
+    with summary.step("load"):
+        photographed = load_scene(config.photos, options=config.data) if config.photos else None
+        loaded = [_load(Path(path), config, photographed) for path in config.paths]
+    objects = () if photographed is None else photographed.objects
+    titles = _titles([Path(path) for path in config.paths])
+    if config.out is not None:
+        _write(config.out, config, bundle, loaded, titles, objects, summary)
+    else:
+        _serve(config, bundle, loaded, titles, objects)
+
+
+def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple[Scene, Words | None]:
+    scene, _ = with_up(load_features(folder))
+    if photographed is not None:
+        scene = with_photographs(scene, photographed)
+    if not (config.head or config.words) and isinstance(config.text, TableTextConfig):
+        _, features = select_features(scene, config.space or None)
+        if not features.space.text_encoder:
+            # Features such as DINOv2's can be looked at.
+            return replace(scene, features={features.space.name: features}), None
+    return asked_scene(scene, folder, head=config.head, space=config.space, given=config.words, text=config.text)
+
+
+def _titles(folders: Sequence[Path]) -> list[str]:
+    """What tells two folders apart: their names, or their paths where the names are the same."""
+    names = [folder.resolve().name for folder in folders]
+    return names if len(set(names)) == len(names) else [str(folder) for folder in folders]
+
+
+def _serve(
+    config: ViewConfig,
+    bundle: Bundle,
+    loaded: Sequence[tuple[Scene, Words | None]],
+    titles: Sequence[str],
+    objects: tuple[SceneObject, ...],
+) -> None:
+    searches = [
+        SceneSearch(
+            shown=shown_scene(scene, title, max_gaussians=config.max_gaussians), words=words, config=config.localize
+        )
+        for (scene, words), title in zip(loaded, titles, strict=True)
+    ]
+    name = loaded[0][0].name
+    settings = {"kind": "server", "scenes": len(searches), "notes": []}
+    page = served_page(bundle, f"{name} · gsencoder view", settings)
+    scenes = [scene_container(search, objects) for search in searches]
+    with ViewServer(page, searches, scenes, host=config.host, port=config.port) as server:
+        # The address is the result: it is printed also where there is no terminal, at once.
+        print(f"{server.address} shows {name}; Ctrl-C ends it", flush=True)
+        if config.open or (config.open is None and sys.stdout.isatty()):
+            webbrowser.open(server.address)
+        try:
+            server.serve_forever(poll_interval=0.1)
+        except KeyboardInterrupt:
+            console(config.quiet).print("ended")
+
+
+def _write(
+    out: Path,
+    config: ViewConfig,
+    bundle: Bundle,
+    loaded: Sequence[tuple[Scene, Words | None]],
+    titles: Sequence[str],
+    objects: tuple[SceneObject, ...],
+    summary: Summary,
+) -> None:
+    options = FileOptions(error=config.error, sh_degree=3, photographs=config.photographs, photograph_side=640)
+    with summary.step("page"):
+        made = fitting_page(
+            bundle,
+            [(scene, title, words) for (scene, words), title in zip(loaded, titles, strict=True)],
+            config.localize,
+            objects,
+            options,
+            max_gaussians=config.max_gaussians,
+            max_bytes=int(config.megabytes * 1e6),
+        )
+    with summary.step("write"), atomic_file(out) as stream:
+        stream.write(made.page)
+    summary.results.update(
+        page=str(out),
+        bytes=len(made.page),
+        gaussians=made.gaussians,
+        sh_degree=made.sh_degree,
+        photographs=made.photographs,
+        feature_error=made.feature_error,
+        left_out=list(made.notes),
+    )
+    write_json(f"{out}.summary.json", summary.to_dict())
+    screen = console(config.quiet)
+    for note in made.notes:
+        screen.print(note)
+    counts = " and ".join(f"{count:,}" for count in made.gaussians)
+    screen.print(
+        f"{out}: {len(made.page) / 1e6:.1f} MB; {counts} Gaussians, spherical harmonics of degree "
+        f"{max(made.sh_degree)}; opens in a browser without a network"
+    )

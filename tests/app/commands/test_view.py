@@ -1,0 +1,143 @@
+"""`gsencoder view`: the page as a file, the server until Ctrl-C, and what is refused."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from command_runs import refusal
+from viewed_rooms import STUB, save_viewed_room
+
+from gsencoder.app import cli
+from gsencoder.infer.viewer import bundle
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("view")
+    save_viewed_room(made)
+    return made
+
+
+@pytest.fixture
+def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A bundle that was built, in a folder of its own."""
+    made = tmp_path / "static"
+    made.mkdir()
+    (made / bundle.SCRIPT).write_text(STUB.script)
+    (made / bundle.STYLE).write_text(STUB.style)
+    monkeypatch.setattr(bundle, "STATIC", made)
+    return made
+
+
+def test_a_page_is_written_with_a_summary_of_what_it_holds(folder: Path, built: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page.html"
+    arguments = ["view", str(folder / "features"), f"photos={folder / 'room'}", f"out={out}", "photographs=2"]
+    assert cli.main([*arguments, "quiet=true"]) == 0
+    results = json.loads(Path(f"{out}.summary.json").read_text())["results"]
+    assert results["bytes"] == out.stat().st_size
+    assert results["photographs"] == [2]
+    assert results["gaussians"] == [5156]
+    assert 'id="scene-0"' in out.read_text()
+
+
+def test_a_page_that_exists_is_replaced_only_when_told(
+    folder: Path, built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "page.html"
+    out.write_text("mine")
+    arguments = ["view", str(folder / "features"), f"out={out}"]
+    assert "overwrite=true" in refusal(capsys, *arguments)
+    assert out.read_text() == "mine"
+    assert cli.main([*arguments, "overwrite=true", "quiet=true"]) == 0
+    assert out.read_text().startswith("<!doctype html>")
+
+
+def test_two_folders_are_two_scenes_of_one_page(folder: Path, built: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page.html"
+    features = str(folder / "features")
+    assert cli.main(["view", features, features, f"out={out}", "max_gaussians=1500", "quiet=true"]) == 0
+    results = json.loads(Path(f"{out}.summary.json").read_text())["results"]
+    assert results["gaussians"] == [1500, 1500]
+    assert any("1,500 of 5,156 Gaussians" in note for note in results["left_out"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["out=page.txt"], "ends in .html"),
+        (["max_gaussians=0"], "max_gaussians: expected 1 or more"),
+        (["port=70000"], "port: expected 0 to 65535"),
+        (["host=0.0.0.0"], "host: expected one address"),
+        (["megabytes=0"], "megabytes: expected"),
+        (["error=1"], "error: expected"),
+        (["photographs=-1"], "photographs: expected"),
+        (["localize.contrast=true"], "centered cosines"),
+        (["localize.mode=raw"], "centered cosines"),
+        (["photos=nowhere"], "nowhere"),
+        (["space=other"], "none of 'other'"),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(
+    folder: Path, built: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert message in refusal(capsys, "view", str(folder / "features"), *options)
+
+
+def test_three_folders_are_too_many(folder: Path, built: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "one or two folders" in refusal(capsys, "view", *[str(folder / "features")] * 3)
+
+
+def test_a_folder_of_something_else_is_refused(built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "folder of gsencoder features" in refusal(capsys, "view", str(tmp_path))
+
+
+def test_a_page_that_was_not_built_is_refused_in_one_line(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bundle, "STATIC", tmp_path / "nowhere")
+    assert "make viewer" in refusal(capsys, "view", str(folder / "features"))
+
+
+SERVE = """
+import sys
+from pathlib import Path
+from gsencoder.infer.viewer import bundle
+bundle.STATIC = Path(sys.argv[1])
+from gsencoder.app import cli
+sys.exit(cli.main(["view", sys.argv[2], "open=false"]))
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_the_server_answers_until_it_is_stopped_and_then_says_how_it_ended(
+    folder: Path, built: Path, number: signal.Signals, code: int
+) -> None:
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-c", SERVE, str(built), str(folder / "features")]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        # A background job of a shell begins with the signal ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        address = re.match(r"http://127\.0\.0\.1:\d+/[\w-]{32}/", line)
+        assert address is not None, line
+        with urllib.request.urlopen(address[0]) as page:
+            assert page.read().startswith(b"<!doctype html>")
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == code
+    assert "Traceback" not in errors

@@ -1,0 +1,64 @@
+"""A small synthetic room with features of names, and photographs, that tests of the page stand on."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.data.synthetic.room import make_room, write_room
+from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
+from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.viewer.bundle import Bundle
+from gsencoder.infer.viewer.search import SceneSearch
+from gsencoder.infer.viewer.shown import object_numbers, shown_scene
+from gsencoder.text.table import TextTable, load_text_table, make_text_table, save_text_table
+from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
+
+HOSTILE = "<img src=x onerror=\"document.title='harmed'\"></script><script>document.title='harmed'</script>\u202e&amp;'"
+STUB = Bundle(script="'use strict';", style="body { margin: 0; }")
+CHANNELS = 32
+NOISE = 0.4
+
+
+def room_scene() -> Scene:
+    """Five objects on a table, six views, about five thousand Gaussians."""
+    return make_room(0, objects=5, views=6, width=96, height=72, spacing=0.08)
+
+
+def name_features(scene: Scene, rename: dict[str, str] | None = None) -> tuple[GaussianFeatures, TextTable]:
+    """Features that are the vector of the name of the object that a Gaussian lies in, with some noise; what lies in
+    none was seen by no view where it lies high."""
+    assert scene.gaussians is not None
+    rng = np.random.default_rng(0)
+    means = scene.gaussians.means
+    numbers = object_numbers(means, scene.objects, scene.origin, 0.01)
+    rename = rename or {}
+    names = [rename.get(each.name or "room", each.name or "room") for each in scene.objects]
+    known = list(dict.fromkeys([*names, "piano"]))
+    vectors = np.linalg.qr(rng.normal(size=(CHANNELS, len(known))))[0].T.astype(np.float32)
+    row = np.array([known.index("room"), *(known.index(name) for name in names)])[numbers]
+    features = vectors[row] + NOISE * rng.normal(size=(len(means), CHANNELS)).astype(np.float32) / CHANNELS**0.5
+    seen = (numbers > 0) | (means[:, 2] < 1.0)
+    weights = np.where(seen, rng.uniform(0.1, 50, len(means)), 0).astype(np.float32)
+    features[~seen] = 0
+    mean = features[seen].mean(axis=0)
+    space = FeatureSpace(name="names", channels=CHANNELS, teacher="labels", text_encoder="table")
+    made = GaussianFeatures(features=features, weights=weights, mean=mean, space=space)
+    return made, make_text_table(known, vectors, "table")
+
+
+def save_viewed_room(folder: Path, rename: dict[str, str] | None = None, **changes: object) -> Scene:
+    """Writes the room as a scene into `folder/room`, and its features into `folder/features`."""
+    scene = room_scene()
+    write_room(scene, folder / "room")
+    features, table = name_features(scene, rename)
+    (folder / "features").mkdir()
+    save_features(folder / "features", replace(scene, **changes), features)  # type: ignore[arg-type]
+    save_text_table(folder / "features" / WORDS_FILE, table)
+    return scene
+
+
+def search_of(folder: Path, *, max_gaussians: int = 1_000_000) -> SceneSearch:
+    """The search over the features in a folder."""
+    shown = shown_scene(load_features(folder), "features", max_gaussians=max_gaussians)
+    return SceneSearch(shown=shown, words=load_text_table(folder / WORDS_FILE), config=LocalizeConfig())

@@ -1,0 +1,108 @@
+// Answers of the server that sent the page; see gsencoder/infer/viewer/server.py.
+
+import { arrayOf, readContainer, type Container } from "./container";
+import { Scene } from "./scene";
+import type { Answer, Answers, FoundBox, Judged, Labels, SceneMeta } from "./types";
+
+interface SentBox {
+  query: string;
+  rank: number;
+  score: number;
+  probability: number;
+  count: number;
+  obb: { center: [number, number, number]; rotation: number[][]; size: [number, number, number] };
+}
+
+async function checked(response: Response): Promise<Response> {
+  if (response.ok) return response;
+  let message = `The server answered ${response.status}.`;
+  try {
+    message = ((await response.json()) as { error?: string }).error ?? message;
+  } catch {
+    // The status says enough.
+  }
+  throw new Error(message);
+}
+
+async function get(path: string): Promise<ArrayBuffer> {
+  return (await checked(await fetch(path))).arrayBuffer();
+}
+
+async function post(path: string, body: unknown): Promise<Response> {
+  const request = { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
+  return checked(await fetch(path, request));
+}
+
+export async function sceneOfServer(number: number): Promise<Scene> {
+  return new Scene(readContainer<SceneMeta>(await get(`scene/${number}`)));
+}
+
+export class ServerAnswers implements Answers {
+  private readonly photographs = new Map<number, string>();
+  private found: Promise<Labels> | null = null;
+
+  constructor(
+    private readonly number: number,
+    private readonly scene: Scene,
+  ) {}
+
+  async ask(word: string): Promise<Answer> {
+    const response = await post("ask", { scene: this.number, word });
+    const sent: Container<{ threshold: number | null; step: number; unseen: number }> = readContainer(
+      await response.arrayBuffer(),
+    );
+    const steps = arrayOf(sent, "relevancy", Int16Array);
+    const { step, unseen, threshold } = sent.meta;
+    const relevancy = new Float32Array(steps.length);
+    for (let row = 0; row < steps.length; row++) {
+      const value = steps[row] as number;
+      relevancy[row] = value === unseen ? NaN : value * step;
+    }
+    return { word, relevancy, threshold };
+  }
+
+  async judge(answer: Answer, _found: FoundBox[]): Promise<Judged> {
+    const response = await post("boxes", { scene: this.number, word: answer.word });
+    const sent = (await response.json()) as { boxes: SentBox[]; probability: number };
+    const origin = this.scene.meta.origin;
+    const boxes = sent.boxes.map((box): FoundBox => {
+      const center = box.obb.center.map((value, axis) => value - (origin[axis] ?? 0)) as [number, number, number];
+      return {
+        word: box.query,
+        rank: box.rank,
+        score: box.score,
+        probability: box.probability,
+        center,
+        rotation: box.obb.rotation.flat(),
+        size: box.obb.size,
+        rows: null,
+        count: box.count,
+      };
+    });
+    return { boxes, probability: sent.probability };
+  }
+
+  async bestWords(rows: number[]): Promise<[string, number][]> {
+    const response = await post("words", { scene: this.number, rows });
+    return ((await response.json()) as { words: [string, number][] }).words;
+  }
+
+  labels(): Promise<Labels> {
+    this.found ??= get(`labels/${this.number}`).then((buffer) => {
+      const sent = readContainer<{ names: string[] }>(buffer);
+      return { names: sent.meta.names, numbers: arrayOf(sent, "numbers", Uint16Array) };
+    });
+    return this.found;
+  }
+
+  async photograph(view: number): Promise<string | null> {
+    if (!this.scene.meta.photographs) return null;
+    let address = this.photographs.get(view);
+    if (!address) {
+      const response = await checked(await fetch(`photograph/${this.number}/${view}`));
+      address = URL.createObjectURL(await response.blob());
+      this.photographs.set(view, address);
+    }
+    return address;
+  }
+}
