@@ -10,7 +10,7 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, from_pose
-from gsencoder.infer.localize.pixel_relevancy import GaussianProducts
+from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.relevancy import Mode, relevancy, word_directions
 from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.memory.render import render_features
@@ -114,7 +114,7 @@ def test_cosines_of_gaussians_are_relevancies_also_in_chunks_and_near_the_mean(m
     values[~features.seen] = 0
     features = replace(features, features=values.astype(np.float32))
     expected = relevancy(features, words().encode(NAMES), words().mean)
-    monkeypatch.setattr("gsencoder.infer.localize.pixel_relevancy.CHUNK_BYTES", 8 * CHANNELS * 42)
+    monkeypatch.setattr("gsencoder.infer.localize.gaussian_products.CHUNK_BYTES", 8 * CHANNELS * 42)
     directions = word_directions(words().encode(NAMES), words().mean)
     cosines = GaussianProducts(features).cosines(directions)
     near_mean = np.arange(295) // 50 == 4
