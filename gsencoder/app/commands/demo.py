@@ -12,6 +12,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
@@ -27,8 +28,14 @@ from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.viewer.bundle import load_bundle
+from gsencoder.infer.viewer.file_size import fitting_page
+from gsencoder.infer.viewer.page_scene import FileOptions
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.types import Scene, SceneObject
+
+PAGE = "page.html"
+PAGE_OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=16, photograph_side=640)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,9 +93,34 @@ def run(config: DemoConfig, summary: Summary) -> None:
             report="report.html",
             **{one.title: one.to_dict() for one in results},
         )
+        with summary.step("page"):
+            missing = write_page(folder / PAGE, scene, results[0], names, config.localize)
+        if missing:
+            screen.print(f"{PAGE} is left out: {missing}")
         with summary.step("report"):
-            write_report(folder / "report.html", scene, results, summary)
+            write_report(folder / "report.html", scene, results, summary, page="" if missing else PAGE)
     screen.print(f"{out}/report.html is the report; {out}/room is a scene folder for the other commands")
+
+
+def write_page(path: Path, scene: Scene, one: TeacherResult, words: TextTable, config: LocalizeConfig) -> str:
+    """Writes the room as the page of `gsencoder view`; returns why there is none, or nothing."""
+    try:
+        bundle = load_bundle()
+    except InputError as error:
+        return str(error)
+    shown = replace(scene, features={one.features.space.name: one.features})
+    made = fitting_page(
+        bundle,
+        [(shown, one.title, words)],
+        config,
+        scene.objects,
+        PAGE_OPTIONS,
+        max_gaussians=10**6,
+        max_bytes=25 * 10**6,
+    )
+    with atomic_file(path) as stream:
+        stream.write(made.page)
+    return ""
 
 
 def photographed_room(config: DemoConfig, folder: Path, summary: Summary) -> Scene:

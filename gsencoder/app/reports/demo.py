@@ -70,8 +70,10 @@ class TeacherResult:
         }
 
 
-def write_report(path: Path, scene: Scene, results: Sequence[TeacherResult], summary: Summary) -> None:
-    """Draws the pictures and writes the report."""
+def write_report(
+    path: Path, scene: Scene, results: Sequence[TeacherResult], summary: Summary, *, page: str = ""
+) -> None:
+    """Draws the pictures and writes the report, with a link to a page beside it if there is one."""
     assert scene.gaussians is not None
     assert scene.views is not None
     report = HtmlReport(
@@ -87,6 +89,9 @@ def write_report(path: Path, scene: Scene, results: Sequence[TeacherResult], sum
             **{f"{one.title} localized": f"{one.num_localized} of {len(one.words)}" for one in results},
         }
     )
+    if page:
+        report.section("In a browser")
+        report.link("The room as a page: type a word, and see it", page)
     features = {one.title: one.features for one in results}
     add_views(report, scene, features)
     for one in results:

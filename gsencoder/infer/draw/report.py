@@ -5,6 +5,7 @@ import io
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import UInt8
@@ -69,6 +70,10 @@ class HtmlReport:
     def paragraph(self, text: str) -> None:
         """Adds a paragraph."""
         self._add(f"<p>{escape(text)}</p>")
+
+    def link(self, text: str, file: str) -> None:
+        """Adds a link to a file beside the page."""
+        self._add(f'<p><a href="{escape(quote(file))}">{escape(text)}</a></p>')
 
     def pictures(
         self,
