@@ -17,10 +17,10 @@ def summary_of(folder: Path) -> dict[str, Any]:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line that a refused command prints."""
+    """The one line that a refused command prints, beside warnings and a note on what it leaves behind."""
     capsys.readouterr()
     assert cli.main(["reconstruct", *arguments]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith(("warning: ", "note: "))]
     assert len(lines) == 1
     return lines[0]
 

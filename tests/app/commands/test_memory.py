@@ -46,6 +46,7 @@ def made(room: Path, teachers: list[str]) -> Path:
 
 def test_a_memory_of_two_teachers_is_written_with_its_words_and_figures(made: Path) -> None:
     assert {path.name for path in made.iterdir()} == {
+        "log.csv",
         "memory.labels.safetensors",
         "memory.palette.safetensors",
         "scene.safetensors",

@@ -43,5 +43,5 @@ def test_a_memory_of_predictions_has_their_mean_and_all_gaussians_without_any_fu
     np.testing.assert_allclose(memory.mean, mean, atol=1e-6)
     message = refusal(capsys, *words, "teacher=labels", f"out={tmp_path / 'other'}")
     assert "gives features of (palette" in message
-    assert "give weights that were trained with this teacher" in message
+    assert "give an encoder that was trained with this teacher" in message
     assert not (tmp_path / "other").exists()

@@ -132,5 +132,8 @@ def test_a_signal_is_ours_after_pycolmap_came(tmp_path: Path, ten: Path) -> None
     words += ["sfm.size=400", "sfm.features=2000", "dense.spacing=12"]
     done = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=False)
     assert done.returncode == 128 + signal.SIGTERM
-    assert done.stderr.splitlines()[-1].startswith("stopped: SIGTERM")
+    stopped, note = done.stderr.splitlines()[-2:]
+    assert stopped.startswith("stopped: SIGTERM")
+    assert note.startswith("note: ")
+    assert "holds what was computed" in note
     assert not list(tmp_path.glob(".out.partial-*"))
