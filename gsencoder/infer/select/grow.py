@@ -175,8 +175,8 @@ def grow(
         from gsencoder.infer.select.votes import sampling, votes
 
         chosen = sampling(cameras, views=config.views, pixels=config.pixels)
-        found = votes(gaussians, cameras, labels, len(parts), chosen, spacing=spacing, track=track)
-        labels = labels_by_pixels(candidates, features.seen, found, config)
-        unknown = unknown & (found.present.sum(axis=1) + found.removed.sum(axis=1) == 0)
+        by_pixels = votes(gaussians, cameras, labels, len(parts), chosen, spacing=spacing, track=track)
+        labels = labels_by_pixels(candidates, features.seen, by_pixels, config)
+        unknown = unknown & (by_pixels.present.sum(axis=1) + by_pixels.removed.sum(axis=1) == 0)
         looked = len(chosen.views)
     return labels_of_hidden(gaussians, labels, candidates.possible, unknown, spacing), looked

@@ -48,7 +48,7 @@ def select(
         boxes: numbers of the boxes of each word, best first from 0; empty = the most probable, and those that are
             nearly as probable.
         threshold: a relevancy instead of boxes.
-        localization: how boxes are found.
+        localization: how words become boxes.
         track: progress over the views.
 
     Returns:
@@ -68,25 +68,25 @@ def select(
     if len(words) > MOST_WORDS:
         raise InputError(f"query: expected at most {MOST_WORDS} words to select, got {len(words)}")
     gaussians, features = select_features(scene, None)
-    found = localize(scene, words, text, localization)
+    localized = localize(scene, words, text, localization)
     if threshold is None:
-        parts = box_parts(found, boxes, probable=config.probable)
+        parts = box_parts(localized, boxes, probable=config.probable)
     else:
-        parts = threshold_parts(words, found.relevancy, threshold)
-    seeds = labels = labels_of_parts(parts, found.relevancy)
+        parts = threshold_parts(words, localized.relevancy, threshold)
+    seeds = labels = labels_of_parts(parts, localized.relevancy)
     looked, placed = 0, False
     if config.grow and labels.any():
         # A part keeps what no other word took from it.
         parts = tuple(
-            tuple(kept for rows in groups if len(kept := rows[labels[rows] == number + 1]))
+            tuple(own for rows in groups if len(own := rows[labels[rows] == number + 1]))
             for number, groups in enumerate(parts)
         )
         seen_by, placed = _with_cameras(scene, config)
         cameras = None if seen_by.views is None else seen_by.views.cameras
         spacing = scene_spacing(gaussians.means) or float(np.median(gaussians.scales))
-        labels, looked = grow(gaussians, features, cameras, parts, found.relevancy, config, spacing, track=track)
-    _check_some(scene, found, labels)
-    return Selection(words=tuple(words), labels=labels, seeds=seeds, views=looked, placed=placed), found
+        labels, looked = grow(gaussians, features, cameras, parts, localized.relevancy, config, spacing, track=track)
+    _check_some(scene, localized, labels)
+    return Selection(words=tuple(words), labels=labels, seeds=seeds, views=looked, placed=placed), localized
 
 
 def _with_cameras(scene: Scene, config: SelectConfig) -> tuple[Scene, bool]:
@@ -101,14 +101,14 @@ def _with_cameras(scene: Scene, config: SelectConfig) -> tuple[Scene, bool]:
     return with_views(replace(scene, features={}), config.orbits), True
 
 
-def _check_some(scene: Scene, found: Localization, labels: np.ndarray) -> None:
+def _check_some(scene: Scene, localized: Localization, labels: np.ndarray) -> None:
     if labels.all():
         raise InputError(
             f"select: every one of the {len(labels):,} Gaussians of {scene.name} is selected, so nothing is left; give "
             "a higher threshold= or fewer words"
         )
     if not labels.any():
-        listing = ", ".join(f"{word!r} (probability {value:.2f})" for word, value in found.absent.items())
+        listing = ", ".join(f"{word!r} (probability {value:.2f})" for word, value in localized.absent.items())
         raise InputError(
             f"select: no Gaussian of {scene.name} is selected; absent: {listing}"
             if listing

@@ -133,8 +133,8 @@ class SceneSearch:
         config = replace(self.config, eps=self.eps)
         with self._boxes_lock, warnings.catch_warnings():
             warnings.simplefilter("ignore", SceneWarning)
-            found = localize(self.shown.scene, [word], words, config)
-        return {"boxes": localization_to_json(found), "probability": float(found.probabilities[0])}
+            localized = localize(self.shown.scene, [word], words, config)
+        return {"boxes": localization_to_json(localized), "probability": float(localized.probabilities[0])}
 
     def best_words(self, rows: Sequence[int]) -> list[tuple[str, float]]:
         """The known words nearest to the mean direction of some Gaussians, best first, with their cosines."""
@@ -169,13 +169,13 @@ class SceneSearch:
         rows = np.flatnonzero(features.seen)
         best, cosines = self._best_of(rows, targets)
         totals = np.bincount(best, features.weights[rows] * (cosines >= LEAST_LABEL), len(table))
-        kept = np.argsort(-totals, kind="stable")[:LABELS]
-        kept = kept[totals[kept] > 0]
+        named = np.argsort(-totals, kind="stable")[:LABELS]
+        named = named[totals[named] > 0]
         numbers = np.full(len(features), NO_LABEL, np.uint16)
-        if len(kept):
-            best, cosines = self._best_of(rows, targets[kept])
+        if len(named):
+            best, cosines = self._best_of(rows, targets[named])
             numbers[rows] = np.where(cosines >= LEAST_LABEL, best, NO_LABEL)
-        return Labels(names=tuple(table.names[row] for row in kept), numbers=numbers)
+        return Labels(names=tuple(table.names[row] for row in named), numbers=numbers)
 
     def _best_of(
         self, rows: Int64[np.ndarray, " n"], targets: Float32[np.ndarray, "C S"]

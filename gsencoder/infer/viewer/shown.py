@@ -93,7 +93,7 @@ def spz_bytes(gaussians: Gaussians, *, sh_degree: int = 3) -> bytes:
 
     Args:
         gaussians: relative to the scene's origin, which is not added.
-        sh_degree: largest degree of spherical harmonics that is kept.
+        sh_degree: largest degree of spherical harmonics that is written.
     """
     degree = min(sh_degree, gaussians.sh_degree)
     raw = RawSplat(
