@@ -122,6 +122,12 @@ def run(config: ViewConfig, summary: Summary) -> None:
     with summary.step("load"):
         photographed = load_scene(config.photos, options=config.data) if config.photos else None
         loaded = [_load(Path(path), config, photographed) for path in config.paths]
+    names = [scene.name for scene, _ in loaded]
+    if len(set(names)) > 1:
+        raise InputError(
+            f"paths: {config.paths[0]} is of scene {names[0]}, and {config.paths[1]} of {names[1]}; give two folders "
+            "of one scene, which are shown under one camera"
+        )
     objects = () if photographed is None else photographed.objects
     titles = _titles([Path(path) for path in config.paths])
     if config.out is not None:

@@ -7,14 +7,18 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 from command_runs import refusal
 from viewed_rooms import STUB, save_viewed_room
 
 from gsencoder.app import cli
+from gsencoder.app.commands import view
 from gsencoder.infer.viewer import bundle
+from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow
 
@@ -108,10 +112,14 @@ def test_a_page_that_was_not_built_is_refused_in_one_line(
 
 SERVE = """
 import sys
+from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 from gsencoder.infer.viewer import bundle
+from gsencoder.types import Scene
 bundle.STATIC = Path(sys.argv[1])
 from gsencoder.app import cli
+from gsencoder.app.commands import view
 sys.exit(cli.main(["view", sys.argv[2], "open=false"]))
 """
 
@@ -141,3 +149,21 @@ def test_the_server_answers_until_it_is_stopped_and_then_says_how_it_ended(
         _, errors = process.communicate(timeout=30)
     assert process.returncode == code
     assert "Traceback" not in errors
+
+
+def test_folders_of_two_scenes_are_not_shown_side_by_side(
+    folder: Path, built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    features, other = folder / "features", tmp_path / "other"
+    copytree(features, other)
+    load = view.load_features
+
+    def renamed(path: Path) -> Scene:
+        scene = load(path)
+        return replace(scene, name="elsewhere") if path == other else scene
+
+    monkeypatch.setattr(view, "load_features", renamed)
+    message = refusal(capsys, "view", str(features), str(other), f"out={tmp_path / 'two.html'}")
+    assert "and" in message
+    assert "of elsewhere; give two folders of one scene" in message
+    assert not (tmp_path / "two.html").exists()
