@@ -25,7 +25,7 @@ from gsencoder.infer.viewer.page import served_page
 from gsencoder.infer.viewer.page_scene import scene_container
 from gsencoder.infer.viewer.search import SceneSearch
 from gsencoder.infer.viewer.server import ViewServer
-from gsencoder.infer.viewer.shown import rows_of_features, shown_scene
+from gsencoder.infer.viewer.shown import drawn_scene, rows_of_features
 
 WORDS = ("mug", "chair", "table", "window", "book")
 SCRIPT = """async (words) => {
@@ -59,7 +59,7 @@ def enlarged(folder: Path, count: int) -> SceneSearch:
     means = gaussians.means + rng.normal(0, 0.2, gaussians.means.shape) * np.median(gaussians.scales)
     gaussians = replace(gaussians, means=means.astype(np.float32), scales=0.6 * gaussians.scales)
     scene = replace(scene, gaussians=gaussians, features={name: rows_of_features(features, rows)})
-    return SceneSearch(shown=shown_scene(scene, "a", max_gaussians=count), words=words, config=LocalizeConfig())
+    return SceneSearch(shown=drawn_scene(scene, "a", max_gaussians=count), words=words, config=LocalizeConfig())
 
 
 def ask(server: ViewServer, word: str) -> tuple[float, int]:

@@ -10,7 +10,7 @@ from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_featur
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.viewer.bundle import Bundle
 from gsencoder.infer.viewer.search import SceneSearch
-from gsencoder.infer.viewer.shown import object_numbers, shown_scene
+from gsencoder.infer.viewer.shown import drawn_scene, object_numbers
 from gsencoder.text.table import TextTable, load_text_table, make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
@@ -60,5 +60,5 @@ def save_viewed_room(folder: Path, rename: dict[str, str] | None = None, **chang
 
 def search_of(folder: Path, *, max_gaussians: int = 1_000_000) -> SceneSearch:
     """The search over the features in a folder."""
-    shown = shown_scene(load_features(folder), "features", max_gaussians=max_gaussians)
+    shown = drawn_scene(load_features(folder), "features", max_gaussians=max_gaussians)
     return SceneSearch(shown=shown, words=load_text_table(folder / WORDS_FILE), config=LocalizeConfig())

@@ -90,11 +90,11 @@ def generate_from_features(
     Raises:
         InputError: the model has no such module or several, or takes features of another shape.
     """
-    found = {name: each for name, each in model.named_modules() if name.rpartition(".")[2] in CONNECTORS}
-    if len(found) != 1:
+    connectors = {name: each for name, each in model.named_modules() if name.rpartition(".")[2] in CONNECTORS}
+    if len(connectors) != 1:
         raise InputError(
             f"{WHAT}: expected a model with one module called {' or '.join(CONNECTORS)} between its tower and its "
-            f"language model, got {type(model).__name__} with {len(found)}"
+            f"language model, got {type(model).__name__} with {len(connectors)}"
         )
     replaced = 0
 
@@ -109,7 +109,7 @@ def generate_from_features(
         replaced += 1
         return (tokens.to(given[0].device, given[0].dtype), *given[1:])
 
-    handle = next(iter(found.values())).register_forward_pre_hook(replace)
+    handle = next(iter(connectors.values())).register_forward_pre_hook(replace)
     try:
         with torch.inference_mode(), quiet_transformers():
             ids = model.generate(**inputs, max_new_tokens=max_tokens, do_sample=False, num_beams=1)

@@ -115,12 +115,12 @@ def ground(
             f"got {int(truth.sum())} pixels of {truth.shape}"
         )
     finite = bool(np.isfinite(relevancy).all())
-    found = relevancy > otsu_threshold(relevancy) if finite else np.zeros_like(truth)
+    above = relevancy > otsu_threshold(relevancy) if finite else np.zeros_like(truth)
     return GroundedPair(
         view=view,
         phrase=phrase,
-        intersection=int((found & truth).sum()),
-        union=int((found | truth).sum()),
+        intersection=int((above & truth).sum()),
+        union=int((above | truth).sum()),
         finite=finite,
     )
 

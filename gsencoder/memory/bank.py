@@ -171,14 +171,15 @@ class _Builder:
         if config.threshold:
             return config.threshold
         if config.components:
-            features = sum(len(rows) for rows, _, _ in self._rows())
+            counts = np.array([(len(rows), directed.sum()) for rows, _, directed in self._rows()]).reshape(-1, 2)
+            features, directed = counts.sum(axis=0).tolist()
             if min(config.components, features) > self._limit:
                 raise InputError(
                     f"bank.components={config.components:,}: {self._too_large()}; give at most {self._limit:,}"
                 )
             # One component is for features without a direction.
-            most = min(config.components, features) - self._has_undirected()
-            if most < 1 and any(directed.any() for _, _, directed in self._rows()):
+            most = min(config.components, features) - (directed < features)
+            if most < 1 and directed:
                 raise InputError(
                     f"bank.components={config.components}: cells at the mean need a component beside that of others; "
                     "give 2 or more"
@@ -202,9 +203,6 @@ class _Builder:
         return 1 - largest_threshold(
             lambda each: _mean_cosine(sample, _cover_of(sample, 1 - each), kinds) >= config.cosine
         )
-
-    def _has_undirected(self) -> bool:
-        return any(not directed.all() for _, _, directed in self._rows())
 
     def _sample(self) -> Float32[np.ndarray, "n D"]:
         """Features with a direction, evenly from all views."""

@@ -25,9 +25,9 @@ from gsencoder.infer.viewer.page import file_page, json_in_script, served_page
 from gsencoder.infer.viewer.page_scene import WORD_STEP, FileOptions, file_container, scene_container
 from gsencoder.infer.viewer.search import NO_LABEL, RELEVANCY_STEP, UNSEEN, SceneSearch
 from gsencoder.infer.viewer.shown import (
+    drawn_scene,
     object_numbers,
     rows_of_features,
-    shown_scene,
     spz_bytes,
     weight_bytes,
 )
@@ -184,7 +184,7 @@ def test_harmonics_above_a_degree_are_left_out(tmp_path: Path, rng: np.random.Ge
 
 def test_thinned_scenes_say_so_and_keep_features_with_their_gaussians(search: SceneSearch) -> None:
     scene = search.shown.scene
-    thin = shown_scene(scene, "t", max_gaussians=500)
+    thin = drawn_scene(scene, "t", max_gaussians=500)
     assert len(thin.gaussians) == len(thin.features) == 500
     assert thin.total == len(search.shown.gaussians)
     assert "500 of" in thin.notes[0]
@@ -196,7 +196,7 @@ def test_thinned_scenes_say_so_and_keep_features_with_their_gaussians(search: Sc
 
 def test_a_scene_that_is_not_thinned_is_left_as_it_is(search: SceneSearch) -> None:
     count = len(search.shown.gaussians)
-    whole = shown_scene(search.shown.scene, "t", max_gaussians=count)
+    whole = drawn_scene(search.shown.scene, "t", max_gaussians=count)
     assert whole.gaussians is search.shown.gaussians
 
 
@@ -263,7 +263,7 @@ def test_photographs_of_a_file_are_small_and_say_whose_they_are(search: SceneSea
 
 
 def replace_shown(search: SceneSearch, scene: Scene) -> SceneSearch:
-    shown = shown_scene(scene, "features", max_gaussians=1_000_000)
+    shown = drawn_scene(scene, "features", max_gaussians=1_000_000)
     return SceneSearch(shown=shown, words=search.words, config=search.config)
 
 
@@ -313,7 +313,7 @@ def test_features_without_words_are_shown_and_say_that_none_lead_into_them(searc
     features = search.shown.features
     space = replace(features.space, name="dense", text_encoder="")
     scene = replace(search.shown.scene, features={"dense": replace(features, space=space)})
-    mute = SceneSearch(shown=shown_scene(scene, "t", max_gaussians=10**6), words=None, config=LocalizeConfig())
+    mute = SceneSearch(shown=drawn_scene(scene, "t", max_gaussians=10**6), words=None, config=LocalizeConfig())
     with pytest.raises(InputError, match="no words lead into"):
         mute.ask("mug")
     assert mute.best_words([0]) == []

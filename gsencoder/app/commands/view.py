@@ -24,7 +24,7 @@ from gsencoder.infer.viewer.page import served_page
 from gsencoder.infer.viewer.page_scene import FileOptions, scene_container
 from gsencoder.infer.viewer.search import SceneSearch
 from gsencoder.infer.viewer.server import ViewServer
-from gsencoder.infer.viewer.shown import shown_scene
+from gsencoder.infer.viewer.shown import drawn_scene
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.text.build import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene, SceneObject
@@ -163,7 +163,7 @@ def _serve(
 ) -> None:
     searches = [
         SceneSearch(
-            shown=shown_scene(scene, title, max_gaussians=config.max_gaussians), words=words, config=config.localize
+            shown=drawn_scene(scene, title, max_gaussians=config.max_gaussians), words=words, config=config.localize
         )
         for (scene, words), title in zip(loaded, titles, strict=True)
     ]

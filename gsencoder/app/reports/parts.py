@@ -34,14 +34,15 @@ def add_views(report: HtmlReport, scene: Scene, features: Mapping[str, GaussianF
     shown = even_indices(len(views), SHOWN_VIEWS).tolist()
     colors = {title: fit_pca_colors(each.stored(each.seen)) for title, each in features.items()}
     rendered, depths = [], []
+    stored = {title: torch.from_numpy(each.stored()) for title, each in features.items()}
     fields: dict[str, list[np.ndarray]] = {title: [] for title in features}
     for view in shown:
         b = blend(gaussians, views.cameras, view)
         rendered.append(render_image(gaussians, views.cameras, view, blended=b))
         depths.append(depth_picture(depth_image(b)))
         alpha = b.alpha.reshape(b.shape).numpy()
-        for title, each in features.items():
-            values = b.render(torch.from_numpy(each.stored())).reshape(*b.shape, -1).numpy()
+        for title, rows in stored.items():
+            values = b.render(rows).reshape(*b.shape, -1).numpy()
             fields[title].append(pca_picture(values, colors[title], alpha))
     captions = [f"view {view}" for view in shown]
     if views.images is not None:

@@ -10,7 +10,7 @@ from gsencoder.infer.viewer.container import Container
 from gsencoder.infer.viewer.page import file_page
 from gsencoder.infer.viewer.page_scene import FileOptions, file_container
 from gsencoder.infer.viewer.search import SceneSearch
-from gsencoder.infer.viewer.shown import shown_scene
+from gsencoder.infer.viewer.shown import drawn_scene
 from gsencoder.text.build import Words, closed_table
 from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.types import Scene, SceneObject
@@ -126,6 +126,6 @@ def _container(
 ) -> Container:
     advice = "megabytes= or max_gaussians= takes more"
     search = SceneSearch(
-        shown=shown_scene(scene, title, max_gaussians=limit, advice=advice), words=words, config=config
+        shown=drawn_scene(scene, title, max_gaussians=limit, advice=advice), words=words, config=config
     )
     return file_container(search, objects, options)

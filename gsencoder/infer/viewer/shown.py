@@ -48,7 +48,7 @@ class ShownScene:
         return next(iter(self.scene.features.values()))
 
 
-def shown_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "") -> ShownScene:
+def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "") -> ShownScene:
     """A scene with at most so many Gaussians, evenly chosen and enlarged so that surfaces stay closed.
 
     Args:
