@@ -8,6 +8,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 # Vectors of phrases are not cached in the user's folder.
 os.environ["GSENCODER_CACHE"] = "off"
+# A test that needs a model names its folder: with a developer's own models in reach, it could pass for them alone.
+os.environ.pop("GSENCODER_MODELS", None)
 
 import signal
 from collections.abc import Iterator

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_runs import refusal, results_of
+from named_rooms import write_words
 
 from gsencoder.app import cli
 from gsencoder.data.synthetic.room import make_room
@@ -15,7 +16,6 @@ from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.export import header_of
 from gsencoder.infer.onnx.header import from_metadata, to_metadata
 from gsencoder.models.weights import load_weights
-from gsencoder.text.table import make_text_table, save_text_table
 
 pytestmark = pytest.mark.slow
 
@@ -36,14 +36,11 @@ QUICK = (
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three rooms, of which the second has no labels, and the words of all that is in them."""
     folder = tmp_path_factory.mktemp("rooms")
-    names: set[str] = set()
-    for number in range(3):
-        room = make_room(number, objects=3, views=3, width=100, height=75)
+    made = [make_room(number, objects=3, views=3, width=100, height=75) for number in range(3)]
+    for number, room in enumerate(made):
         write_room(room, folder / f"room_{number}")
-        names |= {thing.name for thing in room.objects if thing.name}
     (folder / "room_1" / "objects.json").unlink()
-    vectors = np.eye(len(names), dtype=np.float32)
-    save_text_table(folder / "words.safetensors", make_text_table(sorted(names), vectors, "room-words"))
+    write_words(folder / "words.safetensors", *made)
     return folder
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from command_runs import refusal
+from named_rooms import write_words
 
 from gsencoder.app import cli
 from gsencoder.app.commands.train import TrainCommandConfig
@@ -52,13 +53,10 @@ def summary_of(folder: Path) -> dict[str, Any]:
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three rooms and the words of all that is in them."""
     folder = tmp_path_factory.mktemp("rooms")
-    names: set[str] = set()
-    for number in range(3):
-        room = make_room(number, objects=4, views=4, width=120, height=90)
+    made = [make_room(number, objects=4, views=4, width=120, height=90) for number in range(3)]
+    for number, room in enumerate(made):
         write_room(room, folder / f"room_{number}")
-        names |= {thing.name for thing in room.objects if thing.name}
-    vectors = np.eye(len(names), dtype=np.float32)
-    save_text_table(folder / "words.safetensors", make_text_table(sorted(names), vectors, "room-words"))
+    write_words(folder / "words.safetensors", *made)
     return folder
 
 

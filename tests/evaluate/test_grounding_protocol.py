@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from named_rooms import write_words
 from rooms import room
 
 from gsencoder.app import cli
@@ -27,7 +28,7 @@ from gsencoder.evaluate.protocols.grounding import (
 )
 from gsencoder.memory.queries import memory_of_features
 from gsencoder.render import blend
-from gsencoder.text.table import make_text_table, save_text_table
+from gsencoder.text.table import make_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, Scene, SceneObject, Views
 
 
@@ -164,9 +165,7 @@ def test_the_command_writes_pairs_and_names_and_takes_features_of_folders(
 ) -> None:
     made = make_room(0, objects=4, views=4, width=120, height=90)
     write_room(made, tmp_path / "room_0")
-    names = sorted({each.name for each in made.objects if each.name})
-    table = make_text_table(names, np.eye(len(names), dtype=np.float32), "room-words")
-    save_text_table(tmp_path / "words.safetensors", table)
+    write_words(tmp_path / "words.safetensors", made)
     scene, teacher = str(tmp_path / "room_0"), f"teacher.words={tmp_path / 'words.safetensors'}"
     ask = ["evaluate", scene, "protocol=grounding", "protocol.min_pixels=10"]
     assert cli.main([*ask, teacher, f"out={tmp_path / 'fused'}"]) == 0

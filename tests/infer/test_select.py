@@ -280,6 +280,7 @@ def test_a_mug_on_a_table_that_ends_below_it_leaves_a_hole() -> None:
         (("lamp",), {}, r"no Gaussian of table is selected; absent: 'lamp' \(probability"),
         (("mug",), {"threshold": -1.0}, "every one of the .* Gaussians of table is selected"),
         (("teapot",), {}, "teapot"),
+        (("mug", "The Mugs"), {}, "'mug' and 'The Mugs' stand for the same vector; give one of them"),
         (tuple(f"word {number}" for number in range(65)), {}, "at most 64 words"),
     ],
 )

@@ -211,9 +211,11 @@ def test_a_length_that_is_no_number_is_refused(server: ViewServer, length: str) 
         assert stream.recv(64).split()[1] in (b"411", b"413")
 
 
-@pytest.mark.parametrize("method", ["PUT", "DELETE", "OPTIONS", "TRACE"])
-def test_other_methods_are_not_answered(server: ViewServer, method: str) -> None:
-    assert call(server, method, at(server, ""))[0] == 501
+@pytest.mark.parametrize("method", ["HEAD", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"])
+def test_other_methods_are_refused_after_the_token(server: ViewServer, method: str) -> None:
+    status, _, headers = call(server, method, at(server, ""))
+    assert (status, headers["Allow"]) == (405, "GET, POST")
+    assert call(server, method, "/wrong/")[0] == 403
 
 
 def test_a_port_in_use_is_one_line_that_says_so(server: ViewServer, search: SceneSearch) -> None:

@@ -212,7 +212,7 @@ def _load_scene(folder: Path) -> tuple[Scene, Gaussians]:
 
 def _open(folder: Path, name: str) -> AbstractContextManager[Archive]:
     if not (folder / name).is_file():
-        raise InputError(f"{folder}: {name} is missing; expected a folder of gsencoder features")
+        raise InputError(f"{folder}: {name} is missing; expected a folder written by fuse, encode, pack or memory")
     return open_archive(folder / name)
 
 

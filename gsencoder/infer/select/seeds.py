@@ -53,7 +53,7 @@ def threshold_parts(words: Sequence[str], relevancy: Float32[np.ndarray, "Q N"],
     # Comparisons with NaN are false: Gaussians never seen are never taken.
     rows = [np.flatnonzero(scores >= threshold) for scores in relevancy]
     if not any(len(each) for each in rows):
-        best = ", ".join(f"{word!r} {_best(scores):.3f}" for word, scores in zip(words, relevancy, strict=True))
+        best = ", ".join(f"{word!r} {_best(scores):.7g}" for word, scores in zip(words, relevancy, strict=True))
         raise InputError(f"threshold={threshold:g}: no Gaussian is as relevant; the best are {best}")
     return tuple((each,) if len(each) else () for each in rows)
 

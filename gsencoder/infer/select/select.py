@@ -55,8 +55,8 @@ def select(
         The selection, and the boxes that it started from.
 
     Raises:
-        InputError: what `localize` raises; boxes and a threshold; a box that a word does not have; no Gaussian is
-            selected, or every one.
+        InputError: what `localize` raises; two words with the same vector; boxes and a threshold; a box that a word
+            does not have; no Gaussian is selected, or every one.
 
     Warns:
         SceneWarning: words without a box; a splat without views.
@@ -68,6 +68,7 @@ def select(
     if len(words) > MOST_WORDS:
         raise InputError(f"query: expected at most {MOST_WORDS} words to select, got {len(words)}")
     gaussians, features = select_features(scene, None)
+    _check_distinct(words, text)
     localized = localize(scene, words, text, localization)
     if threshold is None:
         parts = box_parts(localized, boxes, probable=config.probable)
@@ -87,6 +88,15 @@ def select(
         labels, looked = grow(gaussians, features, cameras, parts, localized.relevancy, config, spacing, track=track)
     _check_some(scene, localized, labels)
     return Selection(words=tuple(words), labels=labels, seeds=seeds, views=looked, placed=placed), localized
+
+
+def _check_distinct(words: Sequence[str], text: TextEncoder) -> None:
+    """Refuses words with one vector, such as "chair" and "Chair": the first would take all Gaussians of both."""
+    first: dict[bytes, str] = {}
+    for word, vector in zip(words, text.encode(words), strict=True):
+        other = first.setdefault(vector.tobytes(), word)
+        if other != word:
+            raise InputError(f"query: {other!r} and {word!r} stand for the same vector; give one of them")
 
 
 def _with_cameras(scene: Scene, config: SelectConfig) -> tuple[Scene, bool]:

@@ -74,7 +74,7 @@ def fitting_page(
         if degree < highest:
             notes.append(
                 f"Spherical harmonics above degree {degree} of {highest} are left out: colors depend less on the "
-                f"direction. megabytes= larger than {max_bytes / 1e6:g} keeps them."
+                f"direction. A file larger than {max_bytes / 1e6:g} MB (megabytes=) keeps them."
             )
         known = max(0 if words is None else len(closed_table(words)) for _, _, words in scenes)
         # Other phrases need the tower, which no file holds.
@@ -98,7 +98,8 @@ def fitting_page(
         if limit < FEWEST_GAUSSIANS:
             raise InputError(
                 f"megabytes={max_bytes / 1e6:g}: not even {FEWEST_GAUSSIANS:,} Gaussians fit beside the page itself, "
-                f"which takes {fixed / 1e6:.1f}; give more, or photographs=0"
+                f"which takes {fixed / 1e6:.1f} MB; give megabytes= a larger number"
+                + (", or photographs=0" if any(each.meta["photographViews"] for each in made) else "")
             )
     metas = [each.meta for each in made]
     return MadePage(

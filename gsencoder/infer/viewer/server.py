@@ -114,6 +114,12 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         self._answer(self._post)
 
+    def do_other(self) -> None:
+        self._answer(self._other)
+
+    # Without these, the standard library answers before the token is compared.
+    do_HEAD = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = do_TRACE = do_other
+
     def _answer(self, make: Callable[[list[str]], tuple[bytes, str]]) -> None:
         try:
             data, kind = make(self._checked_path())
@@ -129,6 +135,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_response(status)
             self.send_header("Content-Type", kind)
             self.send_header("Content-Length", str(len(data)))
+            if status == HTTPStatus.METHOD_NOT_ALLOWED:
+                self.send_header("Allow", "GET, POST")
             self.send_header("Cache-Control", "no-store")
             self.send_header("X-Content-Type-Options", "nosniff")
             self.send_header("Referrer-Policy", "no-referrer")
@@ -139,7 +147,8 @@ class _Handler(BaseHTTPRequestHandler):
             if self.close_connection:
                 self.send_header("Connection", "close")
             self.end_headers()
-            self.wfile.write(data)
+            if self.command != "HEAD":
+                self.wfile.write(data)
         except ConnectionError:
             self.close_connection = True
 
@@ -172,6 +181,9 @@ class _Handler(BaseHTTPRequestHandler):
                 return jpeg_of(views, _whole(view), PHOTOGRAPH_SIDE), "image/jpeg"
         raise RefusedError(HTTPStatus.NOT_FOUND, "there is nothing at this address")
 
+    def _other(self, _: list[str]) -> tuple[bytes, str]:
+        raise RefusedError(HTTPStatus.METHOD_NOT_ALLOWED, f"expected GET or POST, got {self.command}")
+
     def _post(self, path: list[str]) -> tuple[bytes, str]:
         if path not in (["ask"], ["boxes"], ["words"]):
             raise RefusedError(HTTPStatus.NOT_FOUND, "there is nothing at this address")
@@ -191,7 +203,7 @@ class _Handler(BaseHTTPRequestHandler):
             return _json({"words": search.best_words(rows)})
         word = request.get("word")
         if not isinstance(word, str) or not word.strip() or len(word) > MAX_WORD:
-            raise RefusedError(HTTPStatus.BAD_REQUEST, f"word: expected a text of at most {MAX_WORD} characters")
+            raise RefusedError(HTTPStatus.BAD_REQUEST, f"word: expected a text of 1 to {MAX_WORD} characters")
         if path == ["boxes"]:
             return _json(search.boxes(word.strip()))
         answer = search.ask(word.strip())

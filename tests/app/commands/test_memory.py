@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_runs import refusal, results_of
+from named_rooms import write_words
 
 from gsencoder.app import cli
 from gsencoder.core.files.step_log import read_log
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 from gsencoder.fusion.store.folder import load_features, load_memories
-from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.train import memory as training
 
 pytestmark = pytest.mark.slow
@@ -26,9 +26,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rooms")
     made = make_room(0, objects=3, views=3, width=100, height=75)
     write_room(made, folder / "room")
-    names = sorted({thing.name for thing in made.objects if thing.name})
-    vectors = np.eye(len(names), dtype=np.float32)
-    save_text_table(folder / "words.safetensors", make_text_table(names, vectors, "room-words"))
+    write_words(folder / "words.safetensors", made)
     return folder / "room"
 
 

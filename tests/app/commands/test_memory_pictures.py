@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from command_runs import refusal
+from named_rooms import write_words
 from PIL import Image
 from rooms import room as furnished_room
 
@@ -22,7 +23,9 @@ QUICK = ("quiet=true", "train.steps=5", "train.warmup=2", "memory.channels=6", "
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rooms") / "room"
-    write_room(make_room(0, objects=3, views=3, width=100, height=75), folder)
+    made = make_room(0, objects=3, views=3, width=100, height=75)
+    write_room(made, folder)
+    write_words(folder.parent / "words.safetensors", made)
     return folder
 
 
@@ -31,7 +34,8 @@ def pictures_in(folder: Path) -> dict[str, bytes]:
 
 
 def test_pictures_of_each_teacher_are_written_and_come_again_the_same(room: Path, tmp_path: Path) -> None:
-    words = ["memory", str(room), "teacher=[palette,labels]", "pictures=2", *QUICK]
+    labels = f"teachers.labels.words={room.parent / 'words.safetensors'}"
+    words = ["memory", str(room), "teacher=[palette,labels]", labels, "pictures=2", *QUICK]
     for name in ("one", "other"):
         assert cli.main([*words, f"out={tmp_path / name}"]) == 0
     pictures = pictures_in(tmp_path / "one")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from command_runs import refusal
+from named_rooms import write_words
 from training_scenes import SMALL
 
 from gsencoder.app import cli
@@ -24,7 +25,9 @@ def test_a_memory_of_predictions_has_their_mean_and_all_gaussians_without_any_fu
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     room, weights = tmp_path / "room", tmp_path / "encoder.safetensors"
-    write_room(make_room(0, objects=3, views=3, width=60, height=45), room)
+    made = make_room(0, objects=3, views=3, width=60, height=45)
+    write_room(made, room)
+    names = write_words(tmp_path / "names.safetensors", made)
     mean = np.linspace(0.05, 0.15, 11, dtype=np.float32)
     outputs = OutputSpace(space=PaletteTeacher(PaletteConfig()).space, mean=mean, scale=0.3)
     torch.manual_seed(0)
@@ -41,7 +44,7 @@ def test_a_memory_of_predictions_has_their_mean_and_all_gaussians_without_any_fu
     assert len(memory) > 100
     assert (memory.weights > 0).all()
     np.testing.assert_allclose(memory.mean, mean, atol=1e-6)
-    message = refusal(capsys, *words, "teacher=labels", f"out={tmp_path / 'other'}")
+    message = refusal(capsys, *words, "teacher=labels", f"teacher.words={names}", f"out={tmp_path / 'other'}")
     assert "gives features of (palette" in message
     assert "give an encoder that was trained with this teacher" in message
     assert not (tmp_path / "other").exists()

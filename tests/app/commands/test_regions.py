@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from named_rooms import write_words
 from region_scenes import save_colors
 
 from gsencoder.app import cli
@@ -17,7 +18,7 @@ from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
-from gsencoder.text.table import load_text_table, make_text_table, save_text_table
+from gsencoder.text.table import load_text_table
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +27,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rooms") / "room"
     made = make_room(0, objects=4, views=4, width=120, height=90)
     write_room(made, folder)
-    names = sorted({thing.name for thing in made.objects if thing.name})
-    save_text_table(folder / "words.safetensors", make_text_table(names, np.eye(len(names), dtype=np.float32), "words"))
+    write_words(folder / "words.safetensors", made)
     views = load_scene(folder).views
     assert views is not None
     assert views.instances is not None
