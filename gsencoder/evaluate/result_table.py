@@ -1,0 +1,122 @@
+"""Tables of results: measured rows, and below them what papers print, marked as such."""
+
+import csv
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from gsencoder.core.errors import InputError
+
+PUBLISHED = Path(__file__).parent / "published"
+SOURCES = ("measured", "published")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultRow:
+    """The figures of one method.
+
+    Attributes:
+        source: "measured" by this program, or "published": copied from a paper.
+        method: name of the method.
+        group: heading that a paper gives the methods of a kind; empty = none.
+        values: percent by column; a column that is missing or NaN was not measured or not printed.
+    """
+
+    source: Literal["measured", "published"]
+    method: str
+    group: str = ""
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultTable:
+    """Rows under the same columns.
+
+    Attributes:
+        title: of the table.
+        columns: names of the figures, in order; all are percent.
+        rows: measured ones first.
+        notes: what a reader must know, a sentence each, such as why a column is empty.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[ResultRow, ...]
+    notes: tuple[str, ...] = ()
+
+    def csv_rows(self) -> list[dict[str, object]]:
+        """One mapping a row, with None for what is missing."""
+        return [
+            {"source": row.source, "group": row.group, "method": row.method}
+            | {column: _known(row.values.get(column)) for column in self.columns}
+            for row in self.rows
+        ]
+
+    def markdown(self) -> str:
+        """The table in Markdown, with notes below it."""
+        head = ["method", *self.columns]
+        lines = [f"**{self.title}** (percent)", "", _line(head), _line(["---", *("---:" for _ in self.columns)])]
+        for row in self.rows:
+            figures = (_known(row.values.get(column)) for column in self.columns)
+            method = row.method if row.source == "measured" else f"{row.method} (published)"
+            lines.append(_line([method, *("" if figure is None else f"{figure:.1f}" for figure in figures)]))
+        return "\n".join([*lines, *(f"\n{note}" for note in self.notes)]) + "\n"
+
+
+def table_of(
+    title: str,
+    measured: Mapping[str, Mapping[str, float]],
+    *,
+    published: str = "",
+    columns: Iterable[str] = (),
+    notes: Iterable[str] = (),
+) -> ResultTable:
+    """A table of measured shares, with a paper's rows below.
+
+    Args:
+        title: of the table.
+        measured: for each method, its figures as shares, where 1 is shown as 100 percent.
+        published: name of a file of `published/`, without its ending; empty = none.
+        columns: in order; empty = those of the measured rows, in order of first appearance.
+        notes: see `ResultTable`.
+    """
+    rows = [
+        ResultRow(source="measured", method=method, values={name: 100 * value for name, value in values.items()})
+        for method, values in measured.items()
+    ]
+    names = tuple(columns) or tuple(dict.fromkeys(name for row in rows for name in row.values))
+    below = published_rows(published) if published else ()
+    return ResultTable(title=title, columns=names, rows=(*rows, *below), notes=tuple(notes))
+
+
+def published_rows(name: str) -> tuple[ResultRow, ...]:
+    """The rows of a paper's table, in percent, as printed.
+
+    Raises:
+        InputError: there is no such table.
+    """
+    file = PUBLISHED / f"{name}.csv"
+    if not file.is_file():
+        known = ", ".join(sorted(path.stem for path in PUBLISHED.glob("*.csv")))
+        raise InputError(f"published table {name!r}: there is none; there are {known}")
+    with file.open(newline="", encoding="utf-8") as stream:
+        return tuple(
+            ResultRow(
+                source="published",
+                method=row["method"],
+                group=row["group"],
+                values={key: float(value) for key, value in row.items() if key not in ("group", "method") and value},
+            )
+            for row in csv.DictReader(stream)
+        )
+
+
+def _known(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
+
+
+def _line(cells: Iterable[str]) -> str:
+    # A bar ends a cell also where a name holds one.
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
