@@ -1,4 +1,4 @@
-"""The classes of a benchmark: their names, the ids that files have for them, and groups such as head, common and tail."""
+"""The classes of a benchmark: their names, their ids in files, and groups such as head, common and tail."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field

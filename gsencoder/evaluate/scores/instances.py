@@ -1,19 +1,24 @@
 """Average precision of instances, as ScanNet's `evaluate_semantic_instance.py` counts it (Dai et al. 2017).
 
-A truth is an instance of a scored class with 100 vertices or more. A prediction is a mask of vertices with a class and a
-score; masks of fewer than 100 vertices are left out, as are those of classes that are not scored. At a threshold of IoU:
+A truth is an instance of a scored class with 100 vertices or more. A prediction is a mask of vertices with a class and
+a score; masks of fewer than 100 vertices are left out, as are those of classes that are not scored. At a threshold of
+the IoU:
 
-* Truths, in the order of their ids, take the predictions of their class whose IoU is strictly above the threshold, in the
-  order in which these are listed, unless another truth has them already. The highest score is that of the match, and each
-  further prediction is a false positive.
-* A prediction above the threshold with no instance of its class is a false positive, unless more than that share of its
-  vertices is ignored: vertices without a scored class, and those of its class's instances below 100 vertices.
+* Truths, in the order of their ids, take the predictions of their class whose IoU is strictly above the threshold, in
+  the order in which these are listed, unless another truth has them already. The highest score is that of the match,
+  and each further prediction is a false positive.
+* A prediction that is above the threshold with no instance of its class is a false positive, unless more than that
+  share of its vertices is ignored: vertices without a scored class, and those of its class's instances that have fewer
+  than 100.
 * Precision p and recall r are taken at each distinct score, from the lowest, and the point (1, 0) is added; AP sums
   p[i] · (r[i - 1] - r[i + 1]) / 2, with r[-1] = r[0] and a 0 after the last.
 
-AP of a class is the mean over the thresholds 0.50, 0.55, …, 0.90; AP50 and AP25 are those at 0.5 and 0.25. Without truths
-a class has none, and means leave it out; with truths and no predictions it is 0. Above 0.5 a prediction can match one truth
-only, and the order of predictions means nothing; at 0.25 one prediction may lie on several truths, and the order counts.
+AP of a class is the mean over the thresholds 0.50, 0.55, …, 0.90; AP50 and AP25 are those at 0.5 and 0.25. Without
+truths a class has none, and means leave it out; with truths and no predictions it is 0.
+
+Predictions of one score are one step of the curve, whatever their order. From 0.5 on a prediction can match one truth
+only, and the order in which predictions are listed means nothing; at 0.25 one may lie on several truths, and the order
+counts there, as in the official script, whatever the scores are.
 
 Without classes, truths and predictions are all of one class; what truth labels as no class remains ignored.
 """
@@ -28,6 +33,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth
 
 OVERLAPS = np.append(np.arange(0.5, 0.95, 0.05), 0.25)
 """Thresholds of IoU. Their floating-point values decide ties: 0.6 here is 0.6000000000000001."""
@@ -35,94 +41,6 @@ MIN_REGION = 100
 """Smallest number of vertices of a truth and of a prediction that count."""
 IDS_PER_LABEL = 1000
 """An instance's id in truth is its class's id times this, and a number from 1."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InstanceTruth:
-    """The instance of each vertex of a scene.
-
-    Attributes:
-        scene: its name.
-        ids: class id · 1000 + number of the instance; other ids, such as 0, are no instance.
-    """
-
-    scene: str
-    ids: Int64[np.ndarray, " V"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InstancePrediction:
-    """Masks of a scene, each with a class and a score; masks may overlap.
-
-    Attributes:
-        scene: its name.
-        num_vertices: of the scene, V.
-        vertices: of all masks, one mask after the other; ascending within a mask.
-        offsets: where each mask begins in `vertices`, and at last their number.
-        labels: class ids.
-        scores: finite; predictions are ranked by them.
-    """
-
-    scene: str
-    num_vertices: int
-    vertices: Int64[np.ndarray, " E"]
-    offsets: Int64[np.ndarray, " M_1"]
-    labels: Int64[np.ndarray, " M"]
-    scores: Float64[np.ndarray, " M"]
-
-    def __post_init__(self) -> None:
-        masks, ends = len(self.labels), self.offsets
-        if len(self.scores) != masks or len(ends) != masks + 1:
-            raise InputError(
-                f"{self.scene}: expected as many labels as scores and masks, got {masks} labels, {len(self.scores)} "
-                f"scores and {len(ends) - 1} masks"
-            )
-        if ends[0] != 0 or ends[-1] != len(self.vertices) or (np.diff(ends) < 0).any():
-            raise InputError(
-                f"{self.scene}: the offsets of the masks do not divide their {len(self.vertices):,} vertices"
-            )
-        if not np.isfinite(self.scores).all():
-            worst = int(np.flatnonzero(~np.isfinite(self.scores))[0])
-            raise InputError(
-                f"{self.scene}: prediction {worst} has the score {self.scores[worst]}; expected finite scores"
-            )
-        rising = np.diff(self.vertices) > 0
-        rising[ends[(ends > 0) & (ends < len(self.vertices))] - 1] = True
-        if not rising.all():
-            raise InputError(f"{self.scene}: the vertices of a mask are not ascending, each once")
-        if len(self.vertices) and not (self.vertices.min() >= 0 and self.vertices.max() < self.num_vertices):
-            raise InputError(f"{self.scene}: a mask has a vertex outside of the scene's {self.num_vertices:,}")
-
-    def mask(self, index: int) -> Int64[np.ndarray, " n"]:
-        """The vertices of one mask."""
-        return self.vertices[self.offsets[index] : self.offsets[index + 1]]
-
-
-def prediction_of_masks(
-    scene: str,
-    masks: Sequence[Bool[np.ndarray, " V"]] | Bool[np.ndarray, "M V"],
-    labels: Sequence[int],
-    scores: Sequence[float],
-    *,
-    num_vertices: int,
-) -> InstancePrediction:
-    """The prediction of masks that say for each vertex whether it belongs to them.
-
-    Raises:
-        InputError: masks of another length than `num_vertices`, or what `InstancePrediction` refuses.
-    """
-    for index, mask in enumerate(masks):
-        if len(mask) != num_vertices:
-            raise InputError(f"{scene}: mask {index} has {len(mask):,} vertices, and the scene {num_vertices:,}")
-    parts = [np.flatnonzero(mask) for mask in masks]
-    return InstancePrediction(
-        scene=scene,
-        num_vertices=num_vertices,
-        vertices=np.concatenate([np.zeros(0, np.int64), *parts]),
-        offsets=np.cumsum([0, *(len(part) for part in parts)], dtype=np.int64),
-        labels=np.array(labels, np.int64),
-        scores=np.array(scores, np.float64),
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,8 +143,8 @@ def match_instances(
         raise InputError(f"the prediction is of the scene {prediction.scene!r}, and the truth of {truth.scene!r}")
     if len(truth.ids) != prediction.num_vertices:
         raise InputError(
-            f"{truth.scene}: the masks have {prediction.num_vertices:,} vertices, and the truth {len(truth.ids):,}; expected "
-            "those of the same mesh"
+            f"{truth.scene}: the masks have {prediction.num_vertices:,} vertices, and the truth {len(truth.ids):,}; "
+            "expected those of the same mesh"
         )
     ids, codes, sizes = np.unique(truth.ids, return_inverse=True, return_counts=True)
     instance_rows, rows = classes.rows(ids // IDS_PER_LABEL), classes.rows(prediction.labels)
