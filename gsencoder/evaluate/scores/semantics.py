@@ -8,7 +8,7 @@ Vertices whose true label is no class are left out. Of the others, over all scen
 where *missed* vertices of the class are predicted as another class, or as none, and *wrong* ones are of another class
 and predicted as this one (ScanNet's `evaluate_semantic_label.py`). mIoU is the mean over the classes that are in truth
 or predictions, mAcc that over the classes in truth, and accuracy the share of all vertices that are right (SceneSplat's
-`ZeroShotSemSegTester`, Li et al. 2025; it adds 1e-10 to denominators, which is not done here). A class that is predicted
+`ZeroShotSemSegTester`, Li et al. 2025; the 1e-10 that it adds to denominators is left out). A class that is predicted
 and not in truth has the IoU 0; the evaluation that SceneSplat runs during training leaves it out, and so does
 `miou_present`. f-mIoU, f-mAcc and f-accuracy are the same over the foreground: all classes but wall, floor and ceiling.
 Vertices of these still count as wrong where they are predicted as another class.
@@ -118,8 +118,8 @@ def count_labels(
     """
     if len(truth) != len(predicted):
         raise InputError(
-            f"{scene}: the prediction has {len(predicted):,} labels, and the truth {len(truth):,}; expected those of the "
-            "same vertices"
+            f"{scene}: the prediction has {len(predicted):,} labels, and the truth {len(truth):,}; expected one for each "
+            "vertex of the same mesh"
         )
     number = len(classes.names)
     true_rows, rows = classes.rows(truth), classes.rows(predicted)
