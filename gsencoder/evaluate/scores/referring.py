@@ -1,0 +1,264 @@
+"""Objects that a sentence refers to: the share of the sentences whose box has an IoU of 0.25, or 0.5, or more.
+
+ScanRefer's metric (Chen et al. 2020; `benchmark/eval.py` and `scripts/eval.py`). Boxes are axis-aligned, and
+
+    IoU = common volume / (volume + volume - common volume + 1e-8)
+
+so that a box of one quarter of the other's volume, inside of it, is below 0.25. A sentence is *unique* if its object is
+the only one of its class among the objects that the sentences of its scene describe, else *multiple*. *Others* are the
+sentences about objects of none of the 17 named classes. A sentence for which nothing was found has the IoU 0.
+
+A method that finds several boxes is also scored by the best of the first k, or of all of them, as the paper does for its
+table 5 (sec. 4.5). A user cannot know which box that is.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.core.errors import InputError
+
+IOUS = (0.25, 0.5)
+"""IoUs from which on a box counts."""
+VOLUME_EPSILON = 1e-8
+"""Volume that ScanRefer adds to a union, in cubic world units (metres, in ScanNet)."""
+OTHERS = "others"
+"""Class of the objects that are of none of ScanRefer's 17 named ones."""
+NO_TRUE_BOX = "the object has no box in the truth"
+"""Reason for which a sentence is not scored."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferredObject:
+    """The truth of one sentence.
+
+    Attributes:
+        scene: name of its scene.
+        object: id of the object.
+        annotation: number of the sentence about it.
+        box: lower and upper corner; None if the object has none, and the sentence is not scored.
+        multiple: whether its scene has several objects of its class; None if that is not known.
+        others: whether its class is none of the named ones; None if that is not known.
+    """
+
+    scene: str
+    object: str
+    annotation: str
+    box: Float64[np.ndarray, "2 3"] | None
+    multiple: bool | None = None
+    others: bool | None = None
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return self.scene, self.object, self.annotation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictedBoxes:
+    """The boxes predicted for one sentence.
+
+    Attributes:
+        scene: name of its scene.
+        object: id of the object that it is about.
+        annotation: number of the sentence about it.
+        boxes: lower and upper corners, the likeliest box first; none if nothing was found.
+    """
+
+    scene: str
+    object: str
+    annotation: str
+    boxes: Float64[np.ndarray, "K 2 3"]
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return self.scene, self.object, self.annotation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferringResult:
+    """One sentence, scored.
+
+    Attributes:
+        scene: name of its scene.
+        object: id of the object.
+        annotation: number of the sentence about it.
+        ious: of the predicted boxes with that of the object, in the order of the predictions.
+        multiple: whether its scene has several objects of its class; None if that is not known.
+        others: whether its class is none of the named ones; None if that is not known.
+    """
+
+    scene: str
+    object: str
+    annotation: str
+    ious: tuple[float, ...]
+    multiple: bool | None
+    others: bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferringCell:
+    """The accuracy of some sentences; NaN without any, where the official script prints 0."""
+
+    sentences: int
+    acc25: float
+    acc50: float
+
+
+ReferringTable = dict[str, dict[str, ReferringCell]]
+"""Cells by "unique", "multiple" and "overall", and there by "not_in_others", "in_others" and "overall"."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferringScores:
+    """The scores of sentences.
+
+    Attributes:
+        sentences: that are scored.
+        without_box: of them, those for which nothing was found.
+        top1: of the first box.
+        best_of: of the best among the first k boxes, by k.
+        best: of the best among all boxes.
+    """
+
+    sentences: int
+    without_box: int
+    top1: ReferringTable
+    best_of: dict[int, ReferringTable]
+    best: ReferringTable
+
+
+def box_ious(boxes: Float64[np.ndarray, "K 2 3"], box: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, " K"]:
+    """IoU of axis-aligned boxes with one, as ScanRefer's `box3d_iou` computes it: with 1e-8 added to the union."""
+    common = np.maximum(np.minimum(boxes[:, 1], box[1]) - np.maximum(boxes[:, 0], box[0]), 0)
+    sizes, size = boxes[:, 1] - boxes[:, 0], box[1] - box[0]
+    volume = common[:, 0] * common[:, 1] * common[:, 2]
+    # The order of the operations decides ties at a threshold.
+    union = sizes[:, 0] * sizes[:, 1] * sizes[:, 2] + size[0] * size[1] * size[2] - volume + VOLUME_EPSILON
+    return volume / union
+
+
+def several_of_their_class(objects: Sequence[tuple[str, str, str]]) -> tuple[bool, ...]:
+    """Whether the scene of each sentence has several objects of its class, as ScanRefer counts them.
+
+    Args:
+        objects: scene, id of the object, and its class for each sentence of the benchmark's split; `OTHERS` is one class.
+            An object counts once, with the class of its first sentence, and objects without sentences do not count.
+
+    Returns:
+        For each sentence, whether the objects of its scene that are of its class are not exactly one.
+    """
+    first: dict[tuple[str, str], str] = {}
+    for scene, item, name in objects:
+        first.setdefault((scene, item), name)
+    counts = Counter((scene, name) for (scene, _), name in first.items())
+    return tuple(counts[scene, name] != 1 for scene, _, name in objects)
+
+
+def compare_boxes(
+    predictions: Sequence[PredictedBoxes], truth: Sequence[ReferredObject], *, allow_missing: bool = False
+) -> tuple[tuple[ReferringResult, ...], dict[str, int]]:
+    """Computes the IoUs of every sentence of the truth.
+
+    Args:
+        predictions: in any order.
+        truth: in any order.
+        allow_missing: count sentences without a prediction as ones for which nothing was found, instead of refusing them.
+
+    Returns:
+        The sentences that are scored, in the order of the truth; and how many are not, by the reason.
+
+    Raises:
+        InputError: a sentence that is there twice, is not in the truth, or has no prediction.
+    """
+    known: set[tuple[str, str, str]] = set()
+    for item in truth:
+        if item.key in known:
+            raise InputError(f"{described(item.key)} is there twice in the truth; expected each once")
+        known.add(item.key)
+    found: dict[tuple[str, str, str], PredictedBoxes] = {}
+    for prediction in predictions:
+        if prediction.key in found:
+            raise InputError(f"{described(prediction.key)} is predicted twice; expected each once")
+        if prediction.key not in known:
+            raise InputError(f"{described(prediction.key)} is predicted, and not in the truth")
+        found[prediction.key] = prediction
+    results, skipped = [], 0
+    for item in truth:
+        if item.box is None:
+            skipped += 1
+            continue
+        if item.key not in found and not allow_missing:
+            raise InputError(f"{described(item.key)} has no prediction")
+        boxes = found[item.key].boxes if item.key in found else np.zeros((0, 2, 3))
+        results.append(
+            ReferringResult(
+                scene=item.scene,
+                object=item.object,
+                annotation=item.annotation,
+                ious=tuple(box_ious(boxes, item.box).tolist()),
+                multiple=item.multiple,
+                others=item.others,
+            )
+        )
+    return tuple(results), {NO_TRUE_BOX: skipped} if skipped else {}
+
+
+def referring_scores(results: Sequence[ReferringResult], *, ks: Sequence[int] = (5,)) -> ReferringScores:
+    """The scores of sentences of any scenes. Those whose `multiple` or `others` is not known count in "overall" alone.
+
+    Args:
+        results: as `compare_boxes` gives them.
+        ks: numbers of boxes of which the best counts.
+
+    Raises:
+        InputError: a sentence that is there twice, or a k below 1.
+    """
+    keys = Counter((item.scene, item.object, item.annotation) for item in results)
+    if len(keys) < len(results):
+        raise InputError(f"{described(keys.most_common(1)[0][0])} is there twice; each is scored once")
+    if min(ks, default=1) < 1:
+        raise InputError(f"referring: expected k of 1 or more, got {min(ks)}")
+
+    def table(k: int | None) -> ReferringTable:
+        ious = np.array([max(item.ious[:k], default=0.0) for item in results], np.float64)
+        return _table(ious, results)
+
+    return ReferringScores(
+        sentences=len(results),
+        without_box=sum(not item.ious for item in results),
+        top1=table(1),
+        best_of={k: table(k) for k in ks},
+        best=table(None),
+    )
+
+
+def described(key: tuple[str, str, str]) -> str:
+    """A sentence's name in messages."""
+    return f"sentence {key[2]} about object {key[1]} of {key[0]}"
+
+
+def _table(ious: Float64[np.ndarray, " n"], results: Sequence[ReferringResult]) -> ReferringTable:
+    everything = np.ones(len(results), bool)
+    subsets = {
+        "unique": np.array([item.multiple is False for item in results], bool),
+        "multiple": np.array([item.multiple is True for item in results], bool),
+        "overall": everything,
+    }
+    kinds: Mapping[str, np.ndarray] = {
+        "not_in_others": np.array([item.others is False for item in results], bool),
+        "in_others": np.array([item.others is True for item in results], bool),
+        "overall": everything,
+    }
+    return {
+        subset: {kind: _cell(ious[inside & of_kind]) for kind, of_kind in kinds.items()}
+        for subset, inside in subsets.items()
+    }
+
+
+def _cell(ious: Float64[np.ndarray, " n"]) -> ReferringCell:
+    acc25, acc50 = (float((ious >= least).mean()) if len(ious) else math.nan for least in IOUS)
+    return ReferringCell(sentences=len(ious), acc25=acc25, acc50=acc50)

@@ -1,0 +1,200 @@
+"""Semantic labels of vertices: IoU and accuracy of classes, as ScanNet's and SceneSplat's benchmarks count them.
+
+Vertices whose true label is no class are left out. Of the others, over all scenes,
+
+    IoU of a class      = right / (right + missed + wrong)
+    accuracy of a class = right / (right + missed)
+
+where *missed* vertices of the class are predicted as another class, or as none, and *wrong* ones are of another class
+and predicted as this one (ScanNet's `evaluate_semantic_label.py`). mIoU is the mean over the classes that are in truth
+or predictions, mAcc that over the classes in truth, and accuracy the share of all vertices that are right (SceneSplat's
+`ZeroShotSemSegTester`, Li et al. 2025; the 1e-10 that it adds to denominators is left out). A class that is predicted
+and not in truth has the IoU 0; the evaluation that SceneSplat runs during training leaves it out, and so does
+`miou_present`. f-mIoU, f-mAcc and f-accuracy are the same over the foreground: all classes but wall, floor and ceiling.
+Vertices of these still count as wrong where they are predicted as another class.
+"""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64
+
+from gsencoder.core.errors import InputError
+from gsencoder.evaluate.scores.class_table import ClassTable
+
+BACKGROUND = ("wall", "floor", "ceiling")
+"""Names that SceneSplat excludes from the foreground. ScanNet's 20 classes have no ceiling."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LabelCounts:
+    """Vertices of one scene by true and predicted class.
+
+    Attributes:
+        scene: its name.
+        confusion: by row of the true class, and of the predicted one; the last column counts what is predicted as none.
+        ignored: vertices whose true label is no class.
+    """
+
+    scene: str
+    confusion: Int64[np.ndarray, "C C_1"]
+    ignored: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClassScores:
+    """Scores of one class.
+
+    Attributes:
+        iou: NaN if it is neither in truth nor predicted.
+        accuracy: NaN if it is not in truth.
+        truths: vertices of the class.
+        predictions: vertices predicted as the class, of those that are not ignored.
+    """
+
+    iou: float
+    accuracy: float
+    truths: int
+    predictions: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SemanticAverages:
+    """Means over classes; NaN where no class counts.
+
+    Attributes:
+        miou: mean IoU of the classes in truth or predictions.
+        miou_present: of those in truth.
+        macc: mean accuracy of the classes in truth.
+        accuracy: share of the vertices of these classes that are right.
+    """
+
+    miou: float
+    miou_present: float
+    macc: float
+    accuracy: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SemanticScores:
+    """The scores of scenes.
+
+    Attributes:
+        scenes: how many.
+        overall: over all classes.
+        foreground: over those that are not excluded.
+        excluded: names of the classes that are.
+        classes: by name.
+        vertices: that count.
+        ignored: vertices whose true label is no class.
+        unlabeled: vertices that count, and are predicted as no class.
+    """
+
+    scenes: int
+    overall: SemanticAverages
+    foreground: SemanticAverages
+    excluded: tuple[str, ...]
+    classes: dict[str, ClassScores]
+    vertices: int
+    ignored: int
+    unlabeled: int
+
+
+def count_labels(
+    scene: str, truth: Int64[np.ndarray, " V"], predicted: Int64[np.ndarray, " _V"], classes: ClassTable
+) -> LabelCounts:
+    """Counts the vertices of a scene by true and predicted class.
+
+    Args:
+        scene: its name.
+        truth: class id of each vertex; others are ignored.
+        predicted: class id of each vertex; others are no class.
+        classes: that are scored.
+
+    Raises:
+        InputError: numbers of vertices that differ.
+    """
+    if len(truth) != len(predicted):
+        raise InputError(
+            f"{scene}: the prediction has {len(predicted):,} labels, and the truth {len(truth):,}; expected one for each "
+            "vertex of the same mesh"
+        )
+    number = len(classes.names)
+    true_rows, rows = classes.rows(truth), classes.rows(predicted)
+    counted = true_rows >= 0
+    columns = np.where(rows < 0, number, rows)
+    cells = np.bincount(true_rows[counted] * (number + 1) + columns[counted], minlength=number * (number + 1))
+    return LabelCounts(
+        scene=scene, confusion=cells.reshape(number, number + 1), ignored=int(len(truth) - counted.sum())
+    )
+
+
+def semantic_scores(
+    counts: Sequence[LabelCounts], classes: ClassTable, *, excluded: Collection[str] = BACKGROUND
+) -> SemanticScores:
+    """The scores of scenes together; of one scene, its own.
+
+    Args:
+        counts: of the scenes, in any order.
+        classes: with which they were counted.
+        excluded: names of the classes that are not of the foreground. Of `BACKGROUND`, those that are no class are
+            passed over.
+
+    Raises:
+        InputError: no scene, a scene that is there twice, counts of other classes, or an excluded name that is unknown.
+    """
+    if not counts:
+        raise InputError("semantics: no scene to score")
+    scenes = [scene.scene for scene in counts]
+    if len(set(scenes)) < len(scenes):
+        twice = next(name for name in scenes if scenes.count(name) > 1)
+        raise InputError(f"semantics: the scene {twice} is there twice; each is scored once")
+    number = len(classes.names)
+    if any(scene.confusion.shape != (number, number + 1) for scene in counts):
+        raise InputError("semantics: the scenes were counted with different classes")
+    unknown = [name for name in excluded if name not in classes.names and name not in BACKGROUND]
+    if unknown:
+        raise InputError(f"semantics: cannot exclude {unknown[0]!r}, which is no class")
+
+    confusion = np.sum([scene.confusion for scene in counts], axis=0)
+    right = np.diagonal(confusion)
+    truths, predictions = confusion.sum(axis=1), confusion[:, :number].sum(axis=0)
+    union = truths + predictions - right
+    iou = np.divide(right, union, out=np.full(number, math.nan), where=union > 0)
+    accuracy = np.divide(right, truths, out=np.full(number, math.nan), where=truths > 0)
+
+    def averages(rows: list[int]) -> SemanticAverages:
+        total = int(truths[rows].sum())
+        return SemanticAverages(
+            miou=_mean(iou[rows]),
+            miou_present=_mean(iou[rows][truths[rows] > 0]),
+            macc=_mean(accuracy[rows]),
+            accuracy=int(right[rows].sum()) / total if total else math.nan,
+        )
+
+    return SemanticScores(
+        scenes=len(counts),
+        overall=averages(list(range(number))),
+        foreground=averages([row for row, name in enumerate(classes.names) if name not in excluded]),
+        excluded=tuple(name for name in classes.names if name in excluded),
+        classes={
+            name: ClassScores(
+                iou=float(iou[row]),
+                accuracy=float(accuracy[row]),
+                truths=int(truths[row]),
+                predictions=int(predictions[row]),
+            )
+            for row, name in enumerate(classes.names)
+        },
+        vertices=int(truths.sum()),
+        ignored=sum(scene.ignored for scene in counts),
+        unlabeled=int(confusion[:, number].sum()),
+    )
+
+
+def _mean(values: np.ndarray) -> float:
+    """The mean of the values that are numbers; NaN if none is."""
+    numbers = values[~np.isnan(values)]
+    return float(numbers.mean()) if len(numbers) else math.nan
