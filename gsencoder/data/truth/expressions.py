@@ -31,7 +31,7 @@ from gsencoder.data.truth.entries import (
 )
 
 NR3D_COLUMNS = ("assignmentid", "utterance", "instance_type", "scan_id", "target_id", "tokens")
-"""Columns that an Nr3D file must have; `stimulus_id`, `mentions_target_class` and `correct_guess` are read if present."""
+"""Columns that Nr3D must have; `stimulus_id`, `mentions_target_class` and `correct_guess` are read if present."""
 PREDICTED = ("answer_top10", "pred_answers_at10", "caption", "aabb", "boxes")
 """Keys that predictions have and annotations have not."""
 
