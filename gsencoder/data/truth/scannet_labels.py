@@ -146,4 +146,6 @@ def read_axis_alignment(path: Path) -> Float64[np.ndarray, "4 4"] | None:
         values = np.zeros(0)
     if len(values) != 16:
         raise InputError(f"{path}: axisAlignment: expected 16 numbers, got {stated[-1][2].strip()[:60]!r}")
-    return rigid_pose(values.reshape(4, 4), f"{path}: axisAlignment")
+    rigid_pose(values.reshape(4, 4), f"{path}: axisAlignment")
+    # As it is written, as benchmarks apply it, and not the nearest rotation.
+    return values.reshape(4, 4)
