@@ -12,6 +12,7 @@ from gsencoder.types.features import FeatureBasis, FeatureMap, FeatureSpace, Gau
 from gsencoder.types.gaussians import SH_C0, Gaussians, sh_from_colors
 from gsencoder.types.localization import Box, Localization
 from gsencoder.types.memory import MemoryBank, QueryMemory
+from gsencoder.types.mesh_labels import MeshLabels
 from gsencoder.types.scene import Scene, SceneObject, Views
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "Gaussians",
     "Localization",
     "MemoryBank",
+    "MeshLabels",
     "QueryMemory",
     "Scene",
     "SceneObject",

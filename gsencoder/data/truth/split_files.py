@@ -1,0 +1,52 @@
+"""Split files of benchmarks: one name of a scene a line, such as scannetv2_val.txt."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from gsencoder.core.errors import InputError
+
+MAX_BYTES = 16 << 20
+
+
+def read_split(path: Path) -> tuple[str, ...]:
+    """The names of the scenes of a split, in the order of the file; blank lines are left out.
+
+    Raises:
+        InputError: unreadable, too large, empty, a line that is no name of a folder, or a name that is there twice.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: {path.stat().st_size:,} bytes; expected one name of a scene a line")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a readable split file ({' '.join(str(error).split())[:120]})") from error
+    first: dict[str, int] = {}
+    for number, line in enumerate(lines, start=1):
+        name = line.strip()
+        if not name:
+            continue
+        if name in (".", "..") or any(each in name for each in "/\\\0") or len(name) > 255 or len(name.split()) > 1:
+            raise InputError(f"{path}: line {number}: expected the name of a scene, got {name[:60]!r}")
+        if name in first:
+            raise InputError(f"{path}: line {number}: {name!r} is already on line {first[name]}")
+        first[name] = number
+    if not first:
+        raise InputError(f"{path}: lists no scene; expected one name a line")
+    return tuple(first)
+
+
+def folders_of_split(names: Iterable[str], root: Path) -> tuple[Path, ...]:
+    """The folders of a split's scenes, in order.
+
+    Args:
+        names: of the scenes.
+        root: folder of the data set.
+
+    Raises:
+        InputError: some are missing; the first is named, and their number.
+    """
+    folders = [root / name for name in names]
+    missing = [folder for folder in folders if not folder.is_dir()]
+    if missing:
+        raise InputError(f"{missing[0]}: no such folder ({len(missing)} of {len(folders)} scenes of the split are missing)")
+    return tuple(folders)
