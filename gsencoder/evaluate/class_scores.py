@@ -14,9 +14,7 @@ NAMES_AT_ONCE = 16
 """Classes whose cosines with all Gaussians are in memory together."""
 
 
-def nearest_class(
-    features: GaussianFeatures, names: Sequence[str], text: TextEncoder
-) -> Int64[np.ndarray, " N"]:
+def nearest_class(features: GaussianFeatures, names: Sequence[str], text: TextEncoder) -> Int64[np.ndarray, " N"]:
     """The class whose name has the largest centered cosine with each Gaussian's feature, of equal ones the first.
 
     Args:

@@ -64,7 +64,9 @@ class LabeledPoints:
         return inside[self.gaussians]
 
 
-def labeled_points(scene: Scene, mesh: MeshLabels | None = None, *, max_distance: float = MAX_DISTANCE) -> LabeledPoints:
+def labeled_points(
+    scene: Scene, mesh: MeshLabels | None = None, *, max_distance: float = MAX_DISTANCE
+) -> LabeledPoints:
     """The labeled points of a scene with Gaussians.
 
     Args:

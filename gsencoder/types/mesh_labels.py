@@ -52,9 +52,7 @@ class MeshLabels:
     def __len__(self) -> int:
         return len(self.vertices)
 
-    def boxes(
-        self, *, aligned: bool = False
-    ) -> dict[int, tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]]:
+    def boxes(self, *, aligned: bool = False) -> dict[int, tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]]:
         """Lower and upper corner of the axis-aligned box of each object's vertices; objects without any are left out.
 
         Args:

@@ -1,7 +1,7 @@
 """The instances protocol: average precision of masks with a class and a score (SplatDistill sec. 4.2, tables 2 and 7).
 
-Masks are the clusters of Gaussians that `localize` finds for the name of each class, with the probability of their box as the
-score; or the true objects are given as class-agnostic proposals, of which the class is recognized by the mean feature,
+Masks are the clusters of Gaussians that `localize` finds for the name of each class, with the probability of their box
+as the score. Or the true objects are given as class-agnostic proposals: their class is recognized by the mean feature,
 and the score is the class's share in a softmax over the cosines of all classes.
 """
 
@@ -32,7 +32,9 @@ class InstancesProtocol:
     name: Literal["instances"] = "instances"
     proposals: Proposals = field(
         default="clusters",
-        metadata={"help": "masks: clusters = those that localize finds for each class; truth = the true objects, named"},
+        metadata={
+            "help": "masks: clusters = what localize finds for each class; truth = the true objects, to be named"
+        },
     )
     min_region: int = field(
         default=MIN_REGION, metadata={"help": "smallest number of points of a true object and of a mask that count"}

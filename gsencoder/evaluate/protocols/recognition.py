@@ -47,8 +47,10 @@ def predict_recognition(
     names: Sequence[str],
     text: TextEncoder,
 ) -> list[RankedNames]:
-    """The classes nearest to the mean feature of each object's Gaussians, the nearest first; none for an object of which
-    no Gaussian was seen."""
+    """The classes nearest to the mean feature of each object's Gaussians, the nearest first.
+
+    An object of which no Gaussian was seen has no names.
+    """
     parts = [points.rows_of(int(each.object)) for each in truth]
     cosines = class_cosines(features, parts, names, text)
     return [

@@ -1,7 +1,7 @@
 """The semantics protocol: the class of each point by the nearest word to its feature (mIoU, mAcc, f-mIoU).
 
-Each Gaussian is given the class whose name is nearest to its feature, among the classes of all scenes or of a benchmark;
-points take the class of their Gaussian. Points without a named object are ignored.
+Each Gaussian is given the class whose name is nearest to its feature, among the classes of all scenes or of a
+benchmark, and points take the class of their Gaussian. Points without a named object are ignored.
 """
 
 from collections.abc import Sequence
