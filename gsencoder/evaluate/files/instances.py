@@ -1,9 +1,9 @@
 """Files of instances: ScanNet's submission format and truth, and .npz in place of the pickles that others use.
 
 Truth is SCENE.txt with one number a line: class id · 1000 + number of the instance, and 0 for none. A prediction is
-SCENE.txt with "mask file, class id, score" in each line, where the mask file lies below the same folder and has one number
-a line, 0 outside of the mask; or SCENE.npz with pred_masks (bool, vertices × masks), pred_classes (integers) and pred_scores
-(floating point), as OpenMask3D and Mask3D name them.
+SCENE.txt with "mask file, class id, score" in each line, where the mask file lies below the same folder and has one
+number a line, 0 outside of the mask; or SCENE.npz with pred_masks (bool, vertices × masks), pred_classes (integers) and
+pred_scores (floating point), as OpenMask3D and Mask3D name them.
 """
 
 import io
@@ -55,7 +55,8 @@ def match_instance_files(
         true = read_instance_truth(files.truth)
         found = read_instance_prediction(files.prediction, num_vertices=len(true.ids))
         with about(files.prediction):
-            yield match_instances(true, found, classes, class_agnostic=class_agnostic, min_region=min_region)
+            matches = match_instances(true, found, classes, class_agnostic=class_agnostic, min_region=min_region)
+        yield matches
 
 
 def read_instance_truth(path: Path) -> InstanceTruth:
@@ -78,8 +79,8 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
         num_vertices: of the scene.
 
     Raises:
-        InputError: unreadable; a mask that is missing, listed twice, outside of the folder or of another length; a class id
-            that is no whole number; a score that is no finite number.
+        InputError: unreadable; a mask that is missing, listed twice, outside of the folder or of another length; a
+            class id that is no whole number; a score that is no finite number.
     """
     if path.suffix == ".npz":
         return _read_npz(path, num_vertices)
@@ -87,7 +88,7 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
         lines = read_checked(path, max_bytes=MAX_LIST_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file ({error.reason} at byte {error.start})") from error
-    first: dict[str, int] = {}
+    first: dict[Path, int] = {}
     vertices, labels, scores = [], [], []
     for number, line in enumerate(lines, start=1):
         where, words = f"{path}: line {number}", line.split()
@@ -95,12 +96,12 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
             hint = "; predictions and truth may be swapped" if len(words) == 1 else ""
             raise InputError(f"{where}: expected a mask file, a class id and a score, got {line[:60]!r}{hint}")
         file = PurePosixPath(words[0])
-        mask_path = path.parent / file
-        if file.is_absolute() or not mask_path.resolve().is_relative_to(path.parent.resolve()):
+        mask_path = (path.parent / file).resolve()
+        if file.is_absolute() or not mask_path.is_relative_to(path.parent.resolve()):
             raise InputError(f"{where}: the mask {words[0][:80]!r} is not below {path.parent}")
-        if str(file) in first:
-            raise InputError(f"{where}: the mask {words[0][:80]!r} is that of line {first[str(file)]} already")
-        first[str(file)] = number
+        if mask_path in first:
+            raise InputError(f"{where}: the mask {words[0][:80]!r} is that of line {first[mask_path]} already")
+        first[mask_path] = number
         labels.append(_label(words[1], where))
         scores.append(_score(words[2], where))
         with about(where):
@@ -143,9 +144,7 @@ def write_instance_prediction(
         mask[prediction.mask(index)] = True
     if form == "npz":
         data = io.BytesIO()
-        np.savez_compressed(
-            data, pred_masks=masks.T, pred_classes=prediction.labels, pred_scores=prediction.scores, allow_pickle=False
-        )
+        np.savez_compressed(data, pred_masks=masks.T, pred_classes=prediction.labels, pred_scores=prediction.scores)
         write_bytes(folder / f"{prediction.scene}.npz", data.getvalue())
         return folder / f"{prediction.scene}.npz"
     (folder / MASK_FOLDER).mkdir(exist_ok=True)
@@ -164,13 +163,13 @@ def _read_npz(path: Path, num_vertices: int) -> InstancePrediction:
     if len(masks) != num_vertices:
         turned = "; transpose it" if masks.shape[1] == num_vertices else ""
         raise InputError(
-            f"{path}: pred_masks is {masks.shape[0]:,} × {masks.shape[1]:,}, and the scene has {num_vertices:,} vertices; "
-            f"expected vertices × masks{turned}"
+            f"{path}: pred_masks is {masks.shape[0]:,} × {masks.shape[1]:,}, and the scene has {num_vertices:,} "
+            f"vertices; expected vertices × masks{turned}"
         )
     if not len(labels) == len(scores) == masks.shape[1]:
         raise InputError(
-            f"{path}: {masks.shape[1]} masks, {len(labels)} pred_classes and {len(scores)} pred_scores; expected as many of "
-            "each"
+            f"{path}: {masks.shape[1]} masks, {len(labels)} pred_classes and {len(scores)} pred_scores; expected as "
+            "many of each"
         )
     with about(path):
         return prediction_of_masks(

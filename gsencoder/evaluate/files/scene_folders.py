@@ -31,8 +31,8 @@ def scene_files(
 ) -> tuple[SceneFiles, ...]:
     """Finds the files of every scene to score, in the order of the names.
 
-    ScanNet's scripts score the scenes that have predictions, and pass over the others. Here those are refused, as a mean
-    over the scenes that a method got through cannot stand beside that of one that got through all.
+    ScanNet's scripts score the scenes that have predictions, and pass over the others. Here those are refused: the
+    scores of a method that got through some scenes cannot stand beside those of one that got through all.
 
     Args:
         predictions: folder with SCENE.txt, or what `suffixes` allows.

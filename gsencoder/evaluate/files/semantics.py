@@ -39,4 +39,5 @@ def count_label_files(
                     "expected class ids"
                 )
         with about(files.prediction):
-            yield count_labels(files.scene, true, found, classes)
+            counts = count_labels(files.scene, true, found, classes)
+        yield counts
