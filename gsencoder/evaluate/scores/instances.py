@@ -157,7 +157,7 @@ def match_instances(
     kept = np.flatnonzero((rows >= 0) & (np.diff(prediction.offsets) >= min_region))
     rows, scores, areas = rows[kept], prediction.scores[kept], np.diff(prediction.offsets)[kept]
     common = np.zeros((len(kept), len(ids)), np.int64)
-    for row, index in enumerate(kept):
+    for row, index in enumerate(kept.tolist()):
         common[row] = np.bincount(codes[prediction.mask(index)], minlength=len(ids))
 
     same = rows[:, None] == instance_rows

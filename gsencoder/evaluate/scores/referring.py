@@ -8,8 +8,8 @@ so that a box of one quarter of the other's volume, inside of it, is below 0.25.
 the only one of its class among the objects that the sentences of its scene describe, else *multiple*. *Others* are the
 sentences about objects of none of the 17 named classes. A sentence for which nothing was found has the IoU 0.
 
-A method that finds several boxes is also scored by the best of the first k, or of all of them, as the paper does for its
-table 5 (sec. 4.5). A user cannot know which box that is.
+A method that finds several boxes is also scored by the best of the first k, or of all of them, as the paper does for
+its table 5 (sec. 4.5). A user cannot know which box that is.
 """
 
 import math
@@ -66,12 +66,16 @@ class PredictedBoxes:
         object: id of the object that it is about.
         annotation: number of the sentence about it.
         boxes: lower and upper corners, the likeliest box first; none if nothing was found.
+        multiple: what the prediction's file says of the truth's `multiple`, as ScanRefer's own files do.
+        others: the same of `others`.
     """
 
     scene: str
     object: str
     annotation: str
     boxes: Float64[np.ndarray, "K 2 3"]
+    multiple: bool | None = None
+    others: bool | None = None
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -145,8 +149,8 @@ def several_of_their_class(objects: Sequence[tuple[str, str, str]]) -> tuple[boo
     """Whether the scene of each sentence has several objects of its class, as ScanRefer counts them.
 
     Args:
-        objects: scene, id of the object, and its class for each sentence of the benchmark's split; `OTHERS` is one class.
-            An object counts once, with the class of its first sentence, and objects without sentences do not count.
+        objects: scene, id of the object, and its class for each sentence of the benchmark's split; `OTHERS` is one
+            class. An object counts once, with the class of its first sentence; objects without sentences do not count.
 
     Returns:
         For each sentence, whether the objects of its scene that are of its class are not exactly one.
@@ -164,15 +168,16 @@ def compare_boxes(
     """Computes the IoUs of every sentence of the truth.
 
     Args:
-        predictions: in any order.
+        predictions: in any order. What they say of `multiple` and `others` is taken where the truth does not say it.
         truth: in any order.
-        allow_missing: count sentences without a prediction as ones for which nothing was found, instead of refusing them.
+        allow_missing: count sentences without a prediction as ones for which nothing was found; else they are refused.
 
     Returns:
         The sentences that are scored, in the order of the truth; and how many are not, by the reason.
 
     Raises:
-        InputError: a sentence that is there twice, is not in the truth, or has no prediction.
+        InputError: a sentence that is there twice, is not in the truth, or has no prediction; truth and prediction
+            that contradict each other about `multiple` or `others`.
     """
     known: set[tuple[str, str, str]] = set()
     for item in truth:
@@ -193,15 +198,17 @@ def compare_boxes(
             continue
         if item.key not in found and not allow_missing:
             raise InputError(f"{described(item.key)} has no prediction")
-        boxes = found[item.key].boxes if item.key in found else np.zeros((0, 2, 3))
+        prediction = found.get(item.key) or PredictedBoxes(
+            scene=item.scene, object=item.object, annotation=item.annotation, boxes=np.zeros((0, 2, 3))
+        )
         results.append(
             ReferringResult(
                 scene=item.scene,
                 object=item.object,
                 annotation=item.annotation,
-                ious=tuple(box_ious(boxes, item.box).tolist()),
-                multiple=item.multiple,
-                others=item.others,
+                ious=tuple(box_ious(prediction.boxes, item.box).tolist()),
+                multiple=_agreed(item.multiple, prediction.multiple, "unique_multiple", item.key),
+                others=_agreed(item.others, prediction.others, "others", item.key),
             )
         )
     return tuple(results), {NO_TRUE_BOX: skipped} if skipped else {}
@@ -239,6 +246,12 @@ def referring_scores(results: Sequence[ReferringResult], *, ks: Sequence[int] = 
 def described(key: tuple[str, str, str]) -> str:
     """A sentence's name in messages."""
     return f"sentence {key[2]} about object {key[1]} of {key[0]}"
+
+
+def _agreed(true: bool | None, said: bool | None, what: str, key: tuple[str, str, str]) -> bool | None:
+    if true is not None and said is not None and true != said:
+        raise InputError(f"{described(key)}: {what} is {int(said)} in the prediction, and {int(true)} in the truth")
+    return said if true is None else true
 
 
 def _table(ious: Float64[np.ndarray, " n"], results: Sequence[ReferringResult]) -> ReferringTable:

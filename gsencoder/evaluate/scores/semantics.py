@@ -118,8 +118,8 @@ def count_labels(
     """
     if len(truth) != len(predicted):
         raise InputError(
-            f"{scene}: the prediction has {len(predicted):,} labels, and the truth {len(truth):,}; expected one for each "
-            "vertex of the same mesh"
+            f"{scene}: the prediction has {len(predicted):,} labels, and the truth {len(truth):,}; expected one for "
+            "each vertex of the same mesh"
         )
     number = len(classes.names)
     true_rows, rows = classes.rows(truth), classes.rows(predicted)

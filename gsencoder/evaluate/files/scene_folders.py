@@ -1,0 +1,86 @@
+"""Folders with one file for each scene, of predictions and of truth."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsencoder.core.errors import InputError, listed
+from gsencoder.evaluate.files.checked_bytes import PICKLE_SUFFIXES
+
+RESULT_FILES = ("semantic_instance_evaluation.txt", "semantic_label_evaluation.txt")
+"""What ScanNet's scripts write into the folder of the predictions."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneFiles:
+    """The files of one scene.
+
+    Attributes:
+        scene: its name, that of both files without the suffix.
+        prediction: what is scored.
+        truth: what it is held against.
+    """
+
+    scene: str
+    prediction: Path
+    truth: Path
+
+
+def scene_files(
+    predictions: Path, truth: Path, *, scenes: Collection[str] | None = None, suffixes: Collection[str] = (".txt",)
+) -> tuple[SceneFiles, ...]:
+    """Finds the files of every scene to score, in the order of the names.
+
+    ScanNet's scripts score the scenes that have predictions, and pass over the others. Here those are refused: the
+    scores of a method that got through some scenes cannot stand beside those of one that got through all.
+
+    Args:
+        predictions: folder with SCENE.txt, or what `suffixes` allows.
+        truth: folder with SCENE.txt.
+        scenes: those to score, such as the ones of a split; None = all of the truth.
+        suffixes: of prediction files.
+
+    Raises:
+        InputError: no such folder, both are the same, a scene without prediction or truth, or with two predictions.
+    """
+    for folder in (predictions, truth):
+        if not folder.is_dir():
+            raise InputError(f"{folder}: expected a folder with a file for each scene")
+    if predictions.resolve() == truth.resolve():
+        raise InputError(f"{predictions}: predictions and truth are the same folder")
+    true_files = {path.stem: path for path in _files(truth, (".txt",))}
+    found: dict[str, Path] = {}
+    for path in _files(predictions, suffixes):
+        if path.stem in found:
+            raise InputError(f"{predictions}: the scene {path.stem} has both {found[path.stem].name} and {path.name}")
+        found[path.stem] = path
+    if not found:
+        pickled = [path.name for path in sorted(predictions.iterdir()) if path.suffix.lower() in PICKLE_SUFFIXES]
+        because = f"; {pickled[0]} is a pickle, which is refused since reading it executes code" if pickled else ""
+        expected = " or ".join(f"SCENE{suffix}" for suffix in suffixes)
+        raise InputError(f"{predictions}: no predictions; expected {expected} for each scene{because}")
+    if not true_files:
+        raise InputError(f"{truth}: no truth; expected SCENE.txt for each scene")
+    foreign = [scene for scene in found if scene not in true_files]
+    if foreign:
+        raise InputError(f"{found[foreign[0]]}: there is no truth of this scene in {truth}; it has {_some(true_files)}")
+    chosen = sorted(true_files if scenes is None else set(scenes))
+    unknown = [scene for scene in chosen if scene not in true_files]
+    if unknown:
+        raise InputError(f"{truth}: no truth of {len(unknown)} scenes to score: {listed(unknown)}")
+    missing = [scene for scene in chosen if scene not in found]
+    if missing:
+        raise InputError(f"{predictions}: no prediction of {len(missing)} scenes: {listed(missing)}")
+    return tuple(SceneFiles(scene=s, prediction=found[s], truth=true_files[s]) for s in chosen)
+
+
+def _files(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix in suffixes and path.name not in RESULT_FILES and path.is_file()
+    )
+
+
+def _some(scenes: Collection[str]) -> str:
+    return listed(sorted(scenes), 3)
