@@ -7,7 +7,7 @@ what measured depth says is hidden.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -47,6 +47,10 @@ class LabeledPoints:
         """The classes of the objects that have points, by their id in ascending order."""
         present = np.unique(self.objects)
         return {int(number): self.names[int(number)] for number in present if int(number) in self.names}
+
+    def renamed(self, names: Mapping[str, str]) -> "LabeledPoints":
+        """The points with other class names; objects whose name is not a key have no class."""
+        return replace(self, names={number: names[name] for number, name in self.names.items() if name in names})
 
     def rows_of(self, number: int) -> Int64[np.ndarray, " n"]:
         """The Gaussians that speak for the points of an object, ascending, each once."""

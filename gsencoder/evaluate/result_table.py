@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -53,6 +53,10 @@ class ResultTable:
             | {column: _known(row.values.get(column)) for column in self.columns}
             for row in self.rows
         ]
+
+    def measured(self) -> "ResultTable":
+        """The table without the rows of papers."""
+        return replace(self, rows=tuple(row for row in self.rows if row.source == "measured"))
 
     def markdown(self) -> str:
         """The table in Markdown, with notes below it."""

@@ -80,6 +80,11 @@ COMMANDS = {
         Command(name="ask", config="AskCommandConfig", help="ask a vision-language model about such views"),
         Command(name="evaluate", config="EvaluateConfig", help="compute metrics on labeled scenes"),
         Command(
+            name="score",
+            config="ScoreConfig",
+            help="score files of predictions, of this program or another, against a benchmark's truth",
+        ),
+        Command(
             name="tradeoff",
             config="TradeoffConfig",
             help="measure the seconds and the accuracy of each setting of fusion",

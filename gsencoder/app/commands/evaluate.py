@@ -18,7 +18,17 @@ from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
+from gsencoder.data.truth.label_sets import COLUMNS, read_label_map
+from gsencoder.evaluate.benchmark_files import BenchmarkProtocol, score_written, write_predictions
+from gsencoder.evaluate.files.class_files import load_classes, write_classes
 from gsencoder.evaluate.grounding import grounding_scores
+from gsencoder.evaluate.protocols.instances import InstancesProtocol
+from gsencoder.evaluate.protocols.recognition import RecognitionProtocol
+from gsencoder.evaluate.protocols.referring import ReferringProtocol
+from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
+from gsencoder.evaluate.score_report import ScoreReport
+from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,
     absent_scores,
@@ -98,8 +108,28 @@ class EvaluateConfig(CommonConfig):
             "features themselves"
         },
     )
-    protocol: LocalizationProtocol | NamingProtocol | AbsentProtocol | GroundingProtocol = field(
-        default_factory=LocalizationProtocol
+    protocol: (
+        LocalizationProtocol
+        | NamingProtocol
+        | AbsentProtocol
+        | GroundingProtocol
+        | RecognitionProtocol
+        | InstancesProtocol
+        | SemanticsProtocol
+        | ReferringProtocol
+    ) = field(default_factory=LocalizationProtocol)
+    classes: str = field(
+        default="",
+        metadata={
+            "help": "of recognition, instances and semantics: scannet20, scannet200, or a CSV file with the columns id, "
+            "name and group; empty = the names of the scenes' objects"
+        },
+    )
+    label_map: str = field(
+        default="",
+        metadata={
+            "help": "scannetv2-labels.combined.tsv, which gives the raw names of ScanNet's objects a class of classes="
+        },
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
     report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
@@ -119,6 +149,7 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
     else:
         source, words = _source_of_head(config) if config.head else _source(config)
     out = config.out or Path("outputs") / "evaluate" / config.protocol.name
+    report = None
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         if isinstance(config.protocol, NamingProtocol):
             _naming(config, config.protocol, source, words, folder, summary)
@@ -126,12 +157,17 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
             _absent(config, config.protocol, source, words, folder, summary)
         elif isinstance(config.protocol, GroundingProtocol):
             _grounding(config, config.protocol, source, words, folder, summary)
+        elif isinstance(config.protocol, BenchmarkProtocol):
+            report = _benchmark(config, config.protocol, source, words, folder, summary)
         else:
             _localization(config, config.protocol, source, words, folder, summary)
         if config.report:
             from gsencoder.app.reports.results import report_scores
 
             report_scores(folder, summary)
+    if report is not None:
+        print_report(out, report, quiet=config.quiet)
+        return
     screen = console(config.quiet)
     screen.print(names_table(summary.results))
     screen.print(f"{out}: {scores_line(summary.results)}")
@@ -325,6 +361,49 @@ def _grounding(
     ]
     write_bytes(folder / "pairs.csv", csv_text(rows).encode())
     write_bytes(folder / "names.csv", csv_text([{"name": name, **row} for name, row in names.items()]).encode())
+
+
+def _benchmark(
+    config: EvaluateConfig,
+    protocol: BenchmarkProtocol,
+    source: FeatureSource,
+    words: Words,
+    folder: Path,
+    summary: Summary,
+) -> ScoreReport:
+    classes, class_names = _classes(config)
+    done = write_predictions(
+        _scenes(config),
+        source,
+        words,
+        classes,
+        folder,
+        protocol=protocol,
+        class_names=class_names,
+        seeds=config.seeds,
+        localization=config.localize,
+    )
+    write_classes(folder / "classes_table.csv", classes)
+    for scene in done:
+        summary.add_seconds(scene.seconds)
+    report = score_written(folder, protocol, classes, "fused" if not config.weights else "encoded")
+    write_report(folder, report, summary)
+    summary.results["gaussians"] = {scene.scene: scene.gaussians for scene in done}
+    return report
+
+
+def _classes(config: EvaluateConfig) -> tuple[ClassTable, dict[str, str] | None]:
+    """The classes that can be predicted, and where a label map is given the class of each raw name."""
+    if not config.classes:
+        if config.label_map:
+            raise InputError("label_map: leads to the ids of a benchmark; give classes=scannet20 or classes=scannet200")
+        return classes_of(names_of(scene for scene, _ in _scenes(config))), None
+    classes = load_classes(config.classes)
+    if not config.label_map:
+        return classes, None
+    name_of = dict(zip(classes.ids, classes.names, strict=True))
+    ids = read_label_map(Path(config.label_map), COLUMNS.get(config.classes, "id"))
+    return classes, {raw: name_of[number] for raw, number in ids.items() if number in name_of}
 
 
 def record(outcomes: list[SceneOutcome], summary: Summary) -> None:

@@ -1,0 +1,187 @@
+"""`gsencoder score PROTOCOL predictions=… truth=…`: files of any method's predictions against a benchmark's truth."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.markdown import Markdown
+
+from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.csv_text import csv_text
+from gsencoder.core.files.json_values import write_bytes
+from gsencoder.data.truth.split_files import read_split
+from gsencoder.evaluate.files.class_files import load_classes
+from gsencoder.evaluate.score_files import score_instances, score_recognition, score_referring, score_semantics
+from gsencoder.evaluate.score_report import ScoreReport
+from gsencoder.evaluate.scores.instances import MIN_REGION
+from gsencoder.evaluate.scores.semantics import BACKGROUND
+
+TABLE = "table.md"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScoreConfig(CommonConfig):
+    """Settings of `score`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "help": "what is scored: instances, semantics, recognition or referring",
+            "metavar": "PROTOCOL",
+            "required": True,
+        },
+    )
+    predictions: str = field(
+        default="", metadata={"help": "file or folder of the predictions, in the benchmark's format", "required": True}
+    )
+    truth: str = field(
+        default="", metadata={"help": "file or folder of the truth, in the benchmark's format", "required": True}
+    )
+    method: str = field(default="predictions", metadata={"help": "name of the predictions in the table"})
+    classes: str = field(
+        default="",
+        metadata={
+            "help": "of instances, semantics and recognition: scannet20, scannet200, or a CSV file with the columns id, "
+            "name and, if there are any, group; empty for recognition = all names of the truth"
+        },
+    )
+    scenes: str = field(
+        default="",
+        metadata={"help": "of instances and semantics: a split, one scene a line; empty = all scenes of the truth"},
+    )
+    class_agnostic: bool = field(
+        default=False, metadata={"help": "of instances: leave the classes of masks out of account"}
+    )
+    min_region: int = field(
+        default=MIN_REGION,
+        metadata={"help": "of instances: smallest number of vertices of a true object and of a mask that count"},
+    )
+    excluded: tuple[str, ...] = field(
+        default=BACKGROUND, metadata={"help": "of semantics: classes that are not of the foreground"}
+    )
+    ks: tuple[int, ...] = field(
+        default=(1, 5),
+        metadata={"help": "of recognition and referring: numbers of names or boxes of which the best counts"},
+    )
+    allow_missing: bool = field(
+        default=False,
+        metadata={
+            "help": "of recognition and referring: count what has no prediction as wrong, instead of refusing the file"
+        },
+    )
+
+    def __post_init__(self) -> None:
+        if len(self.paths) != 1 or self.paths[0] not in PROTOCOLS:
+            raise InputError(
+                f"score: expected one protocol, {', '.join(PROTOCOLS)}; got {', '.join(self.paths) or 'none'}"
+            )
+        if self.min_region < 1:
+            raise InputError(f"min_region: expected 1 or more, got {self.min_region}")
+        if not self.ks or min(self.ks) < 1:
+            raise InputError(f"ks: expected numbers from 1, got {', '.join(map(str, self.ks)) or 'none'}")
+        taken = TAKEN[self.paths[0]]
+        defaults = type(self).__dataclass_fields__
+        for name in dict.fromkeys(each for names in TAKEN.values() for each in names):
+            if name not in taken and getattr(self, name) != defaults[name].default:
+                raise InputError(f"{name}: {self.paths[0]} has no such setting; it takes {', '.join(taken)}")
+
+
+def run(config: ScoreConfig, summary: Summary) -> None:
+    """Scores the predictions, prints the table, and writes it with rows by scene and class."""
+    (protocol,) = config.paths
+    with summary.step("score"):
+        report = PROTOCOLS[protocol](config)
+    out = config.out or Path("outputs") / "score" / protocol
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+        write_report(folder, report, summary)
+    print_report(out, report, quiet=config.quiet)
+
+
+def write_report(folder: Path, report: ScoreReport, summary: Summary) -> None:
+    """Writes the table as Markdown and CSV, and the rows by scene and class, and adds the results to the summary."""
+    write_bytes(folder / TABLE, report.table.markdown().encode())
+    write_bytes(folder / "table.csv", csv_text(report.table.csv_rows()).encode())
+    for name, rows in report.rows.items():
+        write_bytes(folder / f"{name}.csv", csv_text(rows).encode())
+    summary.results.update(report.results)
+
+
+def print_report(out: Path, report: ScoreReport, *, quiet: bool) -> None:
+    """Prints the measured rows and the main figures."""
+    screen = console(quiet)
+    screen.print(Markdown(report.table.measured().markdown()))
+    screen.print(f"{out}: {report.line}")
+
+
+def _instances(config: ScoreConfig) -> ScoreReport:
+    return score_instances(
+        Path(config.predictions),
+        Path(config.truth),
+        load_classes(_given_classes(config)),
+        method=config.method,
+        scenes=_split(config),
+        class_agnostic=config.class_agnostic,
+        min_region=config.min_region,
+    )
+
+
+def _semantics(config: ScoreConfig) -> ScoreReport:
+    return score_semantics(
+        Path(config.predictions),
+        Path(config.truth),
+        load_classes(_given_classes(config)),
+        method=config.method,
+        scenes=_split(config),
+        excluded=config.excluded,
+    )
+
+
+def _recognition(config: ScoreConfig) -> ScoreReport:
+    return score_recognition(
+        Path(config.predictions),
+        Path(config.truth),
+        classes=load_classes(config.classes).names if config.classes else (),
+        method=config.method,
+        ks=config.ks,
+        allow_missing=config.allow_missing,
+    )
+
+
+def _referring(config: ScoreConfig) -> ScoreReport:
+    return score_referring(
+        Path(config.predictions),
+        Path(config.truth),
+        method=config.method,
+        ks=[k for k in config.ks if k > 1],
+        allow_missing=config.allow_missing,
+    )
+
+
+def _given_classes(config: ScoreConfig) -> str:
+    if not config.classes:
+        raise InputError("classes= is missing: scannet20, scannet200, or a CSV file with the columns id and name")
+    return config.classes
+
+
+def _split(config: ScoreConfig) -> tuple[str, ...] | None:
+    return read_split(Path(config.scenes)) if config.scenes else None
+
+
+PROTOCOLS: dict[str, Callable[[ScoreConfig], ScoreReport]] = {
+    "instances": _instances,
+    "semantics": _semantics,
+    "recognition": _recognition,
+    "referring": _referring,
+}
+"""What can be scored."""
+TAKEN = {
+    "instances": ("classes", "scenes", "class_agnostic", "min_region"),
+    "semantics": ("classes", "scenes", "excluded"),
+    "recognition": ("classes", "ks", "allow_missing"),
+    "referring": ("ks", "allow_missing"),
+}
+"""Settings of each protocol beside those that all have."""

@@ -1,0 +1,68 @@
+"""Classes that are scored: those of ScanNet's benchmarks, or those of a CSV file with the columns id, name and group."""
+
+import csv
+import io
+from pathlib import Path
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.csv_text import csv_text
+from gsencoder.core.files.json_values import write_bytes
+from gsencoder.data.truth.label_sets import COLUMNS, LabelSet, scannet_label_set
+from gsencoder.evaluate.files.checked_bytes import read_checked
+from gsencoder.evaluate.scores.class_table import ClassTable
+
+MAX_CLASS_BYTES = 4 << 20
+
+
+def load_classes(classes: str) -> ClassTable:
+    """The classes of a benchmark, or of a file.
+
+    Args:
+        classes: scannet20, scannet200, or a CSV file with the columns id and name, and group where classes have groups.
+
+    Raises:
+        InputError: no such benchmark or file, or one that is not such a table.
+    """
+    if classes in COLUMNS:
+        return table_of_set(scannet_label_set(classes))
+    path = Path(classes)
+    if not path.is_file():
+        raise InputError(
+            f"classes: {classes} is no file; expected {', '.join(COLUMNS)}, or a CSV file with the columns id and name"
+        )
+    try:
+        text = read_checked(path, max_bytes=MAX_CLASS_BYTES).decode("utf-8-sig")
+        reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+        rows = list(reader)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not a readable CSV file ({error})") from error
+    if not {"id", "name"} <= set(reader.fieldnames or ()):
+        raise InputError(f"{path}: expected the columns id and name, got {', '.join(reader.fieldnames or ()) or 'none'}")
+    ids, names, groups = [], [], {}
+    for number, row in enumerate(rows, start=2):
+        word, name = row["id"] or "", row["name"] or ""
+        if not (word.isascii() and word.isdigit() and len(word) <= 9 and name.strip()):
+            raise InputError(f"{path}: line {number}: expected a whole number and a name, got {word[:40]!r}, {name[:40]!r}")
+        ids.append(int(word))
+        names.append(name.strip())
+        if row.get("group"):
+            groups.setdefault(row["group"], []).append(name.strip())
+    return ClassTable(
+        names=tuple(names), ids=tuple(ids), groups={group: tuple(members) for group, members in groups.items()}
+    )
+
+
+def table_of_set(label_set: LabelSet) -> ClassTable:
+    """A benchmark's classes as a table to score with."""
+    groups = {group: label_set.names_in(group) for group in dict.fromkeys(label_set.groups)}
+    return ClassTable(names=label_set.names, ids=label_set.ids, groups=groups)
+
+
+def write_classes(path: Path, classes: ClassTable) -> None:
+    """Writes the table as `load_classes` reads it."""
+    group_of = {name: group for group, members in classes.groups.items() for name in members}
+    rows = [
+        {"id": number, "name": name, "group": group_of.get(name, "")}
+        for number, name in zip(classes.ids, classes.names, strict=True)
+    ]
+    write_bytes(path, csv_text(rows).encode())

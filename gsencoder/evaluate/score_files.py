@@ -1,0 +1,291 @@
+"""Scores of files of predictions against files of truth, by protocol: what `score` and `evaluate` both report."""
+
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from gsencoder.evaluate.files.instances import match_instance_files
+from gsencoder.evaluate.files.recognition import read_recognition_truth, recognize_files
+from gsencoder.evaluate.files.referring import compare_box_files
+from gsencoder.evaluate.files.semantics import count_label_files
+from gsencoder.evaluate.result_table import table_of
+from gsencoder.evaluate.score_report import ScoreReport, spread
+from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.evaluate.scores.instances import MIN_REGION, OVERLAPS, InstanceAverages, instance_scores
+from gsencoder.evaluate.scores.recognition import recognition_scores
+from gsencoder.evaluate.scores.referring import IOUS, ReferringTable, referring_scores
+from gsencoder.evaluate.scores.semantics import BACKGROUND, SemanticAverages, semantic_scores
+
+EQUAL_SCORES = (
+    "All predictions have one score, so that their ranking is undefined, and average precision is that of one step."
+)
+
+
+def score_instances(
+    predictions: Path,
+    truth: Path,
+    classes: ClassTable,
+    *,
+    method: str = "predictions",
+    scenes: Collection[str] | None = None,
+    class_agnostic: bool = False,
+    min_region: int = MIN_REGION,
+) -> ScoreReport:
+    """Average precision of masks (`gsencoder.evaluate.scores.instances`).
+
+    Args:
+        predictions: folder of SCENE.txt or SCENE.npz.
+        truth: folder of SCENE.txt.
+        classes: that are scored.
+        method: name of the predictions' row in the table.
+        scenes: names of those to score; None = all of the truth.
+        class_agnostic: leave the classes of masks out of account.
+        min_region: smallest number of vertices of a true object and of a mask that count.
+
+    Raises:
+        InputError: files that cannot be used or that do not belong together.
+    """
+    matches = list(
+        match_instance_files(
+            predictions, truth, classes, scenes=scenes, class_agnostic=class_agnostic, min_region=min_region
+        )
+    )
+    scores = instance_scores(matches, classes)
+    overall = _precisions(scores.overall)
+    by_scene = [
+        {"scene": each.scene, **_precisions(alone.overall), "truths": int(alone.truths.sum())}
+        for each in matches
+        for alone in (instance_scores([each], classes),)
+    ]
+    by_class = [
+        {"class": name, **_precisions(values), "truths": int(truths), "predictions": int(count)}
+        for (name, values), truths, count in zip(scores.classes.items(), scores.truths, scores.predictions, strict=True)
+    ]
+    groups = {f"ap_{group}": values.ap for group, values in scores.groups.items()}
+    notes = [EQUAL_SCORES] if scores.equal_scores else []
+    if scores.shared:
+        notes.append(
+            f"{scores.shared} masks overlap several true objects by more than 0.25; AP at 0.25 depends on the order in "
+            "which they are listed, as in ScanNet's script."
+        )
+    return ScoreReport(
+        results={
+            "protocol": "instances",
+            "class_agnostic": class_agnostic,
+            "min_region": min_region,
+            "thresholds": [round(float(value), 2) for value in OVERLAPS],
+            "truths": int(scores.truths.sum()),
+            "predictions": int(scores.predictions.sum()),
+            "equal_scores": scores.equal_scores,
+            **overall,
+            **groups,
+            "spread": spread(by_scene, list(overall)),
+        },
+        table=table_of("Instances", {method: overall | groups}, published="splatdistill_2_instances", notes=notes),
+        rows={"scenes": by_scene, "classes": by_class},
+        line=f"{int(scores.truths.sum())} objects in {scores.scenes} scenes: AP {overall['ap']:.3f}, AP50 "
+        f"{overall['ap_50']:.3f}, AP25 {overall['ap_25']:.3f}" + (" without classes" if class_agnostic else ""),
+    )
+
+
+def score_semantics(
+    predictions: Path,
+    truth: Path,
+    classes: ClassTable,
+    *,
+    method: str = "predictions",
+    scenes: Collection[str] | None = None,
+    excluded: Collection[str] = BACKGROUND,
+) -> ScoreReport:
+    """IoU and accuracy of the labels of vertices (`gsencoder.evaluate.scores.semantics`).
+
+    Args:
+        predictions: folder of SCENE.txt.
+        truth: folder of SCENE.txt.
+        classes: that are scored.
+        method: name of the predictions' row in the table.
+        scenes: names of those to score; None = all of the truth.
+        excluded: classes that are not of the foreground.
+
+    Raises:
+        InputError: files that cannot be used or that do not belong together.
+    """
+    counts = list(count_label_files(predictions, truth, classes, scenes=scenes))
+    scores = semantic_scores(counts, classes, excluded=excluded)
+    overall = asdict(scores.overall) | _foreground(scores.foreground)
+    by_scene = [
+        {"scene": each.scene, **asdict(alone.overall), **_foreground(alone.foreground), "vertices": alone.vertices}
+        for each in counts
+        for alone in (semantic_scores([each], classes, excluded=excluded),)
+    ]
+    by_class = [{"class": name, **asdict(values)} for name, values in scores.classes.items()]
+    notes = [f"f-: without {', '.join(scores.excluded)}."] if scores.excluded else []
+    return ScoreReport(
+        results={
+            "protocol": "semantics",
+            "vertices": scores.vertices,
+            "ignored": scores.ignored,
+            "unlabeled": scores.unlabeled,
+            "excluded": list(scores.excluded),
+            **overall,
+            "spread": spread(by_scene, list(overall)),
+        },
+        table=table_of("Semantic labels", {method: overall}, notes=notes),
+        rows={"scenes": by_scene, "classes": by_class},
+        line=f"{scores.vertices:,} labels in {scores.scenes} scenes: mIoU {overall['miou']:.3f}, mAcc "
+        f"{overall['macc']:.3f}, f-mIoU {overall['f_miou']:.3f}; {scores.unlabeled:,} without a prediction",
+    )
+
+
+def score_recognition(
+    predictions: Path,
+    truth: Path,
+    *,
+    classes: Sequence[str] = (),
+    method: str = "predictions",
+    ks: Sequence[int] = (1, 5),
+    allow_missing: bool = False,
+) -> ScoreReport:
+    """Accuracy of the classes of given objects (`gsencoder.evaluate.scores.recognition`).
+
+    Args:
+        predictions: JSON of ranked names by object.
+        truth: JSON of the name of each object.
+        classes: that are scored; empty = all of the truth.
+        method: name of the predictions' row in the table.
+        ks: numbers of names of which one has to be right.
+        allow_missing: count objects without a prediction as wrong, instead of refusing them.
+
+    Raises:
+        InputError: files that cannot be used or that do not belong together.
+    """
+    names = list(classes) or sorted({each.name for each in read_recognition_truth(truth)})
+    instances, skipped = recognize_files(predictions, truth, names, allow_missing=allow_missing)
+    scores = recognition_scores(instances, names, ks=ks)
+    by_scene_name = defaultdict(list)
+    for each in instances:
+        by_scene_name[each.scene].append(each)
+    by_scene = [
+        {"scene": scene, "objects": len(each)}
+        | {f"top_{k}": value for k, value in recognition_scores(each, names, ks=ks).overall.items()}
+        for scene, each in by_scene_name.items()
+    ]
+    means = {f"mean_{k}": value for k, value in scores.mean.items()}
+    overall = {f"overall_{k}": value for k, value in scores.overall.items()}
+    by_class = [
+        {"class": name, "objects": scores.counts.get(name, 0)} | {f"top_{k}": scores.classes[k][name] for k in ks}
+        for name in names
+    ]
+    first = ks[0]
+    columns = {"mean": scores.mean[first], **scores.classes[first]}
+    return ScoreReport(
+        results={
+            "protocol": "recognition",
+            "objects": scores.instances,
+            "unanswered": scores.unanswered,
+            "other_classes": skipped,
+            **means,
+            **overall,
+            "spread": spread(by_scene, [f"top_{k}" for k in ks]),
+        },
+        table=table_of(
+            f"Recognition of given objects, top-{first}", {method: columns}, published="splatdistill_1_recognition"
+        ),
+        rows={"scenes": by_scene, "classes": by_class},
+        line=f"{scores.instances} objects, averaged over classes (over objects): "
+        + ", ".join(f"top-{k} {scores.mean[k]:.3f} ({scores.overall[k]:.3f})" for k in ks),
+    )
+
+
+def score_referring(
+    predictions: Path,
+    truth: Path,
+    *,
+    method: str = "predictions",
+    ks: Sequence[int] = (5,),
+    allow_missing: bool = False,
+) -> ScoreReport:
+    """Accuracy of the boxes of sentences (`gsencoder.evaluate.scores.referring`).
+
+    Args:
+        predictions: JSON of boxes by sentence.
+        truth: JSON of sentences with their box.
+        method: name of the predictions' rows in the table.
+        ks: numbers of boxes of which the best counts, besides the first and all.
+        allow_missing: count sentences without a prediction as wrong, instead of refusing them.
+
+    Raises:
+        InputError: files that cannot be used or that do not belong together.
+    """
+    sentences, unscored = compare_box_files(predictions, truth, allow_missing=allow_missing)
+    scores = referring_scores(sentences, ks=ks)
+    by_scene_name = defaultdict(list)
+    for each in sentences:
+        by_scene_name[each.scene].append(each)
+    by_scene = [
+        {"scene": scene, "sentences": len(each), **_accuracies(referring_scores(each, ks=ks).top1)}
+        for scene, each in by_scene_name.items()
+    ]
+    kinds = {method: scores.top1}
+    kinds |= {f"{method}, best of {k}": scores.best_of[k] for k in ks}
+    kinds |= {f"{method}, best of all": scores.best}
+    measured = {name: _accuracies(table) | _by_uniqueness(table) for name, table in kinds.items()}
+    overall, best = measured[method], measured[f"{method}, best of all"]
+    notes = [f"{count} sentences are not scored: {reason}." for reason, count in unscored.items()]
+    return ScoreReport(
+        results={
+            "protocol": "referring",
+            "sentences": scores.sentences,
+            "without_box": scores.without_box,
+            "not_scored": unscored,
+            "thresholds": list(IOUS),
+            **overall,
+            "best_of": {str(k): _accuracies(scores.best_of[k]) for k in ks} | {"all": _accuracies(scores.best)},
+            "tables": {"top_1": _plain(scores.top1), "best": _plain(scores.best)},
+            "spread": spread(by_scene, ["acc_25", "acc_50"]),
+        },
+        table=table_of("Referring", measured, published="splatdistill_5_referring", notes=notes),
+        rows={
+            "scenes": by_scene,
+            "sentences": [
+                {
+                    "scene": each.scene,
+                    "object": each.object,
+                    "annotation": each.annotation,
+                    "iou": each.ious[0] if each.ious else 0.0,
+                    "best_iou": max(each.ious, default=0.0),
+                    "multiple": each.multiple,
+                }
+                for each in sentences
+            ],
+        },
+        line=f"{scores.sentences} sentences: Acc@0.25 {overall['acc_25']:.3f}, Acc@0.5 {overall['acc_50']:.3f}; "
+        f"{scores.without_box} without a box; of all boxes the best: {best['acc_25']:.3f}, {best['acc_50']:.3f}",
+    )
+
+
+def _precisions(averages: InstanceAverages) -> dict[str, float]:
+    return {"ap_25": averages.ap25, "ap_50": averages.ap50, "ap": averages.ap}
+
+
+def _foreground(averages: SemanticAverages) -> dict[str, float]:
+    return {f"f_{name}": value for name, value in asdict(averages).items()}
+
+
+def _accuracies(table: ReferringTable) -> dict[str, float]:
+    cell = table["overall"]["overall"]
+    return {"acc_25": cell.acc25, "acc_50": cell.acc50}
+
+
+def _by_uniqueness(table: ReferringTable) -> dict[str, float]:
+    return {
+        f"{kind}_{name}": getattr(table[kind]["overall"], field)
+        for kind in ("unique", "multiple")
+        for name, field in (("25", "acc25"), ("50", "acc50"))
+    }
+
+
+def _plain(table: ReferringTable) -> dict[str, Any]:
+    return {kind: {subset: asdict(cell) for subset, cell in cells.items()} for kind, cells in table.items()}
