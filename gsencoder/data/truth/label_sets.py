@@ -1,9 +1,9 @@
 """Classes of ScanNet's benchmarks, and how raw names of annotations become their ids.
 
 scannet_classes.csv holds the 20 and the 200 classes with ids and names, and of the 200 whether a class is head, common
-or tail. The figures are those of ScanNet's BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py
-(Rozenberszki et al., Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id, ids
-of the 200 are id, both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to them.
+or tail, as ScanNet's BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py have them (Rozenberszki
+et al., Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id, ids of the 200
+are id, both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to them.
 """
 
 import csv
@@ -134,7 +134,9 @@ def read_label_map(path: Path, column: str) -> dict[str, int]:
             for row in rows:
                 name, text = row["raw_category"], (row[column] or "").strip()
                 if name is None or not text.isascii() or not text.isdigit() or len(text) > 9:
-                    raise InputError(f"{path}: line {rows.line_num}: {column} must be a whole number, got {text[:40]!r}")
+                    raise InputError(
+                        f"{path}: line {rows.line_num}: {column} must be a whole number, got {text[:40]!r}"
+                    )
                 if mapping.setdefault(name, int(text)) != int(text):
                     raise InputError(
                         f"{path}: line {rows.line_num}: {name[:40]!r} has {column} {text}, and {mapping[name]} before"
@@ -146,9 +148,7 @@ def read_label_map(path: Path, column: str) -> dict[str, int]:
     return mapping
 
 
-def ids_of_names(
-    names: Iterable[str], mapping: Mapping[str, int], label_set: LabelSet | None = None
-) -> dict[str, int]:
+def ids_of_names(names: Iterable[str], mapping: Mapping[str, int], label_set: LabelSet | None = None) -> dict[str, int]:
     """The id of each raw name; 0 where the map does not have the name.
 
     Names are compared as they are written, as ScanNet's scripts do.

@@ -71,9 +71,7 @@ def read_scannetpp_labels(source: Path | ScanNetPPFiles, *, names: Collection[st
     if files.missing:
         raise InputError(f"{files.missing[0]}: no such file; the labels of the scene need it")
     # Objects count from 1: the toolkit takes 0 for the background.
-    groups = [
-        group for group in read_groups(files.annotation, first_id=1) if names is None or group.label in names
-    ]
+    groups = [group for group in read_groups(files.annotation, first_id=1) if names is None or group.label in names]
     segments = read_segments(files.segments)
     vertices, faces = read_mesh(files.mesh)
     check_counts(segments, vertices, files.segments, files.mesh)

@@ -48,5 +48,7 @@ def folders_of_split(names: Iterable[str], root: Path) -> tuple[Path, ...]:
     folders = [root / name for name in names]
     missing = [folder for folder in folders if not folder.is_dir()]
     if missing:
-        raise InputError(f"{missing[0]}: no such folder ({len(missing)} of {len(folders)} scenes of the split are missing)")
+        raise InputError(
+            f"{missing[0]}: no such folder ({len(missing)} of {len(folders)} scenes of the split are missing)"
+        )
     return tuple(folders)
