@@ -75,14 +75,15 @@ def write_replica(scene: Scene, folder: Path) -> None:
 
 
 def write_scannetpp(scene: Scene, folder: Path) -> None:
-    """The dslr/ folder with its transforms.json, whose paths count from resized_images."""
+    """The dslr/ folder with its transforms.json, whose paths count from resized_images, in nerfstudio's world."""
     assert scene.views is not None
     K, frames = scene.views.cameras.Ks[0].astype(float), []
     for index, (color, _, pose) in enumerate(_frames(scene)):
         name = f"DSC{index:05d}.png"
         _picture(folder / "dslr" / "resized_images" / name, color)
         _picture(folder / "dslr" / "resized_anon_masks" / name, np.full(color.shape[:2], 255, np.uint8))
-        matrix = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        matrix = (pose @ np.diag([1.0, -1.0, -1.0, 1.0]))[[1, 0, 2, 3]]
+        matrix[2] *= -1
         frames.append({"file_path": name, "mask_path": name, "transform_matrix": matrix.tolist()})
     data = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "frames": frames, "test_frames": []}
     (folder / "dslr" / "nerfstudio").mkdir(parents=True)

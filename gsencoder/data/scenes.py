@@ -27,6 +27,7 @@ from gsencoder.data.readers.scene_splat import (
 )
 from gsencoder.data.readers.transforms_json import TRANSFORMS
 from gsencoder.data.splats import load_splat
+from gsencoder.data.truth.scene_labels import labels_of_layout, objects_of_labels, with_mesh_instances
 from gsencoder.types import Scene
 
 
@@ -113,7 +114,10 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         options: see SceneConfig.
 
     Returns:
-        A scene with views, or with Gaussians only, or both. `views.masks` exists if there are mask files,
+        A scene with views, or with Gaussians only, or both. A ScanNet or ScanNet++ scene whose label files lie beside
+        it has objects, and where there are no pictures of instances, maps that are drawn from the labeled mesh on
+        access.
+        `views.masks` exists if there are mask files,
         transparency, a background of one color, or pinhole pixels that the distorted picture does not cover.
 
     Raises:
@@ -130,7 +134,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         raise InputError(f"{str(given)[:200]!r} is not a path ({type(error).__name__})") from error
     if not exists:
         raise InputError(f"{given}: no such file or folder")
-    posed, folder, _ = read_posed(root, options)
+    posed, folder, layout = read_posed(root, options)
     if posed is None:
         if splat is not None:
             raise InputError(f"{given}: splat= is for scenes with views, and here there are none; give one splat only")
@@ -155,6 +159,10 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         warn_of_unused_splat(folder)
     objects = folder / "objects.json"
     beside_transforms = root.suffix.lower() == ".json" or any((folder / file).is_file() for file in TRANSFORMS)
+    labels = labels_of_layout(folder, layout)
+    if labels is not None:
+        views = with_mesh_instances(views, labels, origin)
+    found = read_objects(objects) if beside_transforms and objects.is_file() else ()
     points = posed.points
     return Scene(
         name=_name_of(folder),
@@ -163,7 +171,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         origin=origin,
         metres_per_unit=options.metres_per_unit or posed.metres_per_unit,
         up=posed.up if options.up is None else _unit(options.up),
-        objects=read_objects(objects) if beside_transforms and objects.is_file() else (),
+        objects=found if labels is None else objects_of_labels(labels),
         sfm_points=(points - origin).astype(np.float32) if len(points) else None,
         sfm_colors=posed.colors if len(points) else None,
         folder=folder,

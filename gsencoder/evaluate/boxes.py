@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from gsencoder.core.errors import InputError
 from gsencoder.types import Box, Localization, Scene, SceneObject
 
 
@@ -46,8 +47,25 @@ def queryable_objects(objects: Sequence[SceneObject], *, min_views: int = 5, min
         objects: all objects of a scene.
         min_views: smallest number of views in which an object is seen.
         min_pixels: smallest number of pixels that an object has in the view that shows it best.
+
+    Raises:
+        InputError: the views of an object were not counted.
     """
-    return [o for o in objects if o.placed and o.name and o.views >= min_views and o.max_pixels >= min_pixels]
+    return [o for o in objects if o.placed and o.name and is_seen(o, min_views=min_views, min_pixels=min_pixels)]
+
+
+def is_seen(thing: SceneObject, *, min_views: int, min_pixels: int) -> bool:
+    """Whether an object shows in enough views, and in one of them with enough pixels.
+
+    Raises:
+        InputError: its views were not counted.
+    """
+    if thing.views is None or thing.max_pixels is None:
+        raise InputError(
+            f"object {thing.id}: the views that show it were not counted; with_counted_views of "
+            "gsencoder.data.truth.scene_labels counts them"
+        )
+    return thing.views >= min_views and thing.max_pixels >= min_pixels
 
 
 def score_boxes(scene: Scene, localization: Localization, targets: Sequence[SceneObject]) -> list[Hit]:

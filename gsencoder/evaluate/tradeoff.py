@@ -19,6 +19,7 @@ from gsencoder.core.runtime.peak_memory import memory_growth
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
+from gsencoder.data.truth.scene_labels import with_counted_views
 from gsencoder.evaluate.boxes import Hit, accuracy
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries
 from gsencoder.fusion.feature_error import FieldError, field_error
@@ -173,6 +174,7 @@ def measure_tradeoff(
     per_scene: list[list[SettingResult]] = []
     for path in track(list(paths), "scenes"):
         scene = load_scene(path, options=data)
+        scene = with_counted_views(scene) if words is not None else scene
         if scene.gaussians is None:
             scene = replace(scene, gaussians=seed(scene, seeds))
         with tempfile.TemporaryDirectory(prefix="gsencoder_maps_") as maps:

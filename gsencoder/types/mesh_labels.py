@@ -39,11 +39,11 @@ class MeshLabels:
         if len(set(ids)) != len(ids):
             repeated = next(number for row, number in enumerate(ids) if number in ids[:row])
             fail("MeshLabels", "objects", "unique ids", f"{repeated} twice")
-        known = np.isin(self.instances, np.array([0, *ids], np.int64))
+        known = np.asarray(np.isin(self.instances, np.array([0, *ids], np.int64)))
         check_rows("MeshLabels", "instances", known, "0 or the id of an object", self.instances)
         if self.faces is not None:
             check_array("MeshLabels", "faces", self.faces, "int32", ("F", 3))
-            inside = ((self.faces >= 0) & (self.faces < len(self.vertices))).all(axis=1)
+            inside = np.asarray(((self.faces >= 0) & (self.faces < len(self.vertices))).all(axis=1))
             check_rows("MeshLabels", "faces", inside, f"rows of {len(self.vertices)} vertices", self.faces)
         if self.aligned_from_world is not None:
             check_array("MeshLabels", "aligned_from_world", self.aligned_from_world, "float64", (4, 4))

@@ -89,9 +89,10 @@ class SceneObject:
         name: a word of the name table, or None.
         aabb_min: lower corner, world units.
         aabb_max: upper corner.
-        placed: one of the small objects, as opposed to furniture.
-        views: in how many views it shows.
-        max_pixels: its largest visible area in a view.
+        placed: one of the small objects, as opposed to furniture; of scanned scenes whatever is no part of the building
+            (`gsencoder.data.truth.scene_labels.is_placed`).
+        views: in how many views it shows; None where nobody counted (`with_counted_views` of the same module does).
+        max_pixels: its largest visible area in a view; None as above.
     """
 
     id: int
@@ -99,8 +100,8 @@ class SceneObject:
     aabb_min: Float64[np.ndarray, "3"]
     aabb_max: Float64[np.ndarray, "3"]
     placed: bool = True
-    views: int = 0
-    max_pixels: int = 0
+    views: int | None = 0
+    max_pixels: int | None = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

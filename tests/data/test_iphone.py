@@ -50,7 +50,9 @@ def write_iphone(scene: Scene, folder: Path, poses: Poses, *, prefix: str = "") 
         inverse = np.linalg.inv(pose)
         quat = Rotation.from_matrix(inverse[:3, :3]).as_quat()[[3, 0, 1, 2]]
         lines += [" ".join(map(str, (view + 1, *quat, *inverse[:3, 3], 1, f"{prefix}{stem}.jpg"))), ""]
-        frames.append({"file_path": f"{stem}.jpg", "transform_matrix": (pose @ OPENCV_FROM_OPENGL).tolist()})
+        # In nerfstudio's world x and y are exchanged, and z is turned around.
+        matrix = (pose @ OPENCV_FROM_OPENGL)[[1, 0, 2, 3]] * np.array([[1], [1], [-1], [1]])
+        frames.append({"file_path": f"{stem}.jpg", "transform_matrix": matrix.tolist()})
         arkit[stem] = {"timestamp": view / 6, "pose": np.eye(4).tolist(), "intrinsic": K.tolist()}
         arkit[stem]["aligned_pose"] = pose.tolist()
     if poses == "colmap":

@@ -31,6 +31,8 @@ VIDEOS = ("rgb.mkv", "rgb.mp4")
 DEPTH_STREAM = "depth.bin"
 ARKIT_POSES, TRANSFORMS_FILE = "pose_intrinsic_imu.json", "nerfstudio/transforms.json"
 MILLIMETRES = 1e-3
+NERFSTUDIO_FROM_SCAN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+"""(x, y, z) of the scan is (y, x, -z) in transforms.json; the matrix is its own inverse."""
 
 
 def is_iphone(folder: Path) -> bool:
@@ -69,11 +71,13 @@ def read_iphone(folder: Path, *, allow_outside: bool = False, depth_scale: float
         # Names in the model of some releases begin with the name of a folder.
         posed = read_colmap(folder / "colmap", pictures, folder, allow_outside=allow_outside, base_names=True)
     elif (folder / TRANSFORMS_FILE).is_file():
-        posed = read_transforms(
-            folder / TRANSFORMS_FILE,
-            allow_outside=allow_outside,
-            pictures=pictures,
-            masks=folder / MASKS if (folder / MASKS).is_dir() else None,
+        posed = in_world_of_scan(
+            read_transforms(
+                folder / TRANSFORMS_FILE,
+                allow_outside=allow_outside,
+                pictures=pictures,
+                masks=folder / MASKS if (folder / MASKS).is_dir() else None,
+            )
         )
     else:
         posed = _read_arkit(folder, allow_outside=allow_outside)
@@ -89,6 +93,12 @@ def read_iphone(folder: Path, *, allow_outside: bool = False, depth_scale: float
             SceneWarning,
             stacklevel=2,
         )
+    return replace(posed, images=images)
+
+
+def in_world_of_scan(posed: PosedImages) -> PosedImages:
+    """Views of a nerfstudio/transforms.json of ScanNet++, in the world of its scan."""
+    images = tuple(replace(image, cam_from_world=image.cam_from_world @ NERFSTUDIO_FROM_SCAN) for image in posed.images)
     return replace(posed, images=images)
 
 

@@ -2,7 +2,9 @@
 
 The DSLR photographs of dslr/resized_images (fisheye, masks in resized_anon_masks) are read through its
 transforms.json, else through its COLMAP model; iphone.py reads the other folder, which is used where dslr/ has no
-photographs, or where it is given itself. The world is that of the laser scan: metres, z up.
+photographs, or where it is given itself. The world is that of the laser scan: metres, z up. The COLMAP models and
+the meshes are in it; nerfstudio/transforms.json is not, since its poses went through nerfstudio's convention, which
+exchanges x and y and turns z around. They are taken back here.
 """
 
 from dataclasses import replace
@@ -12,7 +14,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
-from gsencoder.data.readers.iphone import is_iphone, read_iphone
+from gsencoder.data.readers.iphone import in_world_of_scan, is_iphone, read_iphone
 from gsencoder.data.readers.posed import PosedImages
 from gsencoder.data.readers.transforms_json import read_transforms
 
@@ -68,10 +70,11 @@ def _read_dslr(folder: Path, *, allow_outside: bool) -> PosedImages:
         transforms = folder / NERFSTUDIO[index]
         if (folder / pictures).is_dir() and transforms.is_file():
             masks = folder / DSLR_MASKS[index]
-            return read_transforms(
+            posed = read_transforms(
                 transforms,
                 allow_outside=allow_outside,
                 pictures=folder / pictures,
                 masks=masks if masks.is_dir() else None,
             )
+            return in_world_of_scan(posed)
     return read_colmap(folder / "colmap", folder / DSLR_PICTURES[0], folder, allow_outside=allow_outside)

@@ -78,9 +78,9 @@ def read_header(path: Path, stream: BinaryIO) -> PlyHeader:
                 order = ">" if encoding == "binary_big_endian" else "<"
             case ["element", name, digits] if digits.isascii() and digits.isdigit() and len(digits) < 20:
                 elements.append((name, int(digits), [], ""))
-            case ["property", "list", count, kind, name] if elements:
+            case ["property", "list", count_kind, entry_kind, name] if elements:
                 elements[-1] = (*elements[-1][:3], name)
-                lists.setdefault(elements[-1][0], []).append((count, kind))
+                lists.setdefault(elements[-1][0], []).append((count_kind, entry_kind))
             case ["property", kind, name] if elements and kind in _TYPES:
                 elements[-1][2].append((name, order + _TYPES[kind]))
             case _:

@@ -1,9 +1,9 @@
 """Classes of ScanNet's benchmarks, and how raw names of annotations become their ids.
 
 scannet_classes.csv holds the 20 and the 200 classes with ids and names, and of the 200 whether a class is head, common
-or tail. The figures are those of ScanNet's BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py
-(Rozenberszki et al., Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id, ids
-of the 200 are id, both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to them.
+or tail, as ScanNet's BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py have them (Rozenberszki
+et al., Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id, ids of the 200
+are id, both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to them.
 """
 
 import csv

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Int32, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splat_formats.ply import PlyElement, PlyHeader, read_header, read_property
@@ -32,7 +32,7 @@ def read_mesh(path: Path) -> tuple[Float32[np.ndarray, "V 3"], Int32[np.ndarray,
         if not good.all():
             bad = np.flatnonzero(~good)
             raise InputError(
-                f"{path}: vertex {bad[0]:,} is not finite ({bad.size:,} of {len(vertices):,} are not); get the mesh anew"
+                f"{path}: vertex {bad[0]:,} is not finite ({bad.size:,} of {len(vertices):,}); get the file anew"
             )
         faces = header.element("face")
         if faces is None or not faces.count:
@@ -82,7 +82,9 @@ def _header(path: Path, stream: BinaryIO) -> tuple[PlyHeader, int]:
     return header, size
 
 
-def _read_triangles(path: Path, stream: BinaryIO, header: PlyHeader, faces: PlyElement, size: int) -> np.ndarray:
+def _read_triangles(
+    path: Path, stream: BinaryIO, header: PlyHeader, faces: PlyElement, size: int
+) -> Int64[np.ndarray, "F 3"]:
     if faces.triangle is None or [element.name for element in header.elements[:2]] != ["vertex", "face"]:
         raise InputError(f"{path}: expected vertices, and then faces with one list of vertices each")
     vertex = header.element("vertex")
@@ -97,18 +99,18 @@ def _read_triangles(path: Path, stream: BinaryIO, header: PlyHeader, faces: PlyE
             raise InputError(f"{path}: a face cannot be read: {' '.join(str(error).split())[:120]}") from error
         if table.shape != (faces.count, 4):
             raise InputError(f"{path}: expected {faces.count:,} triangles, got {list(table.shape)} numbers")
-        counts, rows = table[:, 0], table[:, 1:]
+        counts, rows = table[:, 0], np.asarray(table[:, 1:])
     else:
         start = header.start + vertex.count * vertex.dtype.itemsize
         end = start + faces.count * faces.triangle.itemsize
         if end > size:
             raise InputError(
-                f"{path}: {faces.count:,} triangles end at byte {end:,}, but the file has {size:,}; it is truncated, or "
-                "its faces are not triangles"
+                f"{path}: {faces.count:,} triangles end at byte {end:,}, but the file has {size:,}; it is truncated, "
+                "or its faces are not triangles"
             )
         stream.seek(start)
-        table = np.fromfile(stream, faces.triangle, faces.count)
-        counts, rows = table["n"], table["v"].astype(np.int64)
+        read = np.fromfile(stream, faces.triangle, faces.count)
+        counts, rows = read["n"], read["v"].astype(np.int64)
     if (counts != 3).any():
         row = int(np.flatnonzero(counts != 3)[0])
         raise InputError(f"{path}: face {row:,} has {counts[row]} vertices; expected triangles")

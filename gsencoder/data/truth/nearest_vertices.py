@@ -1,7 +1,7 @@
 """Labels of mesh vertices for Gaussians, and back.
 
-As published work does: a Gaussian has the label of the nearest vertex within a distance (SceneSplat takes 0.25 m), and a
-vertex the most frequent label among the k nearest Gaussians that have features (SceneSplat's benchmark takes k = 25).
+As published work does: a Gaussian has the label of the nearest vertex within a distance (SceneSplat takes 0.25 m), and
+a vertex the most frequent label among the k nearest Gaussians that have features (SceneSplat's benchmark takes k = 25).
 Queries run in chunks, so that memory does not grow with their number.
 
 Reference: Li et al., SceneSplat, 2025; SceneSplat's pointcept/utils/misc.py (neighbor_voting).

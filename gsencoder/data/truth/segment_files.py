@@ -132,8 +132,8 @@ def check_counts(segments: Int64[np.ndarray, " V"], vertices: np.ndarray, path: 
     """
     if len(segments) != len(vertices):
         raise InputError(
-            f"{path}: segIndices has {len(segments):,} entries, but {mesh} has {len(vertices):,} vertices; expected the "
-            "files of one mesh"
+            f"{path}: segIndices has {len(segments):,} entries, but {mesh} has {len(vertices):,} vertices; expected "
+            "the files of one mesh"
         )
 
 

@@ -18,6 +18,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.data.truth.scene_labels import with_counted_views
+from gsencoder.evaluate.boxes import is_seen
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.text.encoder import TextEncoder
@@ -88,7 +90,7 @@ def words_to_ask(
         min_pixels: smallest number of pixels that an object has in the view that shows it best.
     """
     named = [each for each in objects if each.name]
-    present = {each.name for each in named if each.views >= min_views and each.max_pixels >= min_pixels}
+    present = {each.name for each in named if is_seen(each, min_views=min_views, min_pixels=min_pixels)}
     return sorted(name for name in present if name), sorted(set(vocabulary) - {each.name for each in named})
 
 
@@ -121,7 +123,7 @@ def evaluate_absent(
     """
     results = []
     for loaded_scene, load_seconds in scenes:
-        scene, features, seconds = with_features(loaded_scene, source, seeds)
+        scene, features, seconds = with_features(with_counted_views(loaded_scene), source, seeds)
         start = time.perf_counter()
         asked = ask_words(scene, features, words, vocabulary, protocol, localization)
         seconds = {"load": load_seconds, **seconds, "localize": time.perf_counter() - start}

@@ -105,7 +105,7 @@ def evaluate_grounding(
         if views is None or views.instances is None or not loaded_scene.objects:
             raise InputError(
                 f"grounding: scene {loaded_scene.name} needs views with instance maps (instance_file_path in "
-                "transforms.json) and an objects.json that names them"
+                "transforms.json) and an objects.json that names them, or the label files of ScanNet or ScanNet++"
             )
         scene, features, seconds = with_features(loaded_scene, source, seeds)
         start = time.perf_counter()

@@ -16,6 +16,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.data.truth.scene_labels import with_counted_views
 from gsencoder.evaluate.boxes import Hit, accuracy, queryable_objects, score_boxes
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
@@ -114,8 +115,10 @@ def evaluate_scene(
 ) -> SceneOutcome:
     """Runs the protocol on one loaded scene; see `evaluate_localization`.
 
-    A scene without objects to query gets neither seeds nor features.
+    A scene without objects to query gets neither seeds nor features. The views that show objects are counted where
+    their files do not state them.
     """
+    scene = with_counted_views(scene)
     if not queryable_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels):
         count = len(scene.gaussians) if scene.gaussians is not None else 0
         return SceneOutcome(scene=scene.name, hits=(), gaussians=count, seen=0, rank=0, boxless=0, seconds={})
@@ -160,8 +163,9 @@ def _warn_about_gaps(outcomes: Sequence[SceneOutcome]) -> None:
     empty = [outcome.scene for outcome in outcomes if not outcome.hits]
     if len(empty) == len(outcomes):
         raise InputError(
-            f"evaluate: none of {len(outcomes)} scenes has an object to query; expected an objects.json with placed, "
-            "named objects that are seen well enough (see protocol.min_views and protocol.min_pixels)"
+            f"evaluate: none of {len(outcomes)} scenes has an object to query; expected placed, named objects "
+            "that are seen well enough (see protocol.min_views and protocol.min_pixels), in an objects.json or in "
+            "the label files of ScanNet or ScanNet++"
         )
     if empty:
         warnings.warn(

@@ -71,7 +71,10 @@ class LabelsTeacher:
             InputError: a name that the table lacks.
         """
         if not objects:
-            raise MissingInput("teacher labels: the scene lists no objects; it needs an objects.json beside its views")
+            raise MissingInput(
+                "teacher labels: the scene lists no objects; it needs an objects.json beside its views, or the "
+                "label files of ScanNet or ScanNet++"
+            )
         row_of = {name: row for row, name in enumerate(names)}
         used = sorted({o.name for o in objects if o.name is not None})
         missing = [name for name in used if name not in row_of]
