@@ -194,6 +194,7 @@ def _score(word: str, where: str) -> float:
 
 def _number(word: str) -> float | None:
     try:
-        return float(word)
+        # Python reads 1_000 as a number, and other tools do not.
+        return None if "_" in word else float(word)
     except ValueError:
         return None

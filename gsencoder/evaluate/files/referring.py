@@ -1,10 +1,10 @@
 """Files of boxes of sentences, in ScanRefer's format: lists of JSON objects with scene_id, object_id, ann_id and bbox.
 
-A bbox is a list of the eight corners of an axis-aligned box, of which the lowest and highest coordinates count, or of its
-lower and upper corner. In truth, unique_multiple is 1 if the scene has several objects of the class, and others is 1 if
-the class is none of the named ones; ScanRefer's own tool reads both from the prediction, and so does this one where the
-truth has none. A truth whose bbox is null is not scored. A prediction may have bboxes, a list of boxes with the likeliest
-first, in place of or beside bbox, which is then the first of them; [] or null stands for nothing found.
+A bbox is a list of the eight corners of an axis-aligned box, of which the lowest and highest coordinates count, or of
+its lower and upper corner. In truth, unique_multiple is 1 if the scene has several objects of the class, and others is
+1 if the class is none of the named ones; ScanRefer's own tool reads both from the prediction, and so does this one
+where the truth has none. A truth whose bbox is null is not scored. A prediction may have bboxes, a list of boxes with
+the likeliest first, in place of or beside bbox, which is then the first of them; [] or null stands for nothing found.
 """
 
 import itertools
@@ -155,7 +155,7 @@ def _box(value: Any, key: str, entry: Entry) -> Float64[np.ndarray, "2 3"]:
         raise entry.error(f"{key} must be eight corners, or a lower and an upper one, of three numbers each")
     for number in itertools.chain(*rows):
         good = isinstance(number, (int, float)) and not isinstance(number, bool)
-        if not good or not math.isfinite(number) or abs(number) > MAX_COORDINATE:
+        if not good or abs(number) > MAX_COORDINATE or not math.isfinite(number):
             raise entry.error(f"{key} has {shown(number)} where a finite number is expected")
     corners = np.array(rows, np.float64)
     if len(corners) == 2 and (corners[0] > corners[1]).any():

@@ -42,6 +42,9 @@ MIN_REGION = 100
 IDS_PER_LABEL = 1000
 """An instance's id in truth is its class's id times this, and a number from 1."""
 
+MAX_TABLE = 1 << 22
+"""Largest range of ids that are counted in a table; ScanNet200's reach 1,191,000."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneMatches:
@@ -146,7 +149,7 @@ def match_instances(
             f"{truth.scene}: the masks have {prediction.num_vertices:,} vertices, and the truth {len(truth.ids):,}; "
             "expected those of the same mesh"
         )
-    ids, codes, sizes = np.unique(truth.ids, return_inverse=True, return_counts=True)
+    ids, codes, sizes = _distinct(truth.ids)
     instance_rows, rows = classes.rows(ids // IDS_PER_LABEL), classes.rows(prediction.labels)
     if class_agnostic:
         instance_rows, rows = np.where(instance_rows < 0, -1, 0), np.zeros_like(rows)
@@ -185,6 +188,21 @@ def match_instances(
         hits=hits,
         outcome_scores=np.concatenate([values for _, _, values in outcomes]),
     )
+
+
+def _distinct(
+    ids: Int64[np.ndarray, " V"],
+) -> tuple[Int64[np.ndarray, " I"], Int64[np.ndarray, " V"], Int64[np.ndarray, " I"]]:
+    """The distinct ids in ascending order, the index of each vertex's id among them, and their numbers of vertices."""
+    lowest = int(ids.min(initial=0))
+    if int(ids.max(initial=0)) - lowest > MAX_TABLE:
+        return np.unique(ids, return_inverse=True, return_counts=True)
+    # Counting takes a tenth of the time of sorting.
+    counts = np.bincount(ids - lowest)
+    present = np.flatnonzero(counts)
+    codes = np.zeros(len(counts), np.int64)
+    codes[present] = np.arange(len(present))
+    return present + lowest, codes[ids - lowest], counts[present]
 
 
 def _outcomes(

@@ -1,0 +1,95 @@
+"""How long it takes to score instances: 100 scenes with 200 predicted masks each.
+
+    python bench/scores.py [--scenes 100] [--instances 200] [--points 20000]
+
+Scenes are random: instances are runs of vertices, and every mask is one of them, moved and cut. In the first row a
+scene has as many vertices as `points`, in the second each instance has. Checking the masks, matching and scoring are
+timed, and not how the data is made; then reading the files of some scenes of the first kind, in ScanNet's text format
+and as .npz.
+"""
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gsencoder.evaluate.files.instances import (
+    match_instance_files,
+    write_instance_prediction,
+    write_instance_truth,
+)
+from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth
+from gsencoder.evaluate.scores.instances import instance_scores, match_instances
+
+CLASSES = ClassTable(
+    names=tuple(f"class {number}" for number in range(1, 199)),
+    ids=tuple(range(1, 199)),
+    groups={
+        group: tuple(f"class {number}" for number in range(first, first + 66))
+        for group, first in (("head", 1), ("common", 67), ("tail", 133))
+    },
+)
+FILE_SCENES = 3
+
+
+def random_scene(seed: int, instances: int, mask: int) -> tuple[InstanceTruth, InstancePrediction]:
+    """A scene of `instances` runs of `mask` vertices, and as many masks of as many vertices."""
+    vertices = instances * mask
+    rng = np.random.default_rng(seed)
+    starts = np.arange(instances) * mask
+    labels = rng.integers(1, 199, instances)
+    ids = np.repeat(labels * 1000 + np.arange(1, instances + 1), mask)
+    begins = np.clip(starts + rng.integers(-mask // 3, mask // 3 + 1, instances), 0, vertices - mask)
+    prediction = InstancePrediction(
+        scene=f"scene{seed:04d}_00",
+        num_vertices=vertices,
+        vertices=(begins[:, None] + np.arange(mask)).ravel(),
+        offsets=np.arange(instances + 1) * mask,
+        labels=np.where(rng.random(instances) < 0.7, labels, rng.integers(1, 199, instances)),
+        scores=rng.random(instances),
+    )
+    return InstanceTruth(scene=prediction.scene, ids=ids), prediction
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scenes", type=int, default=100)
+    parser.add_argument("--instances", type=int, default=200)
+    parser.add_argument("--points", type=int, default=20_000)
+    options = parser.parse_args()
+    kinds = (max(options.points // options.instances, 100), options.points)
+    for mask in kinds:
+        matches, seconds = [], 0.0
+        for seed in range(options.scenes):
+            truth, made = random_scene(seed, options.instances, mask)
+            start = time.perf_counter()
+            matches.append(match_instances(truth, replace(made), CLASSES))
+            seconds += time.perf_counter() - start
+        start = time.perf_counter()
+        scores = instance_scores(matches, CLASSES)
+        last = time.perf_counter() - start
+        print(
+            f"{options.scenes} scenes of {options.instances * mask:,} vertices × {options.instances} masks of {mask:,}: "
+            f"matching {seconds:.2f} s, scores {last:.2f} s, AP {scores.overall.ap:.3f}, AP25 {scores.overall.ap25:.3f}"
+        )
+    with tempfile.TemporaryDirectory() as name:
+        for form in ("text", "npz"):
+            folders = Path(name) / form / "predictions", Path(name) / form / "truth"
+            for folder in folders:
+                folder.mkdir(parents=True)
+            for seed in range(FILE_SCENES):
+                truth, prediction = random_scene(seed, options.instances, kinds[0])
+                write_instance_prediction(folders[0], prediction, form=form)
+                write_instance_truth(folders[1] / f"{truth.scene}.txt", truth)
+            start = time.perf_counter()
+            instance_scores(list(match_instance_files(*folders, CLASSES)), CLASSES)
+            seconds = (time.perf_counter() - start) / FILE_SCENES
+            print(f"from files, {form}: {seconds:.3f} s a scene, {seconds * options.scenes:.1f} s for all")
+
+
+if __name__ == "__main__":
+    main()
