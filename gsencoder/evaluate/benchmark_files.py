@@ -1,7 +1,7 @@
 """Predictions of the pipeline and the truth of scenes, in the files that benchmarks are scored from.
 
-`evaluate` runs the pipeline scene by scene and writes these files, and then scores them as `score` does. What it reports
-is therefore what anyone finds who scores the same files.
+`evaluate` runs the pipeline scene by scene, writes these files, and then scores them as `score` does. What it reports is
+therefore what anyone finds who scores the same files.
 """
 
 import time
@@ -146,9 +146,7 @@ def score_written(folder: Path, protocol: BenchmarkProtocol, classes: ClassTable
             min_region=protocol.min_region,
         )
     if isinstance(protocol, SemanticsProtocol):
-        return score_semantics(
-            folder / PREDICTIONS, folder / TRUTH, classes, method=method, excluded=protocol.excluded
-        )
+        return score_semantics(folder / PREDICTIONS, folder / TRUTH, classes, method=method, excluded=protocol.excluded)
     files = folder / f"{PREDICTIONS}.json", folder / f"{TRUTH}.json"
     if isinstance(protocol, RecognitionProtocol):
         return score_recognition(*files, classes=classes.names, method=method)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gsencoder.app.commands.evaluate_report import names_table, scores_line
 from gsencoder.app.commands.evaluated_features import stored_memory, stored_source, stored_words, with_stored_features
+from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.commands.through_head import words_of_head
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
@@ -22,13 +23,6 @@ from gsencoder.data.truth.label_sets import COLUMNS, read_label_map
 from gsencoder.evaluate.benchmark_files import BenchmarkProtocol, score_written, write_predictions
 from gsencoder.evaluate.files.class_files import load_classes, write_classes
 from gsencoder.evaluate.grounding import grounding_scores
-from gsencoder.evaluate.protocols.instances import InstancesProtocol
-from gsencoder.evaluate.protocols.recognition import RecognitionProtocol
-from gsencoder.evaluate.protocols.referring import ReferringProtocol
-from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
-from gsencoder.evaluate.score_report import ScoreReport
-from gsencoder.evaluate.scores.class_table import ClassTable
-from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,
     absent_scores,
@@ -42,6 +36,7 @@ from gsencoder.evaluate.protocols.grounding import (
     phrase_mean,
     scores_by_phrase,
 )
+from gsencoder.evaluate.protocols.instances import InstancesProtocol
 from gsencoder.evaluate.protocols.localization import (
     LocalizationProtocol,
     SceneOutcome,
@@ -50,6 +45,11 @@ from gsencoder.evaluate.protocols.localization import (
     scores_by_name,
 )
 from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming, naming_scores
+from gsencoder.evaluate.protocols.recognition import RecognitionProtocol
+from gsencoder.evaluate.protocols.referring import ReferringProtocol
+from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
+from gsencoder.evaluate.score_report import ScoreReport
+from gsencoder.evaluate.scores.class_table import ClassTable
 from gsencoder.evaluate.sources import (
     FeatureSource,
     encoder_source,
@@ -121,8 +121,8 @@ class EvaluateConfig(CommonConfig):
     classes: str = field(
         default="",
         metadata={
-            "help": "of recognition, instances and semantics: scannet20, scannet200, or a CSV file with the columns id, "
-            "name and group; empty = the names of the scenes' objects"
+            "help": "of recognition, instances and semantics: scannet20, scannet200, or a CSV file with the columns "
+            "id, name and group; empty = the names of the scenes' objects"
         },
     )
     label_map: str = field(

@@ -45,8 +45,8 @@ class ScoreConfig(CommonConfig):
     classes: str = field(
         default="",
         metadata={
-            "help": "of instances, semantics and recognition: scannet20, scannet200, or a CSV file with the columns id, "
-            "name and, if there are any, group; empty for recognition = all names of the truth"
+            "help": "of instances, semantics and recognition: scannet20, scannet200, or a CSV file with the columns "
+            "id, name and, if there are any, group; empty for recognition = all names of the truth"
         },
     )
     scenes: str = field(

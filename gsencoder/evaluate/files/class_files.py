@@ -1,4 +1,4 @@
-"""Classes that are scored: those of ScanNet's benchmarks, or those of a CSV file with the columns id, name and group."""
+"""Classes that are scored: those of ScanNet's benchmarks, or of a CSV file with the columns id, name and group."""
 
 import csv
 import io
@@ -37,12 +37,16 @@ def load_classes(classes: str) -> ClassTable:
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: not a readable CSV file ({error})") from error
     if not {"id", "name"} <= set(reader.fieldnames or ()):
-        raise InputError(f"{path}: expected the columns id and name, got {', '.join(reader.fieldnames or ()) or 'none'}")
+        raise InputError(
+            f"{path}: expected the columns id and name, got {', '.join(reader.fieldnames or ()) or 'none'}"
+        )
     ids, names, groups = [], [], {}
     for number, row in enumerate(rows, start=2):
         word, name = row["id"] or "", row["name"] or ""
         if not (word.isascii() and word.isdigit() and len(word) <= 9 and name.strip()):
-            raise InputError(f"{path}: line {number}: expected a whole number and a name, got {word[:40]!r}, {name[:40]!r}")
+            raise InputError(
+                f"{path}: line {number}: expected a whole number and a name, got {word[:40]!r}, {name[:40]!r}"
+            )
         ids.append(int(word))
         names.append(name.strip())
         if row.get("group"):
