@@ -142,6 +142,10 @@ class EvaluateConfig(CommonConfig):
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
 
+CLASS_IDS = "class_ids.csv"
+"""The classes of benchmarks, as `score` takes them."""
+
+
 def run(config: EvaluateConfig, summary: Summary) -> None:
     """Evaluates, prints the scores, and writes them with one row for each object or name."""
     if config.features:
@@ -383,7 +387,7 @@ def _benchmark(
         seeds=config.seeds,
         localization=config.localize,
     )
-    write_classes(folder / "classes_table.csv", classes)
+    write_classes(folder / CLASS_IDS, classes)
     for scene in done:
         summary.add_seconds(scene.seconds)
     report = score_written(folder, protocol, classes, "fused" if not config.weights else "encoded")

@@ -1,7 +1,7 @@
 """`gsencoder score PROTOCOL predictions=… truth=…`: files of any method's predictions against a benchmark's truth."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rich.markdown import Markdown
@@ -21,6 +21,8 @@ from gsencoder.evaluate.scores.instances import MIN_REGION
 from gsencoder.evaluate.scores.semantics import BACKGROUND
 
 TABLE = "table.md"
+MOST_COLUMNS = 10
+"""Columns that are printed; more do not fit a terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +115,11 @@ def write_report(folder: Path, report: ScoreReport, summary: Summary) -> None:
 def print_report(out: Path, report: ScoreReport, *, quiet: bool) -> None:
     """Prints the measured rows and the main figures."""
     screen = console(quiet)
-    screen.print(Markdown(report.table.measured().markdown()))
+    table = report.table.measured()
+    if len(table.columns) > MOST_COLUMNS:
+        table = replace(table, columns=table.columns[:MOST_COLUMNS])
+        screen.print(f"The first {MOST_COLUMNS} of {len(report.table.columns)} columns; all are in {TABLE}.")
+    screen.print(Markdown(table.markdown()))
     screen.print(f"{out}: {report.line}")
 
 

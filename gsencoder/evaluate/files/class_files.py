@@ -40,7 +40,9 @@ def load_classes(classes: str) -> ClassTable:
         raise InputError(
             f"{path}: expected the columns id and name, got {', '.join(reader.fieldnames or ()) or 'none'}"
         )
-    ids, names, groups = [], [], {}
+    ids: list[int] = []
+    names: list[str] = []
+    groups: dict[str, list[str]] = {}
     for number, row in enumerate(rows, start=2):
         word, name = row["id"] or "", row["name"] or ""
         if not (word.isascii() and word.isdigit() and len(word) <= 9 and name.strip()):

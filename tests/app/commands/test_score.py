@@ -1,0 +1,161 @@
+"""`gsencoder score`, and the protocols of `evaluate` that write predictions and score them."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_runs import refusal, results_of
+from named_rooms import write_words
+
+from gsencoder.app import cli
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+from gsencoder.evaluate.files.instances import write_instance_prediction
+from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
+
+pytestmark = pytest.mark.slow
+
+PROTOCOLS = {
+    "recognition": (),
+    "instances": ("protocol.min_region=20",),
+    "semantics": (),
+    "referring": (),
+}
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two rooms and the words of all that is in them."""
+    folder = tmp_path_factory.mktemp("rooms")
+    made = [make_room(number, objects=4, views=4, width=120, height=90) for number in range(2)]
+    for number, room in enumerate(made):
+        write_room(room, folder / f"room_{number}")
+    write_words(folder / "words.safetensors", *made)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def evaluated(rooms: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The outputs of `evaluate` by protocol."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    scenes = [str(rooms / f"room_{number}") for number in range(2)]
+    words = f"teacher.words={rooms / 'words.safetensors'}"
+    for name, options in PROTOCOLS.items():
+        out = f"out={folder / name}"
+        assert cli.main(["evaluate", *scenes, f"protocol={name}", words, *options, out, "quiet=true"]) == 0
+    return {name: folder / name for name in PROTOCOLS}
+
+
+def scored(protocol: str, evaluated: Path, out: Path, *options: str) -> dict[str, Any]:
+    """The results of `score` on what `evaluate` wrote."""
+    ending = ".json" if protocol in ("recognition", "referring") else ""
+    files = [f"{name}={evaluated / name}{ending}" for name in ("predictions", "truth")]
+    assert cli.main(["score", protocol, *files, *options, f"out={out}", "quiet=true"]) == 0
+    return results_of(out)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_files_that_evaluate_writes_have_the_scores_that_it_reports(
+    protocol: str, evaluated: dict[str, Path], tmp_path: Path
+) -> None:
+    options = {
+        "recognition": ("ks=1,5",),
+        "instances": (f"classes={evaluated['instances'] / 'class_ids.csv'}", "min_region=20"),
+        "semantics": (f"classes={evaluated['semantics'] / 'class_ids.csv'}",),
+        "referring": ("ks=5",),
+    }[protocol]
+    again = scored(protocol, evaluated[protocol], tmp_path / "score", *options)
+    first = results_of(evaluated[protocol])
+    del first["gaussians"]
+    assert again == first
+    for name in ("scenes.csv", "table.csv"):
+        given, made = ((folder / name).read_text() for folder in (evaluated[protocol], tmp_path / "score"))
+        assert made.replace("predictions", "fused") == given
+
+
+def test_features_that_were_fused_from_the_labels_name_nearly_all_that_is_there(evaluated: dict[str, Path]) -> None:
+    assert results_of(evaluated["recognition"])["mean_1"] == 1.0
+    assert results_of(evaluated["semantics"])["miou"] > 0.9
+    assert results_of(evaluated["referring"])["acc_25"] >= 0.75
+    instances = results_of(evaluated["instances"])
+    assert instances["ap_25"] >= instances["ap_50"] >= instances["ap"] > 0.2
+    assert instances["spread"]["ap"]["scenes"] == 2
+
+
+def test_the_papers_rows_stand_below_the_measured_ones(evaluated: dict[str, Path]) -> None:
+    with (evaluated["instances"] / "table.csv").open(newline="") as stream:
+        sources = [row["source"] for row in csv.DictReader(stream)]
+    assert sources[0] == "measured"
+    assert set(sources[1:]) == {"published"}
+    assert (
+        "| SplatDistill, fused (published) | 28.1 | 24.3 | 19.1 |" in (evaluated["instances"] / "table.md").read_text()
+    )
+
+
+def test_given_objects_that_are_named_rightly_have_a_precision_of_one(rooms: Path, tmp_path: Path) -> None:
+    words = f"teacher.words={rooms / 'words.safetensors'}"
+    options = ["protocol=instances", "protocol.proposals=truth", "protocol.min_region=5"]
+    assert cli.main(["evaluate", str(rooms / "room_0"), *options, words, f"out={tmp_path / 'out'}", "quiet=true"]) == 0
+    assert results_of(tmp_path / "out")["ap"] == 1.0
+
+
+def test_masks_of_another_scene_or_of_another_length_are_refused(
+    evaluated: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth, classes = evaluated["instances"] / "truth", evaluated["instances"] / "class_ids.csv"
+    words = ["score", "instances", f"truth={truth}", f"classes={classes}", f"out={tmp_path / 'out'}"]
+    (tmp_path / "masks").mkdir()
+    for name in ("room_000", "room_001"):
+        mask = prediction_of_masks(name, [[True] * 7], [1], [0.5], num_vertices=7)
+        write_instance_prediction(tmp_path / "masks", mask)
+    assert "room_000" in refusal(capsys, *words, f"predictions={tmp_path / 'masks'}")
+    (tmp_path / "masks" / "room_001.txt").rename(tmp_path / "masks" / "room_009.txt")
+    assert "room_009" in refusal(capsys, *words, f"predictions={tmp_path / 'masks'}")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["answerz"], "expected one protocol, instances, semantics, recognition, referring"),
+        (["instances"], "classes= is missing"),
+        (["instances", "classes=scannet21"], "classes: scannet21 is no file; expected scannet20, scannet200"),
+        (["recognition", "min_region=5"], "min_region: recognition has no such setting; it takes classes, ks"),
+        (["semantics", "classes=scannet20", "ks=3"], "ks: semantics has no such setting"),
+        (["instances", "classes=scannet20", "min_region=0"], "min_region: expected 1 or more, got 0"),
+        (["referring", "ks=0"], "ks: expected numbers from 1, got 0"),
+    ],
+)
+def test_settings_that_do_not_fit_the_protocol_are_refused(
+    words: list[str], message: str, evaluated: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = evaluated["instances"]
+    assert message in refusal(capsys, "score", *words, f"predictions={folder / 'predictions'}", f"truth={folder}/truth")
+
+
+def test_predictions_and_truth_that_are_swapped_are_refused(
+    evaluated: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for protocol in ("recognition", "referring"):
+        swapped = [f"predictions={evaluated[protocol]}/truth.json", f"truth={evaluated[protocol]}/predictions.json"]
+        assert "may be swapped" in refusal(capsys, "score", protocol, *swapped)
+
+
+def test_a_missing_prediction_is_refused_or_counts_as_wrong(
+    evaluated: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = json.loads((evaluated["recognition"] / "predictions.json").read_text())
+    (tmp_path / "some.json").write_text(json.dumps(rows[1:]))
+    words = [
+        "score",
+        "recognition",
+        f"predictions={tmp_path / 'some.json'}",
+        f"truth={evaluated['recognition'] / 'truth.json'}",
+    ]
+    assert "has no prediction" in refusal(capsys, *words)
+    assert cli.main([*words, "allow_missing=true", f"out={tmp_path / 'out'}", "quiet=true"]) == 0
+    results = results_of(tmp_path / "out")
+    assert results["unanswered"] == 1
+    assert results["overall_1"] == pytest.approx(1 - 1 / len(rows))
