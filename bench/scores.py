@@ -72,10 +72,9 @@ def main() -> None:
         start = time.perf_counter()
         scores = instance_scores(matches, CLASSES)
         last = time.perf_counter() - start
-        print(
-            f"{options.scenes} scenes of {options.instances * mask:,} vertices × {options.instances} masks of {mask:,}: "
-            f"matching {seconds:.2f} s, scores {last:.2f} s, AP {scores.overall.ap:.3f}, AP25 {scores.overall.ap25:.3f}"
-        )
+        size = f"{options.instances * mask:,} vertices, {options.instances} masks of {mask:,}"
+        print(f"{options.scenes} scenes of {size}: matching {seconds:.2f} s, scores {last:.2f} s")
+        print(f"    AP {scores.overall.ap:.3f}, AP50 {scores.overall.ap50:.3f}, AP25 {scores.overall.ap25:.3f}")
     with tempfile.TemporaryDirectory() as name:
         for form in ("text", "npz"):
             folders = Path(name) / form / "predictions", Path(name) / form / "truth"
