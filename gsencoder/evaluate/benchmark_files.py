@@ -1,7 +1,7 @@
 """Predictions of the pipeline and the truth of scenes, in the files that benchmarks are scored from.
 
-`evaluate` runs the pipeline scene by scene, writes these files, and then scores them as `score` does. What it reports is
-therefore what anyone finds who scores the same files.
+`evaluate` runs the pipeline scene by scene, writes these files, and then scores them as `score` does. What it reports
+is therefore what anyone finds who scores the same files.
 """
 
 import time

@@ -27,14 +27,14 @@ class ScoreReport:
     line: str
 
 
-def spread(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> dict[str, dict[str, float]]:
+def spread(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> dict[str, dict[str, float | int]]:
     """Mean and standard deviation over scenes of some columns, and the number of scenes that have a value.
 
     Args:
         rows: one a scene; NaN and None are no values.
         columns: which.
     """
-    figures = {}
+    figures: dict[str, dict[str, float | int]] = {}
     for column in columns:
         values = [row[column] for row in rows if row.get(column) is not None and not math.isnan(row[column])]
         figures[column] = {

@@ -77,10 +77,10 @@ class ScoreConfig(CommonConfig):
     )
 
     def __post_init__(self) -> None:
-        if len(self.paths) != 1 or self.paths[0] not in PROTOCOLS:
-            raise InputError(
-                f"score: expected one protocol, {', '.join(PROTOCOLS)}; got {', '.join(self.paths) or 'none'}"
-            )
+        if not self.paths:
+            return
+        if len(self.paths) > 1 or self.paths[0] not in PROTOCOLS:
+            raise InputError(f"score: expected one protocol, {', '.join(PROTOCOLS)}; got {', '.join(self.paths)}")
         if self.min_region < 1:
             raise InputError(f"min_region: expected 1 or more, got {self.min_region}")
         if not self.ks or min(self.ks) < 1:

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from command_runs import refusal, results_of
 from named_rooms import write_words
@@ -107,12 +108,12 @@ def test_masks_of_another_scene_or_of_another_length_are_refused(
     truth, classes = evaluated["instances"] / "truth", evaluated["instances"] / "class_ids.csv"
     words = ["score", "instances", f"truth={truth}", f"classes={classes}", f"out={tmp_path / 'out'}"]
     (tmp_path / "masks").mkdir()
-    for name in ("room_000", "room_001"):
-        mask = prediction_of_masks(name, [[True] * 7], [1], [0.5], num_vertices=7)
+    for name in ("room_0", "room_1"):
+        mask = prediction_of_masks(name, np.ones((1, 7), bool), [1], [0.5], num_vertices=7)
         write_instance_prediction(tmp_path / "masks", mask)
-    assert "room_000" in refusal(capsys, *words, f"predictions={tmp_path / 'masks'}")
-    (tmp_path / "masks" / "room_001.txt").rename(tmp_path / "masks" / "room_009.txt")
-    assert "room_009" in refusal(capsys, *words, f"predictions={tmp_path / 'masks'}")
+    assert "room_0" in refusal(capsys, *words, f"predictions={tmp_path / 'masks'}")
+    (tmp_path / "masks" / "room_1.txt").rename(tmp_path / "masks" / "room_9.txt")
+    assert "room_9" in refusal(capsys, *words, f"predictions={tmp_path / 'masks'}")
     assert not (tmp_path / "out").exists()
 
 
