@@ -178,7 +178,7 @@ def recognition_scores(
 
 
 def _share(places: list[int], k: int) -> float:
-    return _mean([1 <= place <= k for place in places])
+    return _mean([float(1 <= place <= k) for place in places])
 
 
 def _mean(values: Sequence[float]) -> float:
