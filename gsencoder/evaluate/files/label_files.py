@@ -1,6 +1,7 @@
 """Text files with one whole number a line: labels of vertices, instances of truth, and masks, in ScanNet's formats."""
 
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -55,11 +56,11 @@ def mask_bytes(mask: Bool[np.ndarray, " n"]) -> bytes:
 
 
 def _parsed(path: Path, data: bytes, hint: str) -> Int64[np.ndarray, " n"]:
-    lines = data.count(b"\n") + (not data.endswith(b"\n") and bool(data))
-    with warnings.catch_warnings():
-        # numpy warns, and stops, at what it cannot read; the number of values then differs.
+    lines, values = data.count(b"\n") + (not data.endswith(b"\n") and bool(data)), np.zeros(0, np.int64)
+    with warnings.catch_warnings(), suppress(ValueError):
+        # At what it cannot read, numpy warns and stops, or from 2.3 on raises.
         warnings.simplefilter("ignore", DeprecationWarning)
-        values = np.fromstring(data, np.int64, sep="\n") if data.strip() else np.zeros(0, np.int64)
+        values = np.fromstring(data, np.int64, sep="\n") if data.strip() else values
     if len(values) == lines and (not lines or max(values.max(), -values.min()) <= LARGEST) and _plain(data):
         return values
     for number, line in enumerate(data.splitlines(), start=1):

@@ -1,0 +1,287 @@
+"""Files of instances and labels in ScanNet's formats: what is written is read back, and bad files are named."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.evaluate.files.instances import (
+    match_instance_files,
+    read_instance_prediction,
+    read_instance_truth,
+    write_instance_prediction,
+    write_instance_truth,
+)
+from gsencoder.evaluate.files.label_files import read_mask, read_whole_numbers, write_whole_numbers
+from gsencoder.evaluate.files.scene_folders import scene_files
+from gsencoder.evaluate.files.semantics import count_label_files
+from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
+from gsencoder.evaluate.scores.instances import instance_scores
+from gsencoder.evaluate.scores.semantics import semantic_scores
+
+CLASSES = ClassTable(names=("bed", "chair"), ids=(4, 5))
+IDS = np.repeat([4001, 5001, 0], [150, 120, 30])
+SIZE = len(IDS)
+
+
+def prediction(scene: str = "scene0011_00") -> InstancePrediction:
+    return prediction_of_masks(scene, [IDS == 4001, IDS == 5001], [4, 5], [0.1, 1 / 3], num_vertices=SIZE)
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    """Predictions and truth of one scene, on which the predictions are perfect."""
+    predictions, truth = tmp_path / "predictions", tmp_path / "truth"
+    for folder in (predictions, truth):
+        folder.mkdir()
+    write_instance_prediction(predictions, prediction())
+    write_instance_truth(truth / "scene0011_00.txt", InstanceTruth(scene="scene0011_00", ids=IDS))
+    return predictions, truth
+
+
+@pytest.mark.parametrize("form", ["text", "npz"])
+def test_what_is_written_is_read_back(tmp_path: Path, form: str) -> None:
+    path = write_instance_prediction(tmp_path, prediction(), form=form)  # type: ignore[arg-type]
+    again = read_instance_prediction(path, num_vertices=SIZE)
+    assert again.scene == "scene0011_00"
+    for name in ("vertices", "offsets", "labels", "scores"):
+        assert np.array_equal(getattr(again, name), getattr(prediction(), name))
+
+
+@pytest.mark.parametrize("form", ["text", "npz"])
+def test_a_scene_without_masks_is_written_and_read(tmp_path: Path, form: str) -> None:
+    none = prediction_of_masks("a", [], [], [], num_vertices=7)
+    path = write_instance_prediction(tmp_path, none, form=form)  # type: ignore[arg-type]
+    assert len(read_instance_prediction(path, num_vertices=7).labels) == 0
+
+
+def test_text_is_as_scannets_script_reads_it(folders: tuple[Path, Path]) -> None:
+    lines = [line.split(" ") for line in (folders[0] / "scene0011_00.txt").read_text().splitlines()]
+    assert [(int(float(label)), float(score)) for _, label, score in lines] == [(4, 0.1), (5, 1 / 3)]
+    mask = np.array((folders[0] / lines[1][0]).read_text().splitlines(), dtype=np.int64)
+    assert np.array_equal(mask != 0, IDS == 5001)
+    truth = np.array((folders[1] / "scene0011_00.txt").read_text().splitlines(), dtype=np.int64)
+    assert np.array_equal(truth, IDS)
+
+
+def test_folders_are_scored(folders: tuple[Path, Path]) -> None:
+    scores = instance_scores(list(match_instance_files(*folders, CLASSES)), CLASSES)
+    assert (scores.scenes, scores.overall.ap) == (1, 1)
+
+
+def test_files_of_other_tools_are_read(folders: tuple[Path, Path]) -> None:
+    # ScanNet's script writes its results beside predictions. Class ids may be written as 4.0; masks with any number,
+    # with CRLF, and without an end of the last line.
+    (folders[0] / "semantic_instance_evaluation.txt").write_text("class,class id,ap\n")
+    (folders[0] / "masks").mkdir()
+    (folders[0] / "masks" / "m.txt").write_bytes(b"\r\n".join(b"17" if own else b"0" for own in IDS == 4001))
+    (folders[0] / "scene0011_00.txt").write_bytes(b"./masks/m.txt 4.0 1e-1\r\n")
+    assert [files.scene for files in scene_files(*folders)] == ["scene0011_00"]
+    found = read_instance_prediction(folders[0] / "scene0011_00.txt", num_vertices=SIZE)
+    assert np.array_equal(found.mask(0), np.flatnonzero(IDS == 4001))
+    assert (found.labels[0], found.scores[0]) == (4, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "4001\n5001\n",
+            "line 1: expected a mask file, a class id and a score, got '4001'; predictions and truth may be",
+        ),
+        ("predicted_masks/scene0011_00_000.txt 4\n", "line 1: expected a mask file"),
+        ("predicted_masks/scene0011_00_000.txt 4 1 1\n", "line 1: expected a mask file"),
+        ("\n", "line 1: expected a mask file"),
+        ("predicted_masks/scene0011_00_000.txt bed 1\n", "line 1: expected a whole number as the class id, got 'bed'"),
+        ("predicted_masks/scene0011_00_000.txt 4.5 1\n", "class id, got '4.5'"),
+        ("predicted_masks/scene0011_00_000.txt 1e99 1\n", "class id, got '1e99'"),
+        ("predicted_masks/scene0011_00_000.txt 4 nan\n", "line 1: expected a finite number as the score, got 'nan'"),
+        ("predicted_masks/scene0011_00_000.txt 4 inf\n", "score, got 'inf'"),
+        ("predicted_masks/scene0011_00_000.txt 4 high\n", "score, got 'high'"),
+        ("predicted_masks/scene0011_00_000.txt 4 1_0\n", "score, got '1_0'"),
+        ("/etc/passwd 4 1\n", "line 1: the mask '/etc/passwd' is not below"),
+        ("../truth/scene0011_00.txt 4 1\n", "is not below"),
+        ("predicted_masks/other.txt 4 1\n", "other.txt: no such file"),
+        (
+            "predicted_masks/scene0011_00_000.txt 4 1\npredicted_masks/../predicted_masks/scene0011_00_000.txt 5 1\n",
+            "line 2: the mask .* is that of line 1 already",
+        ),
+    ],
+)
+def test_a_bad_line_of_a_prediction_is_named(folders: tuple[Path, Path], text: str, message: str) -> None:
+    path = folders[0] / "scene0011_00.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        list(match_instance_files(*folders, CLASSES))
+    assert "scene0011_00.txt" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"0\n1\n", "line 1: the mask 'predicted_masks/scene0011_00_000.txt' has 2 lines, and the scene 300 vertices"),
+        (b"", "has 0 lines"),
+        (b"0\nx\n", "line 2: expected one whole number, got 'x'"),
+        (b"0\n0.5\n", "line 2: expected one whole number, got '0.5'"),
+        (b"0\n1 1\n0\n", "line 2: expected one whole number, got '1 1'"),
+        (b"0\n\n0\n", "line 2: expected one whole number, got ''"),
+        (b"0\nnan\n", "line 2: expected one whole number, got 'nan'"),
+        (b"0\n99999999999999999999999\n", "line 2: expected one whole number"),
+        (b"0\n-99999999999\n", "line 2: expected one whole number"),
+        (b"0\n1-1\n", "line 2: expected one whole number, got '1-1'"),
+        (b"\xff\xfe\n", "line 1: expected one whole number"),
+        (pickle.dumps(np.zeros(3)), "is a pickle, which is refused"),
+        (b"PK\x03\x04....", "is an archive"),
+    ],
+)
+def test_a_bad_mask_is_named(folders: tuple[Path, Path], content: bytes, message: str) -> None:
+    (folders[0] / "predicted_masks" / "scene0011_00_000.txt").write_bytes(content)
+    with pytest.raises(InputError, match=message) as error:
+        list(match_instance_files(*folders, CLASSES))
+    assert "scene0011_00_000.txt" in str(error.value)
+
+
+def test_swapped_folders_are_told(folders: tuple[Path, Path]) -> None:
+    with pytest.raises(InputError, match="predictions and truth may be swapped"):
+        list(match_instance_files(folders[1], folders[0], CLASSES))
+
+
+def test_truth_without_vertices_is_refused(folders: tuple[Path, Path]) -> None:
+    (folders[1] / "scene0011_00.txt").write_text("")
+    with pytest.raises(InputError, match="no vertices"):
+        read_instance_truth(folders[1] / "scene0011_00.txt")
+
+
+def save_npz(path: Path, **changes: object) -> Path:
+    arrays = {"pred_masks": np.ones((SIZE, 2), bool), "pred_classes": np.array([4, 5]), "pred_scores": np.ones(2)}
+    np.savez(path, **(arrays | changes))  # type: ignore[arg-type]
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pred_masks": np.ones((2, SIZE), bool)}, "pred_masks is 2 × 300, and the scene has 300 vertices.*transpose"),
+        ({"pred_masks": np.ones((5, 2), bool)}, "pred_masks is 5 × 2, and the scene has 300 vertices; expected"),
+        ({"pred_classes": np.array([4])}, "2 masks, 1 pred_classes and 2 pred_scores"),
+        ({"pred_scores": np.array([1, np.nan])}, "prediction 1 has the score nan"),
+        ({"pred_scores": np.array(["a", "b"])}, "pred_scores: expected 1 axes of type 'f'"),
+        ({"pred_masks": np.array([None])}, "pred_masks"),
+    ],
+)
+def test_a_bad_npz_is_named(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    path = save_npz(tmp_path / "a.npz", **changes)
+    with pytest.raises(InputError, match=message) as error:
+        read_instance_prediction(path, num_vertices=SIZE)
+    assert str(path) in str(error.value)
+
+
+def test_an_npz_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.npz").write_bytes(b"no")
+    with pytest.raises(InputError, match="a.npz: cannot be read"):
+        read_instance_prediction(tmp_path / "a.npz", num_vertices=3)
+
+
+# Folders
+
+
+def test_scenes_of_one_folder_only_are_refused(folders: tuple[Path, Path]) -> None:
+    write_instance_prediction(folders[0], prediction("scene0022_00"))
+    with pytest.raises(InputError, match="scene0022_00.txt: there is no truth of this scene"):
+        scene_files(*folders)
+    (folders[0] / "scene0022_00.txt").rename(folders[1] / "scene0022_00.txt")
+    with pytest.raises(InputError, match="no prediction of 1 scenes: scene0022_00"):
+        scene_files(*folders)
+    assert [files.scene for files in scene_files(*folders, scenes=["scene0011_00"])] == ["scene0011_00"]
+    with pytest.raises(InputError, match="no truth of 1 scenes to score: scene0033_00"):
+        scene_files(*folders, scenes=["scene0011_00", "scene0033_00"])
+
+
+def test_two_predictions_of_a_scene_are_refused(folders: tuple[Path, Path]) -> None:
+    write_instance_prediction(folders[0], prediction(), form="npz")
+    with pytest.raises(InputError, match="the scene scene0011_00 has both scene0011_00.npz and scene0011_00.txt"):
+        list(match_instance_files(*folders, CLASSES))
+
+
+def test_folders_without_files_of_scenes_are_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    with pytest.raises(InputError, match="empty: expected a folder"):
+        scene_files(empty, folders[1])
+    empty.mkdir()
+    with pytest.raises(InputError, match="no predictions; expected SCENE.txt"):
+        scene_files(empty, folders[1])
+    with pytest.raises(InputError, match="no truth"):
+        scene_files(folders[0], empty)
+    with pytest.raises(InputError, match="same folder"):
+        scene_files(folders[0], tmp_path / "truth" / ".." / "predictions")
+    (empty / "scene0011_00.pth").write_bytes(b"\x80\x02.")
+    with pytest.raises(InputError, match="scene0011_00.pth is a pickle"):
+        scene_files(empty, folders[1])
+
+
+# Numbers
+
+
+def test_numbers_and_masks_are_read_back(tmp_path: Path) -> None:
+    values = np.array([0, -1, 4001, 2**31 - 1, -(2**31) + 1])
+    write_whole_numbers(tmp_path / "n.txt", values)
+    assert np.array_equal(read_whole_numbers(tmp_path / "n.txt"), values)
+    assert read_mask(tmp_path / "n.txt").tolist() == [False, True, True, True, True]
+    (tmp_path / "m.txt").write_text("0\n1\n7\n0")
+    assert read_mask(tmp_path / "m.txt").tolist() == [False, True, True, False]
+    (tmp_path / "e.txt").write_text("")
+    assert len(read_whole_numbers(tmp_path / "e.txt")) == 0
+
+
+def test_files_that_are_missing_folders_or_too_large_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="none.txt: no such file"):
+        read_whole_numbers(tmp_path / "none.txt")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_whole_numbers(tmp_path)
+    (tmp_path / "a.pkl").write_text("1\n")
+    with pytest.raises(InputError, match="a.pkl: is a pickle"):
+        read_whole_numbers(tmp_path / "a.pkl")
+    with (tmp_path / "large.txt").open("wb") as stream:
+        stream.truncate((256 << 20) + 1)
+    with pytest.raises(InputError, match="at most"):
+        read_whole_numbers(tmp_path / "large.txt")
+
+
+# Semantic labels
+
+
+@pytest.fixture
+def label_folders(tmp_path: Path) -> tuple[Path, Path]:
+    for name in ("predictions", "truth"):
+        (tmp_path / name).mkdir()
+        write_whole_numbers(tmp_path / name / "scene0011_00.txt", np.array([4, 4, 5, 0]))
+    return tmp_path / "predictions", tmp_path / "truth"
+
+
+def test_labels_of_folders_are_scored(label_folders: tuple[Path, Path]) -> None:
+    write_whole_numbers(label_folders[0] / "scene0011_00.txt", np.array([4, 5, 5, 4]))
+    scores = semantic_scores(list(count_label_files(*label_folders, CLASSES)), CLASSES)
+    assert scores.overall.miou == 1 / 2
+    assert scores.ignored == 1
+
+
+@pytest.mark.parametrize(
+    ("side", "text", "message"),
+    [
+        (0, "4\n4\n5\n", "the prediction has 3 labels, and the truth 4"),
+        (0, "4\nbed\n5\n0\n", "line 2: expected one whole number, got 'bed'"),
+        (1, "4001\n4002\n5001\n0\n", "ids such as 5001 are those of instances"),
+        (0, "", "no vertices"),
+        (1, "", "no vertices"),
+    ],
+)
+def test_bad_labels_are_named(label_folders: tuple[Path, Path], side: int, text: str, message: str) -> None:
+    path = label_folders[side] / "scene0011_00.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        list(count_label_files(*label_folders, CLASSES))
+    assert str(path) in str(error.value)

@@ -1,0 +1,122 @@
+"""Scores of labels of vertices: values worked out by hand, and scikit-learn's."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.metrics import accuracy_score, jaccard_score, recall_score
+
+from gsencoder.core.errors import InputError
+from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.evaluate.scores.semantics import LabelCounts, SemanticScores, count_labels, semantic_scores
+
+CLASSES = ClassTable(names=("wall", "bed", "chair", "sofa"), ids=(1, 4, 5, 6))
+WALL, BED, CHAIR, SOFA = CLASSES.ids
+
+
+def counts(truth: list[int], predicted: list[int], scene: str = "a") -> LabelCounts:
+    return count_labels(scene, np.array(truth, np.int64), np.array(predicted, np.int64), CLASSES)
+
+
+def scored(truth: list[int], predicted: list[int]) -> SemanticScores:
+    return semantic_scores([counts(truth, predicted)], CLASSES)
+
+
+def test_scores_are_those_worked_out_by_hand() -> None:
+    # bed: 2 of 3 right, 1 chair and 1 wall called bed: IoU 2 / 5, accuracy 2 / 3.
+    # chair: 1 of 2 right, none called chair: IoU 1 / 2, accuracy 1 / 2.
+    # wall: 0 of 1 right, 1 bed called wall: IoU 0 / 2, accuracy 0.
+    # sofa: neither there nor predicted; the vertex of id 0 that is called sofa is ignored.
+    scores = scored([BED, BED, BED, CHAIR, CHAIR, WALL, 0], [BED, BED, WALL, CHAIR, BED, BED, SOFA])
+    assert {name: row.iou for name, row in scores.classes.items()} == pytest.approx(
+        {"wall": 0, "bed": 2 / 5, "chair": 1 / 2, "sofa": math.nan}, nan_ok=True
+    )
+    assert scores.overall.miou == pytest.approx((2 / 5 + 1 / 2) / 3)
+    assert scores.overall.macc == pytest.approx((2 / 3 + 1 / 2) / 3)
+    assert scores.overall.accuracy == 3 / 6
+    # Without the wall; its vertex that is called bed still counts as wrong there.
+    assert scores.excluded == ("wall",)
+    assert scores.foreground.miou == pytest.approx((2 / 5 + 1 / 2) / 2)
+    assert scores.foreground.macc == pytest.approx((2 / 3 + 1 / 2) / 2)
+    assert scores.foreground.accuracy == 3 / 5
+    assert (scores.vertices, scores.ignored, scores.unlabeled) == (6, 1, 0)
+
+
+def test_what_is_predicted_as_no_class_is_missed_and_no_class_has_it_wrongly() -> None:
+    scores = scored([BED, BED, CHAIR], [BED, 99, -1])
+    assert scores.classes["bed"].iou == scores.classes["bed"].accuracy == 1 / 2
+    assert scores.classes["chair"].iou == 0
+    assert scores.unlabeled == 2
+
+
+def test_a_class_that_is_predicted_and_not_there_has_the_iou_0_unless_only_those_in_truth_count() -> None:
+    scores = scored([BED, BED], [BED, SOFA])
+    assert scores.overall.miou == (1 / 2 + 0) / 2
+    assert scores.overall.miou_present == 1 / 2
+    assert scores.overall.macc == 1 / 2
+    assert math.isnan(scores.classes["sofa"].accuracy)
+
+
+def test_without_vertices_that_count_there_are_no_scores() -> None:
+    for truth, predicted in (([], []), ([0, 77], [BED, SOFA])):
+        scores = scored(truth, predicted)
+        values = (scores.overall.miou, scores.overall.miou_present, scores.overall.macc, scores.overall.accuracy)
+        assert all(math.isnan(value) for value in values)
+        assert scores.ignored == len(truth)
+
+
+def test_excluding_every_class_leaves_no_foreground() -> None:
+    scores = semantic_scores([counts([BED], [BED])], CLASSES, excluded=CLASSES.names)
+    assert math.isnan(scores.foreground.miou)
+    assert scores.overall.miou == 1
+
+
+LABELS = st.lists(st.tuples(st.sampled_from([1, 4, 5, 6, 0]), st.sampled_from([1, 4, 5, 6, 0])), min_size=1)
+
+
+@given(LABELS)
+def test_scores_are_those_of_scikit_learn(pairs: list[tuple[int, int]]) -> None:
+    scores = scored([true for true, _ in pairs], [predicted for _, predicted in pairs])
+    kept = [(true, predicted) for true, predicted in pairs if true]
+    if not kept:
+        assert math.isnan(scores.overall.miou)
+        return
+    truth, predicted = zip(*kept, strict=True)
+    seen = sorted({label for pair in kept for label in pair if label})
+    there = sorted(set(truth))
+    iou = jaccard_score(truth, predicted, labels=seen, average="macro", zero_division=0)
+    present = jaccard_score(truth, predicted, labels=there, average="macro", zero_division=0)
+    assert scores.overall.miou == pytest.approx(iou)
+    assert scores.overall.miou_present == pytest.approx(present)
+    assert scores.overall.macc == pytest.approx(recall_score(truth, predicted, labels=there, average="macro"))
+    assert scores.overall.accuracy == pytest.approx(accuracy_score(truth, predicted))
+
+
+@given(LABELS, st.integers(0, 100))
+def test_scenes_scored_together_are_one_long_scene_in_any_order(pairs: list[tuple[int, int]], cut: int) -> None:
+    truth, predicted = ([pair[side] for pair in pairs] for side in (0, 1))
+    parts = [counts(truth[:cut], predicted[:cut], "a"), counts(truth[cut:], predicted[cut:], "b")]
+    whole = scored(truth, predicted)
+    for scenes in (parts, parts[::-1]):
+        together = semantic_scores(scenes, CLASSES)
+        assert together.overall.miou == pytest.approx(whole.overall.miou, nan_ok=True)
+        assert together.foreground.macc == pytest.approx(whole.foreground.macc, nan_ok=True)
+
+
+def test_numbers_of_vertices_that_differ_are_refused() -> None:
+    with pytest.raises(InputError, match="a: the prediction has 1 labels, and the truth 2"):
+        counts([BED, BED], [BED])
+
+
+def test_a_scene_twice_other_classes_and_unknown_names_are_refused() -> None:
+    one = counts([BED], [BED])
+    with pytest.raises(InputError, match="the scene a is there twice"):
+        semantic_scores([one, one], CLASSES)
+    with pytest.raises(InputError, match="no scene"):
+        semantic_scores([], CLASSES)
+    with pytest.raises(InputError, match="different classes"):
+        semantic_scores([one], CLASSES.without(("sofa",)))
+    with pytest.raises(InputError, match="cannot exclude 'walls', which is no class"):
+        semantic_scores([one], CLASSES, excluded=("walls",))
