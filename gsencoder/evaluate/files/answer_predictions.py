@@ -14,6 +14,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.truth.entries import (
     Corner,
+    box_corners,
     id_value,
     number,
     object_of,
@@ -24,7 +25,6 @@ from gsencoder.data.truth.entries import (
     text_value,
 )
 from gsencoder.data.truth.questions import Question
-from gsencoder.evaluate.files.box_corners import box_corners
 from gsencoder.evaluate.scores.answers import TOP
 
 EXPECTED = "question_id and answer_top10, or scene_id, situation, question and answer"

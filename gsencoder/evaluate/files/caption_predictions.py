@@ -12,6 +12,7 @@ from typing import Any
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.truth.entries import (
+    box_corners,
     corner_bounds,
     number,
     object_id,
@@ -22,7 +23,6 @@ from gsencoder.data.truth.entries import (
     text_list,
     text_value,
 )
-from gsencoder.evaluate.files.box_corners import box_corners
 from gsencoder.evaluate.scores.dense_captions import CaptionedBox, CaptionedObject, NamedCaption, wrapped_caption
 
 EXPECTED = (
@@ -40,8 +40,8 @@ def read_caption_predictions(
         objects: of the truth.
 
     Raises:
-        InputError: not such a file, truth in its place, captions of other scenes or objects, two captions of one object,
-            or something else than texts and finite numbers.
+        InputError: not such a file, truth in its place, captions of other scenes or objects, two captions of one
+            object, or something else than texts and finite numbers.
     """
     file = Path(path)
     content = read_benchmark_json(file)
@@ -133,7 +133,7 @@ def _named(content: Mapping[str, Any], path: Path, objects: Sequence[CaptionedOb
         if identity not in names:
             raise InputError(f"{where}: is no {'object' if scene in scenes else 'scene'} of the truth")
         if name and name != names[identity]:
-            raise InputError(f"{where}: the truth calls this object {names[identity]}")
+            raise InputError(f"{where}: the truth calls this object {shown(names[identity])}")
         if identity in found:
             raise InputError(f"{where}: is the same object as {shown(found[identity])}")
         sentences = text_list(value, where, "caption", empty=True)

@@ -1,13 +1,13 @@
-"""Scan2Cap's m@kIoU: sentence scores of captions that count only where their box overlaps the object (Chen et al. 2021).
+"""Scan2Cap's m@kIoU: sentence scores of captions that count only where their box overlaps the object (Chen 2021).
 
 Every object with captions is one sample. Its hypothesis is the caption of the predicted box that overlaps it most, of
 equal ones the first, if their IoU is above k; else it is the empty caption "sos eos". References are all captions of
 the object. Captions are wrapped in sos and eos, as lib/eval_helper.py does, and cut at blanks, without a tokenizer: sos
 and eos count as words, and an object without a caption scores above 0 in BLEU-1 and ROUGE-L. Scores are of the corpus.
 
-The script takes for each box the object that its detector was trained to assign, by the nearest center, which a file of
-boxes does not have. The benchmark (benchmark/eval.py) assigns by generalized IoU, one box to one object, and takes an IoU
-of k, too; where each object has one box of its own near it, all three agree.
+The script takes for each box the object that its detector was trained to assign, by the nearest center, which a file
+of boxes does not have. The benchmark (benchmark/eval.py) assigns by generalized IoU, one box to one object, and takes
+an IoU of k, too; where each object has one box of its own near it, all three agree.
 """
 
 from collections.abc import Sequence
