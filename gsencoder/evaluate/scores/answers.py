@@ -238,7 +238,7 @@ def mean_answers(rows: Sequence[AnswerRow]) -> AnswerMeans:
     """Means over questions, of one scene or kind, say."""
     count = len(rows)
 
-    def mean(values: Sequence[float]) -> float:
+    def mean(values: Sequence[float | bool]) -> float:
         return sum(values) / count if count else float("nan")
 
     values = [row.f_value for row in rows if row.f_value is not None]
