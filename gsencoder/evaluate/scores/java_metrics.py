@@ -138,7 +138,7 @@ class _Conversation:
 
     def __init__(self, command: Sequence[str], what: str) -> None:
         self.what = what
-        self.errors = tempfile.TemporaryFile()
+        self.errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the block
         pipe = subprocess.PIPE
         try:
             self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self.errors, env=_environment())
