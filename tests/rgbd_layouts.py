@@ -90,9 +90,25 @@ def write_scannetpp(scene: Scene, folder: Path) -> None:
     (folder / "dslr" / "nerfstudio" / "transforms.json").write_text(json.dumps(data))
 
 
+def write_scannet_frames(scene: Scene, folder: Path) -> None:
+    """The export of a ScanNet scan, in millimetres."""
+    assert scene.views is not None
+    for index, (color, depth, pose) in enumerate(_frames(scene)):
+        _picture(folder / "color" / f"{index}.png", color)
+        _picture(folder / "depth" / f"{index}.png", _steps(depth, 1000))
+        (folder / "pose").mkdir(exist_ok=True)
+        np.savetxt(folder / "pose" / f"{index}.txt", pose)
+    K = np.eye(4)
+    K[:3, :3] = scene.views.cameras.Ks[0]
+    (folder / "intrinsic").mkdir()
+    for name in ("color", "depth"):
+        np.savetxt(folder / "intrinsic" / f"intrinsic_{name}.txt", K)
+
+
 WRITERS: dict[str, Callable[[Scene, Path], None]] = {
     "7-Scenes": write_seven_scenes,
     "TUM RGB-D": write_tum,
     "Replica": write_replica,
     "ScanNet++": write_scannetpp,
+    "ScanNet": write_scannet_frames,
 }

@@ -1,9 +1,10 @@
 """Classes of ScanNet's benchmarks, and how raw names of annotations become their ids.
 
 scannet_classes.csv holds the 20 and the 200 classes with ids and names, and of the 200 whether a class is head, common
-or tail, as ScanNet's BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py have them (Rozenberszki
-et al., Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id, ids of the 200
-are id, both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to them.
+or tail, as ScanNet's BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py have them
+(Rozenberszki et al., Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id,
+ids of the 200 are id, both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to
+them.
 """
 
 import csv
@@ -98,6 +99,8 @@ def read_class_list(path: Path) -> LabelSet:
         if path.stat().st_size > MAX_CLASS_LIST_BYTES:
             raise InputError(f"{path}: {path.stat().st_size:,} bytes, expected one name a line")
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a readable list of names ({' '.join(str(error).split())[:120]})") from error
     names = [line for line in lines if line]
@@ -141,6 +144,8 @@ def read_label_map(path: Path, column: str) -> dict[str, int]:
                     raise InputError(
                         f"{path}: line {rows.line_num}: {name[:40]!r} has {column} {text}, and {mapping[name]} before"
                     )
+    except InputError:
+        raise
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"{path}: not a readable label map ({' '.join(str(error).split())[:120]})") from error
     if not mapping:

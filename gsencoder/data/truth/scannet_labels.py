@@ -135,6 +135,8 @@ def read_axis_alignment(path: Path) -> Float64[np.ndarray, "4 4"] | None:
         if path.stat().st_size > MAX_META_BYTES:
             raise InputError(f"{path}: {path.stat().st_size:,} bytes, expected a short text of a scan's settings")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a readable text file ({' '.join(str(error).split())[:120]})") from error
     stated = [words for words in (line.partition("=") for line in lines) if words[0].strip() == "axisAlignment"]

@@ -5,6 +5,7 @@ segments (`segGroups`: objectId, label, segments).
 """
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -146,6 +147,8 @@ def _read(path: Path, key: str, what: str) -> list[Any]:
         data = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
+    except InputError:
+        raise
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a readable JSON file ({' '.join(str(error).split())[:160]})") from error
     values = data.get(key) if isinstance(data, dict) else None
@@ -157,14 +160,10 @@ def _read(path: Path, key: str, what: str) -> list[Any]:
 
 def _integers(values: list[Any], where: str) -> Int64[np.ndarray, " n"]:
     """A list of whole numbers as an array; the first entry that is none is named."""
-    if not values:
-        return np.zeros(0, np.int64)
-    try:
-        array = np.array(values)
-        if array.ndim == 1 and array.dtype.kind == "i":
-            return array.astype(np.int64)
-    except (ValueError, OverflowError):
-        pass
+    # JSON's true is not a number here, though Python and numpy would count it as 1.
+    if set(map(type, values)) <= {int}:
+        with suppress(OverflowError):
+            return np.array(values, np.int64)
     for index, value in enumerate(values):
         if isinstance(value, bool) or not isinstance(value, int) or not -(2**63) <= value < 2**63:
             raise InputError(f"{where}[{index}]: expected a whole number, got {str(value)[:40]!r}")

@@ -18,6 +18,8 @@ def read_split(path: Path) -> tuple[str, ...]:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: {path.stat().st_size:,} bytes; expected one name of a scene a line")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a readable split file ({' '.join(str(error).split())[:120]})") from error
     first: dict[str, int] = {}

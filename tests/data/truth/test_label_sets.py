@@ -1,0 +1,189 @@
+"""Classes of ScanNet's benchmarks, the map of raw names, splits, and the truth files that are made of them."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.truth.label_sets import (
+    COLUMNS,
+    LabelSet,
+    ids_of_names,
+    read_class_list,
+    read_label_map,
+    scannet_label_set,
+    vertex_classes,
+)
+from gsencoder.data.truth.split_files import folders_of_split, read_split
+from gsencoder.data.truth.write_truth import instance_truth, write_instance_truth, write_semantic_truth
+from gsencoder.types import MeshLabels
+
+
+def test_the_sets_have_twenty_and_two_hundred_classes_in_three_groups() -> None:
+    twenty, many = scannet_label_set("scannet20"), scannet_label_set("scannet200")
+    assert (len(twenty), len(many)) == (20, 200)
+    assert twenty.groups == ()
+    assert Counter(many.groups) == {"head": 66, "common": 68, "tail": 66}
+    assert [len(many.names_in(group)) for group in ("head", "common", "tail")] == [66, 68, 66]
+    # nyu40 has no 13 and no 15 among the twenty; ids of the 200 have gaps up to the one added last.
+    assert (twenty.ids[:3], twenty.ids[-1], 13 in twenty.ids) == ((1, 2, 3), 39, False)
+    assert (many.ids[0], many.ids[-1]) == (1, 1191)
+    assert list(many.ids) == sorted(many.ids)
+    assert (twenty.name_of[39], twenty.id_of["shower curtain"]) == ("otherfurniture", 28)
+    # One thing has other names and ids in the two sets.
+    assert (twenty.id_of["sofa"], many.id_of["couch"], many.id_of["chair"], twenty.id_of["chair"]) == (6, 6, 2, 5)
+    assert (many.id_of["mattress"], many.name_of[1163], many.name_of[1175]) == (1191, "object", "folded chair")
+    assert "wall" in many.names_in("head")
+    assert "luggage" in many.names_in("tail")
+    with pytest.raises(InputError, match="expected scannet20 or scannet200"):
+        scannet_label_set("scannet40")
+
+
+def test_sets_that_contradict_themselves_are_refused() -> None:
+    with pytest.raises(InputError, match="a name is there twice"):
+        LabelSet(name="x", ids=(1, 2), names=("a", "a"))
+    with pytest.raises(InputError, match="an? id is there twice"):
+        LabelSet(name="x", ids=(1, 1), names=("a", "b"))
+    with pytest.raises(InputError, match="as many ids as names"):
+        LabelSet(name="x", ids=(1,), names=("a", "b"))
+
+
+def write_map(path: Path, *rows: str, header: str = "id\traw_category\tcategory\tcount\tnyu40id\tnyuClass") -> Path:
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+ROWS = (
+    "1\twall\twall\t8277\t1\twall",
+    "6\tcouch\tcouch\t502\t6\tsofa",
+    "10\toffice chair\toffice chair\t595\t5\tchair",
+    "25\tdoor frame\tdoor frame\t768\t8\tdoor",
+    "43\tpaper\tpaper\t3\t40\totherprop",
+)
+
+
+def test_raw_names_have_the_ids_of_each_benchmark(tmp_path: Path) -> None:
+    path = write_map(tmp_path / "map.tsv", *ROWS)
+    nyu40, own = (read_label_map(path, COLUMNS[name]) for name in ("scannet20", "scannet200"))
+    assert nyu40 == {"wall": 1, "couch": 6, "office chair": 5, "door frame": 8, "paper": 40}
+    assert own == {"wall": 1, "couch": 6, "office chair": 10, "door frame": 25, "paper": 43}
+    names = ["paper", "office chair", "door frame", "paper"]
+    # Ids that are not among the twenty stay, as in ScanNet's script; those of the 200 become 0, as in theirs.
+    assert ids_of_names(names, nyu40) == {"paper": 40, "office chair": 5, "door frame": 8}
+    assert ids_of_names(names, own, scannet_label_set("scannet200")) == {
+        "paper": 0,
+        "office chair": 10,
+        "door frame": 0,
+    }
+    with pytest.warns(SceneWarning, match=r"2 of 3 names are not in the label map and have no class \(first: 'Wall'\)"):
+        assert ids_of_names(["Wall", "wall", "beanbag"], nyu40) == {"Wall": 0, "wall": 1, "beanbag": 0}
+
+
+@pytest.mark.parametrize(
+    ("rows", "column", "said"),
+    [
+        (("1\twall\twall\t1\tone\tx",), "nyu40id", "line 2: nyu40id must be a whole number, got 'one'"),
+        (("1\twall\twall\t1\t\tx",), "nyu40id", "line 2: nyu40id must be a whole number, got ''"),
+        (("1\twall",), "nyu40id", "line 2: nyu40id must be a whole number"),
+        (("1\twall\twall\t1\t-1\tx",), "nyu40id", "line 2: nyu40id must be"),
+        (("1\twall\ta\t1\t1\tx", "2\twall\ta\t1\t2\tx"), "nyu40id", "line 3: 'wall' has nyu40id 2, and 1 before"),
+        (ROWS, "mpcat40", "has no column 'mpcat40'"),
+        ((), "id", "maps no name"),
+    ],
+)
+def test_a_wrong_label_map_is_refused_with_its_line(
+    tmp_path: Path, rows: tuple[str, ...], column: str, said: str
+) -> None:
+    path = write_map(tmp_path / "map.tsv", *rows)
+    with pytest.raises(InputError, match=said) as error:
+        read_label_map(path, column)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_files_that_are_no_label_maps_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not a readable label map"):
+        read_label_map(tmp_path / "missing.tsv", "id")
+    (tmp_path / "map.tsv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="not a readable label map"):
+        read_label_map(tmp_path / "map.tsv", "id")
+    with (tmp_path / "large.tsv").open("wb") as stream:
+        stream.truncate((16 << 20) + 1)
+    with pytest.raises(InputError, match="at most 16,777,216 in a label map"):
+        read_label_map(tmp_path / "large.tsv", "id")
+
+
+def test_a_list_of_classes_counts_from_zero(tmp_path: Path) -> None:
+    path = tmp_path / "top100.txt"
+    path.write_text("wall\nceiling\n\noffice chair\n")
+    assert read_class_list(path) == LabelSet(name="top100", ids=(0, 1, 2), names=("wall", "ceiling", "office chair"))
+    path.write_text("wall\nwall\n")
+    with pytest.raises(InputError, match="'wall' is there twice"):
+        read_class_list(path)
+    path.write_text("\n")
+    with pytest.raises(InputError, match="lists no class"):
+        read_class_list(path)
+
+
+def test_a_split_is_one_name_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "val.txt"
+    path.write_text("scene0011_00\r\n\nscene0011_01  \n", encoding="utf-8-sig")
+    names = read_split(path)
+    assert names == ("scene0011_00", "scene0011_01")
+    (tmp_path / names[0]).mkdir()
+    assert folders_of_split(names[:1], tmp_path) == (tmp_path / names[0],)
+    with pytest.raises(InputError, match=r"scene0011_01: no such folder \(1 of 2 of the split are missing\)"):
+        folders_of_split(names, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("a\nb\na\n", "line 3: 'a' is already on line 1"),
+        ("../a\n", "line 1: expected the name of a scene, got '../a'"),
+        ("a b\n", "line 1: expected the name of a scene"),
+        ("..\n", "line 1: expected the name of a scene"),
+        ("x" * 300, "line 1: expected the name of a scene"),
+        ("\n\n", "lists no scene"),
+    ],
+)
+def test_a_wrong_split_is_refused_with_its_line(tmp_path: Path, content: str, said: str) -> None:
+    path = tmp_path / "val.txt"
+    path.write_text(content)
+    with pytest.raises(InputError, match=said):
+        read_split(path)
+
+
+LABELS = MeshLabels(
+    vertices=np.zeros((6, 3), np.float32),
+    instances=np.array([3, 0, 12, 3, 5, 5], np.int32),
+    objects=((12, "couch"), (3, "wall"), (5, "beanbag")),
+)
+
+
+def test_a_vertex_has_the_class_of_its_objects_name() -> None:
+    assert vertex_classes(LABELS, {"couch": 6, "wall": 1}).tolist() == [1, 0, 6, 1, 0, 0]
+    assert vertex_classes(LABELS, {"couch": 6, "wall": 0}, none=-1).tolist() == [0, -1, 6, 0, -1, -1]
+    empty = MeshLabels(vertices=LABELS.vertices, instances=np.zeros(6, np.int32), objects=())
+    assert vertex_classes(empty, {}).tolist() == [0] * 6
+
+
+def test_truth_files_hold_one_number_a_vertex(tmp_path: Path) -> None:
+    classes = {"couch": 6, "wall": 1}
+    # The bean bag has no class: 0 · 1000 + 5.
+    assert instance_truth(LABELS, classes).tolist() == [1003, 0, 6012, 1003, 5, 5]
+    write_instance_truth(tmp_path / "a.txt", LABELS, classes)
+    write_semantic_truth(tmp_path / "b.txt", LABELS, classes)
+    assert (tmp_path / "a.txt").read_text() == "1003\n0\n6012\n1003\n5\n5\n"
+    assert (tmp_path / "b.txt").read_text() == "1\n0\n6\n1\n0\n0\n"
+    assert np.loadtxt(tmp_path / "a.txt", np.int64).tolist() == instance_truth(LABELS, classes).tolist()
+
+
+def test_an_instance_that_would_read_as_another_class_is_refused() -> None:
+    labels = MeshLabels(
+        vertices=np.zeros((1, 3), np.float32), instances=np.array([1000], np.int32), objects=((1000, "couch"),)
+    )
+    with pytest.raises(InputError, match=r"object 1000 \('couch'\): ids up to 999 fit"):
+        instance_truth(labels, {"couch": 6})

@@ -1,0 +1,328 @@
+"""Labels of meshes from the files of ScanNet and ScanNet++, and every way in which these can be wrong."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from labeled_scans import group, write_ply, write_scannet_labels, write_scannetpp_labels
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth import segment_files
+from gsencoder.data.truth.mesh_file import read_mesh, read_vertex_labels
+from gsencoder.data.truth.scannet_labels import find_scannet_files, read_axis_alignment, read_scannet_labels
+from gsencoder.data.truth.scannetpp_labels import find_scannetpp_files, read_scannetpp_labels
+from gsencoder.types import MeshLabels
+
+VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [4, 4, 4], [5, 5, 5]], np.float32)
+SEGMENTS = np.array([7, 7, 2, 9, 9, 4])
+FACES = np.array([[0, 1, 2], [3, 4, 5]])
+GROUPS = [group(0, "couch", [7]), group(3, "office chair", [9, 2])]
+NAME = "scene0000_00"
+SUFFIXES = {"anno": ".aggregation.json", "segs": "_vh_clean_2.0.010000.segs.json", "mesh": "_vh_clean_2.ply"}
+
+
+def scan(folder: Path, **changes: Any) -> Path:
+    """The small scan, with some of its parts changed."""
+    parts = {"vertices": VERTICES, "segments": SEGMENTS, "groups": GROUPS, "faces": FACES} | changes
+    return write_scannet_labels(folder / NAME, NAME, **parts)
+
+
+def test_the_segments_of_an_object_are_its_vertices_and_ids_are_counted_from_one(tmp_path: Path) -> None:
+    labels = read_scannet_labels(scan(tmp_path))
+    # Segment 7 holds vertices 0 and 1, 2 vertex 2, 9 vertices 3 and 4; segment 4 is nobody's.
+    assert labels.instances.tolist() == [1, 1, 4, 4, 4, 0]
+    assert labels.objects == ((1, "couch"), (4, "office chair"))
+    assert np.array_equal(labels.vertices, VERTICES)
+    assert labels.faces is not None
+    assert np.array_equal(labels.faces, FACES)
+    assert labels.aligned_from_world is None
+    boxes = labels.boxes()
+    assert list(boxes) == [1, 4]
+    assert [corner.tolist() for corner in boxes[1]] == [[0, 0, 0], [1, 0, 0]]
+    assert [corner.tolist() for corner in boxes[4]] == [[0, 0, 0], [4, 4, 4]]
+
+
+def test_boxes_of_the_aligned_frame_follow_axisAlignment(tmp_path: Path) -> None:
+    # A quarter turn about z takes (x, y) to (−y, x); then 10 are added to x.
+    turn = np.array([[0, -1, 0, 10], [1, 0, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]], float)
+    labels = read_scannet_labels(scan(tmp_path, alignment=turn))
+    assert labels.aligned_from_world is not None
+    assert np.array_equal(labels.aligned_from_world, turn)
+    aligned, world = labels.boxes(aligned=True), labels.boxes()
+    # Of the chair: (0, 2, 0) → (8, 0, −2), (0, 0, 3) → (10, 0, 1), (4, 4, 4) → (6, 4, 2).
+    assert [corner.tolist() for corner in aligned[4]] == [[6, 0, -2], [10, 4, 2]]
+    assert [corner.tolist() for corner in world[4]] == [[0, 0, 0], [4, 4, 4]]
+
+
+def test_of_two_objects_with_one_segment_the_later_one_has_it_as_in_scannets_script(tmp_path: Path) -> None:
+    groups = [group(0, "table", [7, 9]), group(1, "book", [9]), group(2, "wall", [2, 2, 2])]
+    labels = read_scannet_labels(scan(tmp_path, groups=groups))
+    assert labels.instances.tolist() == [1, 1, 3, 2, 2, 0]
+
+
+def test_an_object_without_a_vertex_left_has_no_box(tmp_path: Path) -> None:
+    labels = read_scannet_labels(scan(tmp_path, groups=[group(0, "table", [9]), group(1, "book", [9])]))
+    assert labels.objects == ((1, "table"), (2, "book"))
+    assert list(labels.boxes()) == [2]
+
+
+def test_a_scan_without_objects_has_labels_that_are_all_none(tmp_path: Path) -> None:
+    labels = read_scannet_labels(scan(tmp_path, groups=[]))
+    assert labels.objects == ()
+    assert not labels.instances.any()
+    assert labels.boxes() == {}
+
+
+def test_files_are_found_in_the_folder_or_above_exported_frames(tmp_path: Path) -> None:
+    folder = scan(tmp_path)
+    (folder / f"{NAME}_vh_clean.aggregation.json").write_text("{}")
+    found = find_scannet_files(folder)
+    assert found is not None
+    assert found.name == NAME
+    (folder / "exported").mkdir()
+    assert find_scannet_files(folder / "exported") == found
+    assert find_scannet_files(tmp_path) is None
+    renamed = folder.rename(tmp_path / "room")
+    assert find_scannet_files(renamed) is not None
+    (renamed / "scene0001_00.aggregation.json").write_text("{}")
+    with pytest.raises(InputError, match="annotations of 2 scans"):
+        find_scannet_files(renamed)
+    assert find_scannetpp_files(renamed) is None
+    with pytest.raises(InputError, match="no annotation of ScanNet; expected ID.aggregation.json"):
+        read_scannet_labels(tmp_path)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_meshes_of_every_encoding_keep_the_order_of_vertices(tmp_path: Path, text: bool, order: str) -> None:
+    rng = np.random.default_rng(0)
+    vertices = rng.normal(size=(50, 3)).astype(np.float32)
+    vertices[7] = vertices[3]
+    faces = rng.integers(0, 50, (80, 3))
+    nyu40 = rng.integers(0, 41, 50)
+    path = write_ply(tmp_path / "a.ply", vertices, faces, labels=nyu40, text=text, order=order)
+    read, triangles = read_mesh(path)
+    assert np.array_equal(read, vertices)
+    assert triangles is not None
+    assert np.array_equal(triangles, faces)
+    assert np.array_equal(read_vertex_labels(path), nyu40)
+
+
+def test_a_cloud_has_no_triangles(tmp_path: Path) -> None:
+    assert read_mesh(write_ply(tmp_path / "a.ply", VERTICES))[1] is None
+    assert read_mesh(write_ply(tmp_path / "b.ply", VERTICES, FACES[:0]))[1] is None
+
+
+def error_of(folder: Path) -> str:
+    with pytest.raises(InputError) as error:
+        read_scannet_labels(folder)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("changes", "file", "said"),
+    [
+        ({"groups": [group(0, "a", [7]), group(1, "b", [8])]}, "anno", "objectId 1 ('b') names segment 8, which no"),
+        ({"groups": [group(0, "a", [7]), group(0, "b", [9])]}, "anno", "segGroups[1]: objectId 0 is already that of"),
+        ({"groups": [group(5, "a", [])]}, "anno", "segGroups[0] (objectId 5): 'a' has no segments"),
+        ({"groups": [group(-1, "a", [7])]}, "anno", "segGroups[0]: objectId must be a whole number from 0, got '-1'"),
+        ({"groups": [{"label": "a", "segments": [7]}]}, "anno", "segGroups[0]: objectId must be a whole number"),
+        ({"groups": [group(0, "a", [7.5])]}, "anno", "segments[0]: expected a whole number, got '7.5'"),
+        ({"groups": [group(0, "a", [7, True])]}, "anno", "segments[1]: expected a whole number, got 'True'"),
+        ({"groups": [{**group(0, "a", [7]), "label": None}]}, "anno", "label must be a name, got 'None'"),
+        ({"groups": [{**group(0, "a", [7]), "segments": "7"}]}, "anno", "segments must be a list"),
+        ({"groups": ["couch"]}, "anno", "segGroups[0]: expected an object with objectId"),
+        ({"groups": [group(0, "x" * 1001, [7])]}, "anno", "label has 1,001 characters"),
+        ({"segments": SEGMENTS[:5]}, "segs", "segIndices has 5 entries, but"),
+        ({"segments": [7, 7, 2, 9, 9, "4"]}, "segs", "segIndices[5]: expected a whole number, got '4'"),
+        ({"segments": [7, 7, 2, 9, 9, None]}, "segs", "segIndices[5]: expected a whole number, got 'None'"),
+        ({"segments": [7, 7, 2, 9, [9], 4]}, "segs", "segIndices[4]: expected a whole number, got '[9]'"),
+        ({"segments": [7, 7, 2, 9, 9, 2**70]}, "segs", "segIndices[5]: expected a whole number"),
+        ({"segments": []}, "segs", "segIndices is empty"),
+        (
+            {"vertices": np.where(np.arange(6)[:, None] == 4, np.nan, VERTICES)},
+            "mesh",
+            "vertex 4 is not finite (1 of 6)",
+        ),
+        ({"vertices": VERTICES[:0], "faces": None}, "mesh", "holds no vertices"),
+        ({"faces": np.array([[0, 1, 2], [3, 4, 6]])}, "mesh", "face 1 names vertex 6 of 6"),
+        ({"faces": np.array([[0, -1, 2]])}, "mesh", "face 0 names vertex -1 of 6"),
+    ],
+)
+def test_a_wrong_entry_is_one_line_that_names_file_and_entry(
+    tmp_path: Path, changes: dict[str, Any], file: str, said: str
+) -> None:
+    folder = scan(tmp_path, **changes)
+    message = error_of(folder)
+    assert message.startswith(str(folder / f"{NAME}{SUFFIXES[file]}"))
+    assert said in message
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", "3", "null", "{}", '{"segGroups": {}, "segIndices": 3}', "", "{", "\x00", "NaN"]
+)
+@pytest.mark.parametrize("file", ["anno", "segs"])
+def test_json_of_the_wrong_kind_is_refused(tmp_path: Path, content: str, file: str) -> None:
+    folder = scan(tmp_path)
+    path = folder / f"{NAME}{SUFFIXES[file]}"
+    path.write_text(content)
+    assert str(path) in error_of(folder)
+
+
+def test_annotation_and_segments_in_each_others_place_are_refused(tmp_path: Path) -> None:
+    folder = scan(tmp_path)
+    anno, segs = (folder / f"{NAME}{SUFFIXES[key]}" for key in ("anno", "segs"))
+    content = anno.read_text()
+    anno.write_text(segs.read_text())
+    assert "expected an object with the list 'segGroups', the objects; got an object with params, sceneId" in error_of(
+        folder
+    )
+    anno.write_text(content)
+    segs.write_text(content)
+    assert "expected an object with the list 'segIndices'" in error_of(folder)
+
+
+def test_deeply_nested_and_gigantic_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = scan(tmp_path)
+    path = folder / f"{NAME}{SUFFIXES['segs']}"
+    path.write_text("[" * 200_000)
+    assert "not a readable JSON file" in error_of(folder)
+    with path.open("wb") as stream:
+        stream.truncate(segment_files.MAX_BYTES + 1)
+    assert "536,870,913 bytes, at most 536,870,912 are read" in error_of(folder)
+
+
+@pytest.mark.parametrize("file", SUFFIXES)
+def test_a_missing_file_is_named(tmp_path: Path, file: str) -> None:
+    folder = scan(tmp_path)
+    path = folder / f"{NAME}{SUFFIXES[file]}"
+    path.unlink()
+    assert (str(path) if file != "anno" else "no annotation of ScanNet") in error_of(folder)
+
+
+@pytest.mark.parametrize("keep", [0, 2, 40, 300, -5, -30])
+def test_truncated_meshes_are_refused(tmp_path: Path, keep: int) -> None:
+    folder = scan(tmp_path)
+    path = folder / f"{NAME}{SUFFIXES['mesh']}"
+    path.write_bytes(path.read_bytes()[:keep])
+    assert str(path) in error_of(folder)
+
+
+def test_meshes_of_other_polygons_and_other_files_are_refused(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "a.ply", VERTICES, FACES)
+    good = path.read_bytes()
+    data = bytearray(good)
+    data[-13] = 4
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="face 1 has 4 vertices; expected triangles"):
+        read_mesh(path)
+    path.write_bytes(good.replace(b"list uchar int", b"list uchar float"))
+    with pytest.raises(InputError, match="faces with one list of vertices each"):
+        read_mesh(path)
+    path.write_bytes(good.replace(b"element vertex 6", b"element vertex 9999999999"))
+    with pytest.raises(InputError, match="claims 9,999,999,999 vertices"):
+        read_mesh(path)
+    path.write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match="not a .ply file"):
+        read_mesh(path)
+    with pytest.raises(InputError, match="has no property 'label'"):
+        read_vertex_labels(write_ply(tmp_path / "b.ply", VERTICES, FACES))
+    with pytest.raises(InputError, match="cannot be read"):
+        read_mesh(tmp_path / "missing.ply")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("axisAlignment = 1 0 0", "expected 16 numbers, got '1 0 0'"),
+        ("axisAlignment = " + "x " * 16, "expected 16 numbers"),
+        ("axisAlignment = " + "nan " * 16, "not finite"),
+        ("axisAlignment = " + " ".join(map(str, np.diag([2.0, 2, 2, 1]).ravel())), "uniform scale of 2"),
+    ],
+)
+def test_a_wrong_alignment_is_refused(tmp_path: Path, line: str, said: str) -> None:
+    path = tmp_path / "s.txt"
+    path.write_text(f"colorWidth = 1296\n{line}\n")
+    with pytest.raises(InputError, match=said):
+        read_axis_alignment(path)
+    path.write_text("colorWidth = 1296\n")
+    assert read_axis_alignment(path) is None
+
+
+def test_of_overlapping_objects_of_scannetpp_the_smallest_has_the_vertex(tmp_path: Path) -> None:
+    # Four vertices of segment 1, two of 2, one of 3.
+    segments = np.array([1, 1, 1, 1, 2, 2, 3])
+    vertices = np.arange(21, dtype=np.float32).reshape(7, 3)
+    groups = [
+        group(5, "keyboard", [2]),
+        group(1, "table", [1, 2, 3]),
+        group(2, "mouse", [3]),
+        group(9, "tray", [2]),
+        group(7, "screen", [2]),
+    ]
+    folder = write_scannetpp_labels(tmp_path / "scene", vertices, segments, groups)
+    labels = read_scannetpp_labels(folder)
+    # Keyboard, tray and screen have two vertices each, and the first counts; screen would be the fourth on them.
+    assert labels.instances.tolist() == [1, 1, 1, 1, 5, 5, 2]
+    assert labels.objects == ((5, "keyboard"), (1, "table"), (2, "mouse"), (9, "tray"), (7, "screen"))
+    assert read_scannetpp_labels(folder / "scans").objects == labels.objects
+    assert read_scannetpp_labels(folder / "dslr").objects == labels.objects
+    # Only the objects of a benchmark's classes are looked at.
+    some = read_scannetpp_labels(folder, names={"table", "screen"})
+    assert some.instances.tolist() == [1, 1, 1, 1, 7, 7, 1]
+    assert some.objects == ((1, "table"), (7, "screen"))
+
+
+def test_objects_after_the_third_of_a_vertex_are_not_looked_at(tmp_path: Path) -> None:
+    segments = np.array([1, 1, 2, 2, 3])
+    groups = [group(1, "a", [1, 2, 3]), group(2, "b", [1, 2]), group(3, "c", [1, 2]), group(4, "d", [1])]
+    folder = write_scannetpp_labels(tmp_path / "scene", np.zeros((5, 3), np.float32), segments, groups)
+    assert read_scannetpp_labels(folder).instances.tolist() == [2, 2, 2, 2, 1]
+
+
+def test_objects_of_scannetpp_count_from_one(tmp_path: Path) -> None:
+    folder = write_scannetpp_labels(tmp_path / "s", VERTICES, SEGMENTS, [group(0, "a", [7])])
+    with pytest.raises(InputError, match="objectId must be a whole number from 1, got '0'"):
+        read_scannetpp_labels(folder)
+    (folder / "scans" / "segments.json").unlink()
+    with pytest.raises(InputError, match=r"segments.json: no such file"):
+        read_scannetpp_labels(folder)
+    with pytest.raises(InputError, match=r"no annotation of ScanNet\+\+"):
+        read_scannetpp_labels(tmp_path)
+
+
+def test_labels_that_contradict_each_other_are_refused(no_jaxtyping: None) -> None:
+    none = np.zeros(2, np.int32)
+    points = np.zeros((2, 3), np.float32)
+    with pytest.raises(InputError, match="instances: expected 0 or the id of an object, got 3 in row 1"):
+        MeshLabels(vertices=points, instances=np.array([1, 3], np.int32), objects=((1, "a"),))
+    with pytest.raises(InputError, match="objects: expected unique ids, got 2 twice"):
+        MeshLabels(vertices=points, instances=none, objects=((2, "a"), (2, "b")))
+    with pytest.raises(InputError, match="objects: expected ids from 1, got 0"):
+        MeshLabels(vertices=points, instances=none, objects=((0, "a"),))
+    with pytest.raises(InputError, match="vertices: expected finite"):
+        MeshLabels(vertices=points * np.float32(np.nan), instances=none, objects=())
+    with pytest.raises(InputError, match=r"instances: expected int32\[2\]"):
+        MeshLabels(vertices=points, instances=none[:1], objects=())
+    with pytest.raises(InputError, match="faces: expected rows of 2 vertices"):
+        MeshLabels(vertices=points, instances=none, objects=(), faces=np.array([[0, 1, 2]], np.int32))
+
+
+def test_a_scan_of_two_hundred_thousand_vertices_is_read_by_its_segments(tmp_path: Path) -> None:
+    count = 200_000
+    vertices = np.random.default_rng(0).normal(size=(count, 3)).astype(np.float32)
+    segments = np.arange(count) // 50
+    groups = [group(number, "thing", list(range(number, count // 50, 40))) for number in range(40)]
+    labels = read_scannet_labels(scan(tmp_path, vertices=vertices, segments=segments, groups=groups, faces=None))
+    assert np.array_equal(labels.instances, 1 + (np.arange(count) // 50) % 40)
+
+
+def test_json_of_an_annotation_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    folder = scan(tmp_path)
+    path = folder / f"{NAME}{SUFFIXES['anno']}"
+    path.write_text("\ufeff" + json.dumps({"segGroups": GROUPS}), encoding="utf-8")
+    assert len(read_scannet_labels(folder).objects) == 2

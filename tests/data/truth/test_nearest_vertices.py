@@ -1,0 +1,97 @@
+"""Labels of vertices for Gaussians and back, against brute force and scikit-learn's classifier."""
+
+import numpy as np
+import pytest
+from sklearn.neighbors import KNeighborsClassifier
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth import nearest_vertices
+from gsencoder.data.truth.nearest_vertices import labels_of_gaussians, labels_of_vertices
+
+
+def points(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.uniform(0, 1, (count, 3)).astype(np.float32)
+
+
+def test_a_gaussian_has_the_label_of_the_nearest_vertex_within_the_distance(rng: np.random.Generator) -> None:
+    means, vertices = points(rng, 300), points(rng, 200)
+    labels = rng.integers(0, 9, 200).astype(np.int32)
+    found = labels_of_gaussians(means, vertices, labels, max_distance=0.1, none=-7)
+    distances = np.linalg.norm(means[:, None].astype(float) - vertices[None], axis=2)
+    near = distances.min(axis=1) <= 0.1
+    assert 0 < near.sum() < 300
+    assert np.array_equal(found.vertices, np.where(near, distances.argmin(axis=1), -1))
+    assert np.array_equal(found.labels, np.where(near, labels[distances.argmin(axis=1)], -7))
+    assert found.far == (~near).sum()
+
+
+def test_the_distance_itself_is_near_enough() -> None:
+    vertices = np.array([[0, 0, 0]], np.float32)
+    means = np.array([[0.25, 0, 0], [0.2500001, 0, 0]], np.float32)
+    found = labels_of_gaussians(means, vertices, np.array([4]), max_distance=0.25)
+    assert found.labels.tolist() == [4, 0]
+
+
+@pytest.mark.parametrize("k", [1, 4, 25])
+def test_the_majority_of_the_nearest_gaussians_is_that_of_scikit_learn(rng: np.random.Generator, k: int) -> None:
+    """Its classifier also takes the smallest of equally frequent labels."""
+    means, vertices = points(rng, 500), points(rng, 400)
+    labels = rng.integers(0, 6, 500)
+    expected = KNeighborsClassifier(n_neighbors=k).fit(means, labels).predict(vertices)
+    assert np.array_equal(labels_of_vertices(vertices, means, labels, k=k), expected)
+
+
+def test_chunks_change_nothing(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    means, vertices = points(rng, 300), points(rng, 257)
+    labels = rng.integers(0, 40, 300)
+    whole = labels_of_vertices(vertices, means, labels)
+    found = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
+    monkeypatch.setattr(nearest_vertices, "CHUNK", 16)
+    monkeypatch.setattr(nearest_vertices, "MAX_VOTES", 300)
+    assert np.array_equal(labels_of_vertices(vertices, means, labels), whole)
+    again = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
+    assert np.array_equal(again.labels, found.labels)
+
+
+def test_gaussians_without_a_label_are_among_the_nearest_but_do_not_count() -> None:
+    means = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0], [9, 0, 1]], np.float32)
+    vertex = np.zeros((1, 3), np.float32)
+    labels = np.array([-1, -1, 3, 8, 8])
+    # Of the three nearest, one says 3 and two nothing; the two nearest say nothing.
+    assert labels_of_vertices(vertex, means, labels, k=3).tolist() == [3]
+    assert labels_of_vertices(vertex, means, labels, k=2).tolist() == [-1]
+    assert labels_of_vertices(vertex, means, labels, k=25).tolist() == [8]
+    # Those that are not asked are not among the nearest.
+    assert labels_of_vertices(vertex, means, labels, k=1, voters=labels >= 0).tolist() == [3]
+    assert labels_of_vertices(vertex, means, labels, k=25, max_distance=2).tolist() == [3]
+    assert labels_of_vertices(vertex, means, labels, k=1, voters=labels > 3, max_distance=2).tolist() == [-1]
+
+
+def test_equally_frequent_labels_give_the_smallest() -> None:
+    means = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], np.float32)
+    assert labels_of_vertices(means[:1], means, np.array([9, 2, 9, 2]), k=4).tolist() == [2]
+
+
+def test_nothing_gives_no_labels(rng: np.random.Generator) -> None:
+    none, some = np.zeros((0, 3), np.float32), points(rng, 3)
+    empty = np.zeros(0, np.int32)
+    assert labels_of_vertices(some, none, empty).tolist() == [-1, -1, -1]
+    assert labels_of_vertices(none, some, np.arange(3)).shape == (0,)
+    assert labels_of_vertices(some, some, np.arange(3), voters=np.zeros(3, bool)).tolist() == [-1, -1, -1]
+    found = labels_of_gaussians(some, none, empty)
+    assert (found.labels.tolist(), found.far) == ([0, 0, 0], 3)
+    assert labels_of_gaussians(none, some, np.arange(3)).far == 0
+
+
+def test_positions_that_are_not_finite_and_senseless_settings_are_refused(rng: np.random.Generator) -> None:
+    some, broken = points(rng, 4), points(rng, 4)
+    broken[2, 1] = np.nan
+    labels = np.arange(4)
+    with pytest.raises(InputError, match="Gaussians: row 2 is not finite"):
+        labels_of_gaussians(broken, some, labels)
+    with pytest.raises(InputError, match="vertices: row 2 is not finite"):
+        labels_of_vertices(broken, some, labels)
+    with pytest.raises(InputError, match="k: expected at least 1"):
+        labels_of_vertices(some, some, labels, k=0)
+    with pytest.raises(InputError, match="max_distance: expected a positive length"):
+        labels_of_gaussians(some, some, labels, max_distance=0)

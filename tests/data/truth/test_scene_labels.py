@@ -1,0 +1,274 @@
+"""A room as a scan of ScanNet or ScanNet++: its objects, its instance maps, and `evaluate` on it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_runs import results_of
+from labeled_scans import group, write_ply, write_scannet_labels, write_scannet_scan, write_scannetpp_scan
+from named_rooms import write_words
+from rgbd_layouts import write_scannet_frames
+
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.truth.mesh_instances import MeshInstances, draw_instances
+from gsencoder.data.truth.scene_labels import find_labels, is_placed, with_counted_views
+from gsencoder.evaluate.boxes import queryable_objects
+from gsencoder.types import MeshLabels, Scene
+
+VIEWS = 8
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return make_room(3, objects=5, views=VIEWS, width=96, height=72)
+
+
+@pytest.fixture(scope="module")
+def scan(room: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scannet_scan(room, tmp_path_factory.mktemp("scans") / "scene0000_00")
+
+
+def test_objects_of_a_scan_have_the_boxes_of_the_room(room: Scene, scan: Path) -> None:
+    scene = load_scene(scan)
+    found, true = ({each.id: each for each in objects} for objects in (scene.objects, room.objects))
+    assert set(found) == {1, 2} | set(true)
+    assert (found[1].name, found[2].name, found[1].placed, found[2].placed) == ("floor", "wall", False, False)
+    for number, thing in true.items():
+        assert found[number].name == thing.name
+        # A scan has what views see of a surface, to half a vertex: inside the true box, and most of it.
+        inside = thing.aabb_max - thing.aabb_min
+        assert (found[number].aabb_min >= thing.aabb_min - 0.01).all()
+        assert (found[number].aabb_max <= thing.aabb_max + 0.01).all()
+        assert (found[number].aabb_max - found[number].aabb_min >= inside - np.maximum(0.5 * inside, 0.12)).all()
+
+
+def test_instance_maps_drawn_from_the_mesh_are_those_of_the_room(room: Scene, scan: Path) -> None:
+    scene = load_scene(scan)
+    assert scene.views is not None
+    assert room.views is not None
+    assert room.views.instances is not None
+    assert isinstance(scene.views.instances, MeshInstances)
+    agree = [np.mean(scene.views.instances[view] == room.views.instances[view]) for view in range(VIEWS)]
+    # What differs are outlines: a vertex is two pixels wide.
+    assert min(agree) > 0.93
+    assert np.array_equal(scene.views.instances[-1], scene.views.instances[VIEWS - 1])
+    assert np.array_equal(scene.views.instances[2:4][1], scene.views.instances[3])
+    assert np.array_equal(scene.views.select([3]).instances[0], scene.views.instances[3])  # type: ignore[index]
+
+
+def test_views_and_pixels_of_objects_are_counted_as_in_objects_json(room: Scene, scan: Path) -> None:
+    loaded = load_scene(scan)
+    assert all(each.views is None and each.max_pixels is None for each in loaded.objects)
+    with pytest.raises(InputError, match="the views that show it were not counted; with_counted_views of"):
+        queryable_objects(loaded.objects)
+    scene = with_counted_views(loaded)
+    true = {each.id: each for each in room.objects}
+    for thing in scene.objects:
+        if thing.id in true and (true[thing.id].max_pixels or 0) > 60:
+            assert thing.views is not None
+            assert abs(thing.views - (true[thing.id].views or 0)) <= 1
+            assert thing.max_pixels == pytest.approx(true[thing.id].max_pixels, rel=0.25)
+    assert {each.id for each in queryable_objects(scene.objects)} >= {
+        each.id for each in queryable_objects(room.objects, min_pixels=90)
+    }
+    assert with_counted_views(scene) is scene
+
+
+def test_masked_pixels_do_not_count(room: Scene, scan: Path) -> None:
+    scene = load_scene(scan)
+    assert scene.views is not None
+    hidden = [np.zeros((72, 96), bool)] * (VIEWS - 1) + [np.ones((72, 96), bool)]
+    counted = with_counted_views(replace(scene, views=replace(scene.views, masks=hidden)))
+    assert max(each.views or 0 for each in counted.objects) == 1
+
+
+def test_pixels_at_which_the_sensor_saw_something_else_show_no_object(room: Scene, scan: Path) -> None:
+    scene = load_scene(scan)
+    assert scene.views is not None
+    assert scene.views.depths is not None
+    assert scene.views.instances is not None
+    whole, depth = scene.views.instances[0], scene.views.depths[0].copy()
+    assert (whole > 0).mean() > 0.9
+    # Somebody stands in the left half, and of the upper part nothing was measured.
+    depth[:, :48] *= 0.5
+    depth[:20] = 0
+    views = replace(
+        scene.views, depths=[depth, *(scene.views.depths[view] for view in range(1, VIEWS))], instances=None
+    )
+    labels = find_labels(scan)
+    assert labels is not None
+    shown = MeshInstances(labels, views, scene.origin)[0]
+    assert not shown[20:, :48].any()
+    assert np.array_equal(shown[20:, 48:], whole[20:, 48:])
+    assert (shown[:20] > 0).mean() > 0.9
+
+
+def test_a_scannetpp_scene_without_depth_has_objects_in_the_world_of_its_scan(room: Scene, tmp_path: Path) -> None:
+    folder = write_scannetpp_scan(room, tmp_path / "8b5caf3398")
+    scene = with_counted_views(load_scene(folder))
+    assert scene.views is not None
+    assert scene.views.depths is None
+    assert scene.views.instances is not None
+    assert room.views is not None
+    assert room.views.instances is not None
+    agree = [np.mean(scene.views.instances[view] == room.views.instances[view]) for view in range(VIEWS)]
+    assert min(agree) > 0.93
+    true = {each.id: each for each in room.objects}
+    found = {each.id: each for each in scene.objects}
+    # The floor claims every vertex, and keeps those that no smaller object claims.
+    assert set(found) == {1, 2} | set(true)
+    for number, thing in true.items():
+        np.testing.assert_array_less(thing.aabb_min - 0.01, found[number].aabb_min)
+        np.testing.assert_array_less(found[number].aabb_max, thing.aabb_max + 0.01)
+    dslr = load_scene(folder / "dslr")
+    assert [each.id for each in dslr.objects] == list(found)
+
+
+def test_a_scene_far_from_zero_has_the_same_maps_and_boxes_there(tmp_path: Path) -> None:
+    room = replace(make_room(3, objects=2, views=2, width=48, height=36), origin=np.array([5000.0, -3000.0, 0.0]))
+    scene = load_scene(write_scannet_scan(room, tmp_path / "scene0000_00"))
+    assert scene.origin.tolist() == [5000, -3000, 0]
+    assert scene.views is not None
+    assert scene.views.instances is not None
+    assert room.views is not None
+    assert room.views.instances is not None
+    assert np.mean(scene.views.instances[0] == room.views.instances[0]) > 0.85
+    assert all(each.aabb_min[0] > 4990 for each in scene.objects)
+
+
+def test_pictures_of_instances_come_before_maps_of_the_mesh(room: Scene, tmp_path: Path) -> None:
+    from PIL import Image
+
+    folder = write_scannet_scan(room, tmp_path / "scene0000_00")
+    (folder / "instance-filt").mkdir()
+    for view in range(VIEWS):
+        Image.fromarray(np.full((72, 96), 5, np.uint8)).save(folder / "instance-filt" / f"{view}.png")
+    scene = with_counted_views(load_scene(folder))
+    assert {each.id: each.views for each in scene.objects if each.views} == {5: VIEWS}
+    assert {each.max_pixels for each in scene.objects} == {0, 72 * 96}
+
+
+def test_an_annotation_without_its_files_leaves_the_photographs(room: Scene, tmp_path: Path) -> None:
+    folder = write_scannet_scan(room, tmp_path / "scene0000_00")
+    (folder / "scene0000_00_vh_clean_2.ply").unlink()
+    with pytest.warns(SceneWarning, match=r"_vh_clean_2.ply: no such file, so that the scene has no objects"):
+        scene = load_scene(folder)
+    assert scene.objects == ()
+    with pytest.raises(InputError, match=r"_vh_clean_2.ply: no such file"):
+        find_labels(folder)
+    assert find_labels(tmp_path) is None
+
+
+def test_objects_that_others_cover_are_left_out_with_a_warning(room: Scene, tmp_path: Path) -> None:
+    folder = tmp_path / "scene0000_00"
+    write_scannet_frames(room, folder)
+    groups = [group(0, "table", [1]), group(1, " book ", [1]), group(2, " ", [0])]
+    write_scannet_labels(folder, folder.name, np.eye(3, dtype=np.float32), np.array([1, 1, 0]), groups)
+    with pytest.warns(SceneWarning, match=r"1 of 3 labeled objects have no vertex of their own .* \(first: 'table'\)"):
+        scene = load_scene(folder)
+    assert [(each.id, each.name, each.placed) for each in scene.objects] == [(2, "book", True), (3, None, False)]
+    # A cloud of points draws no maps.
+    assert scene.views is not None
+    assert scene.views.instances is None
+    with pytest.raises(InputError, match="no instance maps to count in; expected a mesh with faces"):
+        with_counted_views(scene)
+
+
+def test_parts_of_the_building_and_names_that_say_nothing_are_not_placed() -> None:
+    assert not any(
+        map(is_placed, ("wall", "Floor", " ceiling", "door", "door  frame", "window", "object", "REMOVE", ""))
+    )
+    assert all(
+        map(is_placed, ("chair", "office chair", "table", "wall clock", "whiteboard", "trash can", "ceiling fan"))
+    )
+
+
+def test_the_nearer_triangle_hides_the_other_and_pixels_have_the_nearest_vertex() -> None:
+    """Two squares parallel to the picture: at z = 2 half as large in it as at z = 1, and behind."""
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
+    vertices = np.concatenate([np.c_[2 * square, np.full(4, 2.0)], np.c_[0.25 * square, np.ones(4)]]).astype(np.float32)
+    quads = np.array([[0, 1, 2], [0, 2, 3]])
+    labels = MeshLabels(
+        vertices=vertices,
+        instances=np.array([1, 1, 1, 1, 2, 2, 3, 3], np.int32),
+        objects=((1, "a"), (2, "b"), (3, "c")),
+        faces=np.concatenate([quads, quads + 4]).astype(np.int32),
+    )
+    K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])
+    instances, depth = draw_instances(labels, np.eye(4), K, 16, 16)
+    expected = np.ones((16, 16), int)
+    expected[6:8, 6:10], expected[8:10, 6:10] = 2, 3
+    # On the diagonal of the square the nearest vertex is that of its end; the middle four pixels belong to both.
+    assert np.array_equal(instances[[6, 9]], expected[[6, 9]])
+    assert np.array_equal(np.isin(instances, (2, 3)), expected > 1)
+    np.testing.assert_allclose(depth, np.where(expected > 1, 1.0, 2.0), rtol=1e-6)
+    # From the other side nothing is in front of the camera.
+    behind, far = draw_instances(labels, np.diag([-1.0, 1, -1, 1]), K, 16, 16)
+    assert not behind.any()
+    assert np.isinf(far).all()
+
+
+def test_depth_inside_a_slanted_triangle_is_linear_in_its_inverse() -> None:
+    vertices = np.array([[-4, -4, 1], [16, -16, 4], [-8, 8, 2]], np.float32)
+    labels = MeshLabels(
+        vertices=vertices, instances=np.ones(3, np.int32), objects=((1, "a"),), faces=np.array([[0, 1, 2]], np.int32)
+    )
+    K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])
+    instances, depth = draw_instances(labels, np.eye(4), K, 16, 16)
+    normal = np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0]).astype(float)
+    rows, columns = np.nonzero(instances)
+    assert len(rows) > 50
+    rays = np.stack([(columns + 0.5 - 8) / 8, (rows + 0.5 - 8) / 8, np.ones(len(rows))], axis=1)
+    np.testing.assert_allclose(depth[rows, columns], (normal @ vertices[0]) / (rays @ normal), rtol=1e-5)
+
+
+def test_a_small_scale_and_few_views_are_drawn_at_their_size(scan: Path) -> None:
+    scene = load_scene(scan, options=SceneConfig(max_views=3, image_scale=0.5))
+    assert scene.views is not None
+    assert scene.views.instances is not None
+    assert len(scene.views.instances) == 3
+    assert scene.views.instances[1].shape == (36, 48)
+
+
+def test_localization_and_naming_of_a_scan_are_those_of_the_room_itself(room: Scene, tmp_path: Path) -> None:
+    scan, plain = write_scannet_scan(room, tmp_path / "scene0000_00"), tmp_path / "room"
+    write_room(plain, room)
+    words = write_words(tmp_path / "words.npz", load_scene(scan))
+    results = {}
+    for protocol in ("localization", "naming"):
+        for scene in (scan, plain):
+            out = tmp_path / f"{protocol}_{scene.name}"
+            arguments = ["evaluate", str(scene), f"protocol={protocol}", f"teacher.words={words}", f"out={out}"]
+            assert cli.main([*arguments, "seeds.voxel=0.03", "quiet=true"]) == 0
+            results[protocol, scene.name] = results_of(out)
+    ours, theirs = (results["localization", name] for name in (scan.name, plain.name))
+    assert ours["objects"] >= theirs["objects"] > 0
+    assert ours["acc_25"] >= 0.75
+    naming = results["naming", scan.name]
+    assert {"wall", "floor"} <= set(naming["names"])
+    assert naming["accuracy"] > 0.95
+    json.dumps(results)
+
+
+def test_a_scan_whose_labels_belong_to_another_mesh_is_refused_by_evaluate(
+    room: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from command_runs import refusal
+
+    scan = write_scannet_scan(room, tmp_path / "scene0000_00")
+    write_ply(scan / "scene0000_00_vh_clean_2.ply", np.eye(3))
+    line = refusal(
+        capsys,
+        "evaluate",
+        str(scan),
+        f"out={tmp_path / 'out'}",
+        f"teacher.words={write_words(tmp_path / 'w.npz', room)}",
+    )
+    assert "segIndices has" in line
+    assert "has 3 vertices; expected the files of one mesh" in line
