@@ -17,6 +17,7 @@ from gsencoder.data.truth.split_files import read_split
 from gsencoder.evaluate.files.class_files import load_classes
 from gsencoder.evaluate.score_files import score_instances, score_recognition, score_referring, score_semantics
 from gsencoder.evaluate.score_report import ScoreReport
+from gsencoder.evaluate.score_texts import score_answer_files, score_caption_files
 from gsencoder.evaluate.scores.instances import MIN_REGION
 from gsencoder.evaluate.scores.semantics import BACKGROUND
 
@@ -32,7 +33,7 @@ class ScoreConfig(CommonConfig):
     paths: tuple[str, ...] = field(
         default=(),
         metadata={
-            "help": "what is scored: instances, semantics, recognition or referring",
+            "help": "what is scored: instances, semantics, recognition, referring, answers or captions",
             "metavar": "PROTOCOL",
             "required": True,
         },
@@ -72,7 +73,18 @@ class ScoreConfig(CommonConfig):
     allow_missing: bool = field(
         default=False,
         metadata={
-            "help": "of recognition and referring: count what has no prediction as wrong, instead of refusing the file"
+            "help": "of recognition, referring, answers and captions: count what has no prediction as wrong, instead "
+            "of refusing the file"
+        },
+    )
+    min_iou: float = field(
+        default=0.5, metadata={"help": "of captions: IoU that a box must be above for its caption to count"}
+    )
+    java: bool = field(
+        default=True,
+        metadata={
+            "help": "of answers and captions: use Java's tokenizer and METEOR where they are there; without, columns "
+            "say so"
         },
     )
 
@@ -85,6 +97,8 @@ class ScoreConfig(CommonConfig):
             raise InputError(f"min_region: expected 1 or more, got {self.min_region}")
         if not self.ks or min(self.ks) < 1:
             raise InputError(f"ks: expected numbers from 1, got {', '.join(map(str, self.ks)) or 'none'}")
+        if not 0 <= self.min_iou <= 1:
+            raise InputError(f"min_iou: expected a share in [0, 1], got {self.min_iou}")
         taken = TAKEN[self.paths[0]]
         defaults = type(self).__dataclass_fields__
         for name in dict.fromkeys(each for names in TAKEN.values() for each in names):
@@ -167,6 +181,27 @@ def _referring(config: ScoreConfig) -> ScoreReport:
     )
 
 
+def _answers(config: ScoreConfig) -> ScoreReport:
+    return score_answer_files(
+        Path(config.predictions),
+        Path(config.truth),
+        method=config.method,
+        java=config.java,
+        allow_missing=config.allow_missing,
+    )
+
+
+def _captions(config: ScoreConfig) -> ScoreReport:
+    return score_caption_files(
+        Path(config.predictions),
+        Path(config.truth),
+        method=config.method,
+        min_iou=config.min_iou,
+        java=config.java,
+        allow_missing=config.allow_missing,
+    )
+
+
 def _given_classes(config: ScoreConfig) -> str:
     if not config.classes:
         raise InputError("classes= is missing: scannet20, scannet200, or a CSV file with the columns id and name")
@@ -182,6 +217,8 @@ PROTOCOLS: dict[str, Callable[[ScoreConfig], ScoreReport]] = {
     "semantics": _semantics,
     "recognition": _recognition,
     "referring": _referring,
+    "answers": _answers,
+    "captions": _captions,
 }
 """What can be scored."""
 TAKEN = {
@@ -189,5 +226,7 @@ TAKEN = {
     "semantics": ("classes", "scenes", "excluded"),
     "recognition": ("classes", "ks", "allow_missing"),
     "referring": ("ks", "allow_missing"),
+    "answers": ("java", "allow_missing"),
+    "captions": ("min_iou", "java", "allow_missing"),
 }
 """Settings of each protocol beside those that all have."""
