@@ -155,7 +155,8 @@ def cider(hypotheses: Sequence[str], references: Sequence[Sequence[str]]) -> Flo
     counts = [[_ngrams(sentence.split()) for sentence in sentences] for sentences in references]
     documents = Counter(ngram for sample in counts for ngram in set().union(*sample))
     total = np.log(max(len(hypotheses), 1))
-    weights = {ngram: float(total - np.log(count)) for ngram, count in documents.items()}
+    values = {count: float(total - np.log(count)) for count in set(documents.values())}
+    weights = {ngram: values[count] for ngram, count in documents.items()}
     scores = np.zeros(len(hypotheses))
     for row, (hypothesis, sample) in enumerate(zip(hypotheses, counts, strict=True)):
         vector, norms, length = _tf_idf(_ngrams(hypothesis.split()), weights, float(total))
