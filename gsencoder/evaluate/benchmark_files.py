@@ -4,12 +4,14 @@
 is therefore what anyone finds who scores the same files.
 """
 
+import json
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsencoder.core.files.json_values import write_json
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.truth.expressions import Expression
 from gsencoder.data.truth.scene_labels import find_labels
@@ -66,6 +68,7 @@ def write_predictions(
     *,
     protocol: BenchmarkProtocol,
     class_names: Mapping[str, str] | None = None,
+    part: int = 0,
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
 ) -> list[PredictedScene]:
@@ -76,9 +79,11 @@ def write_predictions(
         source: computes the features of a scene.
         words: turns names into the features' space.
         classes: that can be predicted.
-        folder: an existing one; `predictions` and `truth` are made in it, folders or JSON files as the protocol has it.
+        folder: an existing one. Protocols on points make the folders `predictions` and `truth` in it, with a file for
+            each scene; the others write lists, `predictions.PART.json` and `truth.PART.json`.
         protocol: what is predicted.
         class_names: the class of each name that objects have, where these are not class names themselves.
+        part: number of the process, where several have scenes of their own; `merge_lists` joins their files.
         seeds: how Gaussians are made for scenes without.
         localization: settings of `localize`.
 
@@ -126,16 +131,29 @@ def write_predictions(
         seconds = {"load": load_seconds, **seconds, protocol.name: time.perf_counter() - start}
         done.append(PredictedScene(scene=scene.name, gaussians=len(features), seconds=seconds))
     if isinstance(protocol, RecognitionProtocol):
-        write_recognition_truth(folder / f"{TRUTH}.json", truths)
-        write_recognition_predictions(folder / f"{PREDICTIONS}.json", predictions)
+        write_recognition_truth(folder / f"{TRUTH}.{part}.json", truths)
+        write_recognition_predictions(folder / f"{PREDICTIONS}.{part}.json", predictions)
     elif isinstance(protocol, ReferringProtocol):
-        write_referring_truth(folder / f"{TRUTH}.json", referring_truth(truths))
-        write_referring_predictions(folder / f"{PREDICTIONS}.json", predictions)
+        write_referring_truth(folder / f"{TRUTH}.{part}.json", referring_truth(truths))
+        write_referring_predictions(folder / f"{PREDICTIONS}.{part}.json", predictions)
     return done
 
 
+def merge_lists(folder: Path, protocol: BenchmarkProtocol, *, parts: int = 1) -> None:
+    """Joins the lists that processes wrote with `write_predictions` to `predictions.json` and `truth.json`."""
+    if not isinstance(protocol, (RecognitionProtocol, ReferringProtocol)):
+        return
+    for name in (PREDICTIONS, TRUTH):
+        files = [folder / f"{name}.{part}.json" for part in range(parts)]
+        rows = [row for file in files for row in json.loads(file.read_text())]
+        rows.sort(key=lambda row: row["scene_id"])
+        write_json(folder / f"{name}.json", rows)
+        for file in files:
+            file.unlink()
+
+
 def score_written(folder: Path, protocol: BenchmarkProtocol, classes: ClassTable, method: str) -> ScoreReport:
-    """The scores of what `write_predictions` wrote."""
+    """The scores of what `write_predictions` wrote, after `merge_lists`."""
     if isinstance(protocol, InstancesProtocol):
         return score_instances(
             folder / PREDICTIONS,

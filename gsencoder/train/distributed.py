@@ -21,7 +21,7 @@ from gsencoder.core.runtime.device_names import Device
 
 MAX_VALUE = 64
 """Largest number of characters of a value that processes compare."""
-STOPPED_ELSEWHERE = "training: another process stopped; its own message says why"
+STOPPED_ELSEWHERE = "another process stopped; its own message says why"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +85,18 @@ def test_features_that_were_fused_from_the_labels_name_nearly_all_that_is_there(
     instances = results_of(evaluated["instances"])
     assert instances["ap_25"] >= instances["ap_50"] >= instances["ap"] > 0.2
     assert instances["spread"]["ap"]["scenes"] == 2
+
+
+@pytest.mark.parametrize("protocol", ["instances", "referring"])
+def test_processes_that_share_the_scenes_score_each_of_them_once(
+    protocol: str, rooms: Path, evaluated: dict[str, Path], tmp_path: Path
+) -> None:
+    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=3"]
+    scenes = [str(rooms / f"room_{number}") for number in range(2)]
+    options = [f"protocol={protocol}", f"teacher.words={rooms / 'words.safetensors'}", *PROTOCOLS[protocol]]
+    command = [*launcher, "-m", "gsencoder", "evaluate", *scenes, *options, f"out={tmp_path / 'out'}", "quiet=true"]
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    assert results_of(tmp_path / "out") == results_of(evaluated[protocol])
 
 
 def test_the_papers_rows_stand_below_the_measured_ones(evaluated: dict[str, Path]) -> None:
