@@ -125,7 +125,7 @@ def test_if_one_of_two_processes_fails_in_a_block_both_do(tmp_path: Path, error:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     subprocess.run([*launcher, str(path)], timeout=120, env=environment, capture_output=True, check=True)
     found = [Path(f"{path}.{rank}").read_text() for rank in (0, 1)]
-    elsewhere = "InputError: training: another process stopped; its own message says why"
+    elsewhere = "InputError: another process stopped; its own message says why"
     assert found == [elsewhere, f"{error.partition('(')[0]}: its own"]
 
 
