@@ -92,7 +92,7 @@ def write_scannetpp_labels(
     return folder
 
 
-def scanned(scene: Scene, *, step: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def scanned(scene: Scene, *, step: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A mesh of what the views of a room see: vertices in the world, triangles, and the object of each vertex.
 
     Pixels are vertices, and neighbors at nearly one depth are joined.
@@ -129,7 +129,7 @@ def scanned(scene: Scene, *, step: int = 2) -> tuple[np.ndarray, np.ndarray, np.
 
 def names_of_room(scene: Scene) -> dict[int, str]:
     """The name of each value in the instance maps."""
-    return ROOM_NAMES | {thing.id: thing.name or "unknown" for thing in scene.objects}
+    return {thing.id: thing.name or ROOM_NAMES.get(thing.id, "unknown") for thing in scene.objects}
 
 
 def write_scannet_scan(scene: Scene, folder: Path, *, alignment: np.ndarray | None = None) -> Path:

@@ -70,8 +70,9 @@ def labels_of_gaussians(
         tree = cKDTree(vertices)
         for start in range(0, len(means), CHUNK):
             part = slice(start, start + CHUNK)
-            distances, rows = tree.query(means[part])
-            nearest[part] = np.where(distances <= max_distance, rows, -1)
+            # The bound excludes itself, and makes queries far from the mesh short; beyond it the row is len(vertices).
+            _, rows = tree.query(means[part], distance_upper_bound=np.nextafter(max_distance, np.inf))
+            nearest[part] = np.where(rows < len(vertices), rows, -1)
     result = np.full(len(means), none, np.int32)
     found = nearest >= 0
     result[found] = labels[nearest[found]]

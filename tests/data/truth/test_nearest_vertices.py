@@ -63,8 +63,8 @@ def test_gaussians_without_a_label_are_among_the_nearest_but_do_not_count() -> N
     assert labels_of_vertices(vertex, means, labels, k=25).tolist() == [8]
     # Those that are not asked are not among the nearest.
     assert labels_of_vertices(vertex, means, labels, k=1, voters=labels >= 0).tolist() == [3]
-    assert labels_of_vertices(vertex, means, labels, k=25, max_distance=2).tolist() == [3]
-    assert labels_of_vertices(vertex, means, labels, k=1, voters=labels > 3, max_distance=2).tolist() == [-1]
+    assert labels_of_vertices(vertex, means, labels, k=25, max_distance=2.0).tolist() == [3]
+    assert labels_of_vertices(vertex, means, labels, k=1, voters=labels > 3, max_distance=2.0).tolist() == [-1]
 
 
 def test_equally_frequent_labels_give_the_smallest() -> None:
@@ -94,4 +94,4 @@ def test_positions_that_are_not_finite_and_senseless_settings_are_refused(rng: n
     with pytest.raises(InputError, match="k: expected at least 1"):
         labels_of_vertices(some, some, labels, k=0)
     with pytest.raises(InputError, match="max_distance: expected a positive length"):
-        labels_of_gaussians(some, some, labels, max_distance=0)
+        labels_of_gaussians(some, some, labels, max_distance=0.0)

@@ -1,12 +1,11 @@
 """A room as a scan of ScanNet or ScanNet++: its objects, its instance maps, and `evaluate` on it."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_runs import results_of
+from command_runs import refusal, results_of
 from labeled_scans import group, write_ply, write_scannet_labels, write_scannet_scan, write_scannetpp_scan
 from named_rooms import write_words
 from rgbd_layouts import write_scannet_frames
@@ -37,10 +36,10 @@ def scan(room: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_objects_of_a_scan_have_the_boxes_of_the_room(room: Scene, scan: Path) -> None:
     scene = load_scene(scan)
     found, true = ({each.id: each for each in objects} for objects in (scene.objects, room.objects))
-    assert set(found) == {1, 2} | set(true)
+    assert set(found) == set(true)
     assert (found[1].name, found[2].name, found[1].placed, found[2].placed) == ("floor", "wall", False, False)
     for number, thing in true.items():
-        assert found[number].name == thing.name
+        assert found[number].name == (thing.name or found[number].name)
         # A scan has what views see of a surface, to half a vertex: inside the true box, and most of it.
         inside = thing.aabb_max - thing.aabb_min
         assert (found[number].aabb_min >= thing.aabb_min - 0.01).all()
@@ -55,8 +54,8 @@ def test_instance_maps_drawn_from_the_mesh_are_those_of_the_room(room: Scene, sc
     assert room.views.instances is not None
     assert isinstance(scene.views.instances, MeshInstances)
     agree = [np.mean(scene.views.instances[view] == room.views.instances[view]) for view in range(VIEWS)]
-    # What differs are outlines: a vertex is two pixels wide.
-    assert min(agree) > 0.93
+    # What differs are outlines, and where no view sees far sides well enough for a mesh.
+    assert min(agree) > 0.95
     assert np.array_equal(scene.views.instances[-1], scene.views.instances[VIEWS - 1])
     assert np.array_equal(scene.views.instances[2:4][1], scene.views.instances[3])
     assert np.array_equal(scene.views.select([3]).instances[0], scene.views.instances[3])  # type: ignore[index]
@@ -118,11 +117,11 @@ def test_a_scannetpp_scene_without_depth_has_objects_in_the_world_of_its_scan(ro
     assert room.views is not None
     assert room.views.instances is not None
     agree = [np.mean(scene.views.instances[view] == room.views.instances[view]) for view in range(VIEWS)]
-    assert min(agree) > 0.93
+    assert min(agree) > 0.95
     true = {each.id: each for each in room.objects}
     found = {each.id: each for each in scene.objects}
     # The floor claims every vertex, and keeps those that no smaller object claims.
-    assert set(found) == {1, 2} | set(true)
+    assert set(found) == set(true)
     for number, thing in true.items():
         np.testing.assert_array_less(thing.aabb_min - 0.01, found[number].aabb_min)
         np.testing.assert_array_less(found[number].aabb_max, thing.aabb_max + 0.01)
@@ -131,14 +130,14 @@ def test_a_scannetpp_scene_without_depth_has_objects_in_the_world_of_its_scan(ro
 
 
 def test_a_scene_far_from_zero_has_the_same_maps_and_boxes_there(tmp_path: Path) -> None:
-    room = replace(make_room(3, objects=2, views=2, width=48, height=36), origin=np.array([5000.0, -3000.0, 0.0]))
+    room = replace(make_room(3, objects=2, views=2, width=96, height=72), origin=np.array([5000.0, -3000.0, 0.0]))
     scene = load_scene(write_scannet_scan(room, tmp_path / "scene0000_00"))
     assert scene.origin.tolist() == [5000, -3000, 0]
     assert scene.views is not None
     assert scene.views.instances is not None
     assert room.views is not None
     assert room.views.instances is not None
-    assert np.mean(scene.views.instances[0] == room.views.instances[0]) > 0.85
+    assert np.mean(scene.views.instances[0] == room.views.instances[0]) > 0.9
     assert all(each.aabb_min[0] > 4990 for each in scene.objects)
 
 
@@ -236,39 +235,36 @@ def test_a_small_scale_and_few_views_are_drawn_at_their_size(scan: Path) -> None
     assert scene.views.instances[1].shape == (36, 48)
 
 
-def test_localization_and_naming_of_a_scan_are_those_of_the_room_itself(room: Scene, tmp_path: Path) -> None:
-    scan, plain = write_scannet_scan(room, tmp_path / "scene0000_00"), tmp_path / "room"
-    write_room(plain, room)
-    words = write_words(tmp_path / "words.npz", load_scene(scan))
-    results = {}
-    for protocol in ("localization", "naming"):
-        for scene in (scan, plain):
-            out = tmp_path / f"{protocol}_{scene.name}"
-            arguments = ["evaluate", str(scene), f"protocol={protocol}", f"teacher.words={words}", f"out={out}"]
-            assert cli.main([*arguments, "seeds.voxel=0.03", "quiet=true"]) == 0
-            results[protocol, scene.name] = results_of(out)
-    ours, theirs = (results["localization", name] for name in (scan.name, plain.name))
-    assert ours["objects"] >= theirs["objects"] > 0
-    assert ours["acc_25"] >= 0.75
-    naming = results["naming", scan.name]
-    assert {"wall", "floor"} <= set(naming["names"])
-    assert naming["accuracy"] > 0.95
-    json.dumps(results)
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["localization", "naming"])
+def test_evaluate_scores_a_scan_by_its_labels(scan: Path, tmp_path: Path, protocol: str) -> None:
+    words = write_words(tmp_path / "words.safetensors", load_scene(scan))
+    arguments = ["evaluate", str(scan), f"protocol={protocol}", f"teacher.words={words}", f"out={tmp_path / 'out'}"]
+    assert cli.main([*arguments, "seeds.voxel=0.03", "quiet=true"]) == 0
+    results = results_of(tmp_path / "out")
+    if protocol == "naming":
+        # The words of the labels teacher are those that the truth is made of.
+        assert results["accuracy"] == 1
+        assert {"wall", "floor", "table", "box"} <= set(results["names"])
+    else:
+        # Table and shelf are placed in a scan, walls and floor are not; what is asked and seen well has its box.
+        assert {"table", "shelf", "box"} <= set(results["names"])
+        assert not {"wall", "floor"} & set(results["names"])
+        assert results["names"]["box"]["acc_50"] == results["names"]["shelf"]["acc_50"] == 1
 
 
 def test_a_scan_whose_labels_belong_to_another_mesh_is_refused_by_evaluate(
     room: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from command_runs import refusal
-
     scan = write_scannet_scan(room, tmp_path / "scene0000_00")
     write_ply(scan / "scene0000_00_vh_clean_2.ply", np.eye(3))
+    words = write_words(tmp_path / "words.safetensors", room)
     line = refusal(
         capsys,
         "evaluate",
         str(scan),
         f"out={tmp_path / 'out'}",
-        f"teacher.words={write_words(tmp_path / 'w.npz', room)}",
+        f"teacher.words={words}",
     )
     assert "segIndices has" in line
     assert "has 3 vertices; expected the files of one mesh" in line
