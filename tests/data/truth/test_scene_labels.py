@@ -14,7 +14,6 @@ from gsencoder.app import cli
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
 from gsencoder.data.truth.mesh_instances import MeshInstances, draw_instances
 from gsencoder.data.truth.scene_labels import find_labels, is_placed, with_counted_views
 from gsencoder.evaluate.boxes import queryable_objects
