@@ -16,14 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
+from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.files.instances import (
     match_instance_files,
     write_instance_prediction,
     write_instance_truth,
 )
-from gsencoder.evaluate.scores.class_table import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth
-from gsencoder.evaluate.scores.instances import instance_scores, match_instances
+from gsencoder.evaluate.scores.instance_matches import match_instances
+from gsencoder.evaluate.scores.instances import instance_scores
 
 CLASSES = ClassTable(
     names=tuple(f"class {number}" for number in range(1, 199)),

@@ -1,19 +1,20 @@
 """Scores of files of predictions against files of truth, by protocol: what `score` and `evaluate` both report."""
 
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.files.instances import match_instance_files
 from gsencoder.evaluate.files.recognition import read_recognition_truth, recognize_files
 from gsencoder.evaluate.files.referring import compare_box_files
 from gsencoder.evaluate.files.semantics import count_label_files
 from gsencoder.evaluate.result_table import table_of
 from gsencoder.evaluate.score_report import ScoreReport, spread
-from gsencoder.evaluate.scores.class_table import ClassTable
-from gsencoder.evaluate.scores.instances import MIN_REGION, OVERLAPS, InstanceAverages, instance_scores
+from gsencoder.evaluate.scores.instance_matches import MIN_REGION, OVERLAPS
+from gsencoder.evaluate.scores.instances import InstanceAverages, instance_scores
 from gsencoder.evaluate.scores.recognition import recognition_scores
 from gsencoder.evaluate.scores.referring import IOUS, ReferringTable, referring_scores
 from gsencoder.evaluate.scores.semantics import BACKGROUND, SemanticAverages, semantic_scores
@@ -30,6 +31,7 @@ def score_instances(
     *,
     method: str = "predictions",
     scenes: Collection[str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
     class_agnostic: bool = False,
     min_region: int = MIN_REGION,
 ) -> ScoreReport:
@@ -37,10 +39,11 @@ def score_instances(
 
     Args:
         predictions: folder of SCENE.txt or SCENE.npz.
-        truth: folder of SCENE.txt.
+        truth: folder of SCENE.txt, or of ScanNet's scans.
         classes: that are scored.
         method: name of the predictions' row in the table.
         scenes: names of those to score; None = all of the truth.
+        raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
         class_agnostic: leave the classes of masks out of account.
         min_region: smallest number of vertices of a true object and of a mask that count.
 
@@ -49,7 +52,13 @@ def score_instances(
     """
     matches = list(
         match_instance_files(
-            predictions, truth, classes, scenes=scenes, class_agnostic=class_agnostic, min_region=min_region
+            predictions,
+            truth,
+            classes,
+            scenes=scenes,
+            raw_ids=raw_ids,
+            class_agnostic=class_agnostic,
+            min_region=min_region,
         )
     )
     scores = instance_scores(matches, classes)
@@ -97,22 +106,24 @@ def score_semantics(
     *,
     method: str = "predictions",
     scenes: Collection[str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
     excluded: Collection[str] = BACKGROUND,
 ) -> ScoreReport:
     """IoU and accuracy of the labels of vertices (`gsencoder.evaluate.scores.semantics`).
 
     Args:
         predictions: folder of SCENE.txt.
-        truth: folder of SCENE.txt.
+        truth: folder of SCENE.txt, or of ScanNet's scans.
         classes: that are scored.
         method: name of the predictions' row in the table.
         scenes: names of those to score; None = all of the truth.
+        raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
         excluded: classes that are not of the foreground.
 
     Raises:
         InputError: files that cannot be used or that do not belong together.
     """
-    counts = list(count_label_files(predictions, truth, classes, scenes=scenes))
+    counts = list(count_label_files(predictions, truth, classes, scenes=scenes, raw_ids=raw_ids))
     scores = semantic_scores(counts, classes, excluded=excluded)
     overall = asdict(scores.overall) | _foreground(scores.foreground)
     by_scene = [
@@ -205,21 +216,27 @@ def score_referring(
     *,
     method: str = "predictions",
     ks: Sequence[int] = (5,),
+    label_map: Path | None = None,
+    scans: Path | None = None,
     allow_missing: bool = False,
 ) -> ScoreReport:
     """Accuracy of the boxes of sentences (`gsencoder.evaluate.scores.referring`).
 
     Args:
         predictions: JSON of boxes by sentence.
-        truth: JSON of sentences with their box.
+        truth: ScanRefer's JSON of sentences.
         method: name of the predictions' rows in the table.
         ks: numbers of boxes of which the best counts, besides the first and all.
+        label_map: scannetv2-labels.combined.tsv, which tells unique from multiple where the truth does not.
+        scans: folder of ScanNet's scans, whose labels have the boxes that the truth does not have.
         allow_missing: count sentences without a prediction as wrong, instead of refusing them.
 
     Raises:
         InputError: files that cannot be used or that do not belong together.
     """
-    sentences, unscored = compare_box_files(predictions, truth, allow_missing=allow_missing)
+    sentences, unscored = compare_box_files(
+        predictions, truth, label_map=label_map, scans=scans, allow_missing=allow_missing
+    )
     scores = referring_scores(sentences, ks=ks)
     by_scene_name = defaultdict(list)
     for each in sentences:
@@ -234,6 +251,11 @@ def score_referring(
     measured = {name: _accuracies(table) | _by_uniqueness(table) for name, table in kinds.items()}
     overall, best = measured[method], measured[f"{method}, best of all"]
     notes = [f"{count} sentences are not scored: {reason}." for reason, count in unscored.items()]
+    if unknown := sum(each.multiple is None for each in sentences):
+        notes.append(
+            f"{unknown} sentences count in the overall columns alone: neither file says whether they are unique or "
+            "multiple, which ScanNet's label map tells (label_map=)."
+        )
     return ScoreReport(
         results={
             "protocol": "referring",

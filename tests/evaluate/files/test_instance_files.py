@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gsencoder.evaluate.files.label_files import read_mask, read_whole_numbers, write_whole_numbers
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.files.instances import (
     match_instance_files,
     read_instance_prediction,
@@ -14,10 +16,8 @@ from gsencoder.evaluate.files.instances import (
     write_instance_prediction,
     write_instance_truth,
 )
-from gsencoder.evaluate.files.label_files import read_mask, read_whole_numbers, write_whole_numbers
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.evaluate.files.semantics import count_label_files
-from gsencoder.evaluate.scores.class_table import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
 from gsencoder.evaluate.scores.instances import instance_scores
 from gsencoder.evaluate.scores.semantics import semantic_scores

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
 from gsencoder.evaluate.scores.instances import (
     OVERLAPS,
