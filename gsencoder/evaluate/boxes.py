@@ -36,9 +36,9 @@ def aabb_iou(
 ) -> float:
     """Intersection over union of two axis-aligned boxes; 0 if either has no volume.
 
-    It is exact. Benchmarks add 1e-8 to the union (`gsencoder.evaluate.scores.box_overlap.box_ious`), which lowers the IoU
-    of small boxes (by a percent for a cube of 1 cm in metres), and by more where the world unit is longer than a metre;
-    that is right only where results must equal those of the benchmarks' scripts.
+    It is exact, in any unit. Benchmarks add 1e-8 cubic metres to the union, which lowers the IoU of small boxes, by a
+    percent for a cube of 1 cm; `box_ious` of `gsencoder.evaluate.scores.box_overlap` does so where results must equal
+    theirs.
     """
     overlap = np.prod(np.clip(np.minimum(max_a, max_b) - np.maximum(min_a, min_b), 0, None))
     union = np.prod(max_a - min_a) + np.prod(max_b - min_b) - overlap

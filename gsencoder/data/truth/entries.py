@@ -52,20 +52,21 @@ def entries_of(rows: Any, path: Path, expected: str, *, key: str = "") -> tuple[
     return tuple((object_of(row, where, expected), where) for row, where in zip(rows, wheres, strict=True))
 
 
-def refuse_repeated(path: Path, keys: Iterable[Hashable], name: Callable[[Any], str]) -> None:
+def refuse_repeated(path: Path, keys: Iterable[Hashable], name: Callable[[Any], str], *, what: str = "id") -> None:
     """Raises an error if two entries of a file have one key.
 
     Args:
         path: of the file.
         keys: of the entries, in order.
-        name: what an entry with a key is about.
+        name: a key in words.
+        what: what keys are.
 
     Raises:
-        InputError: two entries are about the same.
+        InputError: two entries have one key.
     """
     if repeated := first_repeated(keys):
         key, first, second = repeated
-        raise InputError(f"{path}: entries {first} and {second} are both about {name(key)}; expected each once")
+        raise InputError(f"{path}: entries {first} and {second} have one {what}: {name(key)}; expected each once")
 
 
 def shown(value: Any) -> str:

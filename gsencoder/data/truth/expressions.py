@@ -2,9 +2,9 @@
 
 ScanRefer (Chen et al. 2020): ScanRefer_filtered_{train,val}.json, a list of {scene_id, object_id, object_name, ann_id,
 description, token}. Scan2Cap's benchmark adds to each entry the box of the object as `bbox`, eight corners
-(ScanRefer_filtered_{train,val}_gt_bbox.json), and ScanRefer's predictions say unique_multiple (1 if the scene has several
-objects of the class) and others (1 if the class is none of the named ones); both may also stand here. Nr3D (ReferIt3D,
-Achlioptas et al. 2020): nr3d.csv.
+(ScanRefer_filtered_{train,val}_gt_bbox.json). ScanRefer's predictions say unique_multiple (1 if the scene has several
+objects of the class) and others (1 if the class is none of the named ones), and both may stand here as well. Nr3D
+(ReferIt3D, Achlioptas et al. 2020): nr3d.csv.
 """
 
 import ast

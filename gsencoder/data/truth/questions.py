@@ -246,7 +246,7 @@ def _object_ids(value: Any, where: str) -> tuple[int, ...]:
 
 
 def _refuse_repeated(path: Path, ids: Sequence[str]) -> None:
-    refuse_repeated(path, ids, lambda each: f"question {each[:60]}")
+    refuse_repeated(path, ids, lambda each: each[:60], what="question_id")
 
 
 def _check_answered(questions: Sequence[Question], path: Path) -> None:

@@ -50,13 +50,14 @@ def read_answer_predictions(path: str | Path, questions: Sequence[Question]) -> 
     rows = read_benchmark_json(file)
     if isinstance(rows, dict) and ("questions" in rows or "annotations" in rows):
         raise InputError(
-            f"{file}: expected a list of objects with {EXPECTED}, got SQA3D's truth; were predictions and truth swapped?"
+            f"{file}: expected a list of objects with {EXPECTED}, got SQA3D's truth; were predictions and truth "
+            "swapped?"
         )
     finder = _Finder(questions)
     answers = [
         (finder.question(entry, where).id, _answers(entry, where)) for entry, where in entries_of(rows, file, EXPECTED)
     ]
-    refuse_repeated(file, [name for name, _ in answers], lambda name: f"question {name[:60]}")
+    refuse_repeated(file, [name for name, _ in answers], lambda name: name[:60], what="question_id")
     return dict(answers)
 
 

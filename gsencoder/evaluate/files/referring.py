@@ -1,12 +1,12 @@
 """Files of boxes of sentences: truth in ScanRefer's own format, and predictions in that of its benchmark.
 
-Truth is ScanRefer's list of {scene_id, object_id, object_name, ann_id, description, token}, as `read_scanrefer` reads it.
-The box of the object may stand there as bbox, and unique_multiple and others as in predictions; what is not there comes
-from the labels of the scans and from ScanNet's label map. A prediction is {scene_id, object_id, ann_id, bbox,
-unique_multiple, others}, the last two being optional: they are taken where the truth does not say them, as ScanRefer's
-own tool takes them. A bbox is a list of the eight corners of an axis-aligned box, or of its lower and upper corner. A
-prediction may have bboxes, a list of boxes with the likeliest first, in place of or beside bbox, which is then the first
-of them; [] or null stands for no box.
+Truth is ScanRefer's list of {scene_id, object_id, object_name, ann_id, description, token}, which `read_scanrefer`
+reads. The box of the object may stand there as bbox, and unique_multiple and others as in predictions; what is not
+there comes from the labels of the scans and from ScanNet's label map. A prediction is {scene_id, object_id, ann_id,
+bbox, unique_multiple, others}; the last two are optional, and are taken where the truth does not say them, as
+ScanRefer's own tool takes them. A bbox is a list of the eight corners of an axis-aligned box, or of its lower and upper
+corner. A prediction may have bboxes, a list of boxes with the likeliest first, in place of or beside bbox, which is then
+the first of them; [] or null stands for no box.
 """
 
 from collections.abc import Sequence
@@ -80,7 +80,7 @@ def read_referring_truth(
     """Reads the objects of ScanRefer's sentences.
 
     Args:
-        path: ScanRefer's JSON, whole: whether an object is the only one of its class is counted among all its sentences.
+        path: ScanRefer's JSON of a whole split, whose sentences say which objects are alone in their class.
         label_map: scannetv2-labels.combined.tsv, which gives raw names ScanRefer's classes where the file does not say
             unique_multiple; without it, sentences are neither unique nor multiple.
         scans: folder of ScanNet's scans, whose labels have the boxes that the file does not have.

@@ -1,7 +1,7 @@
 """Truth of instances and of semantic labels from the labels of ScanNet's scans, without files in between.
 
-It is what `gsencoder.data.truth.write_truth` writes, and what ScanNet's own export writes: class id · 1000 + objectId + 1,
-and class ids.
+It is what `gsencoder.data.truth.write_truth` writes, and what ScanNet's own export writes: class id · 1000 + objectId
++ 1, and class ids.
 """
 
 from collections.abc import Mapping

@@ -70,9 +70,8 @@ def scene_files(
     true_files = _true_files(truth, scans)
     foreign = [scene for scene in predicted if scene not in true_files]
     if foreign:
-        raise InputError(
-            f"{predicted[foreign[0]]}: there is no truth of this scene in {truth}; it has {listed(sorted(true_files), 3)}"
-        )
+        some = listed(sorted(true_files), 3)
+        raise InputError(f"{predicted[foreign[0]]}: there is no truth of this scene in {truth}; it has {some}")
     chosen = sorted(true_files if scenes is None else set(scenes))
     unknown = [scene for scene in chosen if scene not in true_files]
     if unknown:

@@ -14,6 +14,12 @@ def test_ids_lead_to_rows_of_the_table_and_unknown_ones_to_none() -> None:
     assert rows.tolist() == [2, 1, 0, -1, -1, -1, -1]
 
 
+def test_names_and_ids_lead_to_each_other() -> None:
+    assert TABLE.id_of == {"bed": 4, "chair": 5, "wall": 1}
+    assert {name: number for number, name in TABLE.name_of.items()} == TABLE.id_of
+    assert len(TABLE) == 3
+
+
 def test_no_ids_lead_to_no_rows() -> None:
     assert TABLE.rows(np.zeros(0, np.int64)).tolist() == []
 

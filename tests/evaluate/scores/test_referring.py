@@ -9,17 +9,16 @@ from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.evaluate.scores.box_overlap import box_ious
 from gsencoder.evaluate.scores.referring import (
     NO_TRUE_BOX,
-    OTHERS,
     PredictedBoxes,
     ReferredObject,
     ReferringResult,
-    box_ious,
     compare_boxes,
     referring_scores,
-    several_of_their_class,
 )
+from gsencoder.evaluate.scores.referring_kinds import OTHERS, several_of_their_class
 
 CUBE = np.array([[0.0, 0, 0], [1, 1, 1]])
 FAR = CUBE + 5
@@ -45,6 +44,13 @@ def test_the_iou_has_scanrefers_epsilon() -> None:
     # A quarter of the cube: 0.25 / (1 + 0.25 - 0.25 + 1e-8).
     assert box_ious(np.array([part(0.25)]), CUBE)[0] == 0.25 / (1 + 1e-8)
     assert box_ious(np.array([CUBE, FAR, part(0)]), CUBE).tolist() == [1 / (1 + 1e-8), 0, 0]
+
+
+def test_boxes_without_volume_overlap_nothing() -> None:
+    flat = np.zeros((2, 3))
+    assert box_ious(np.array([flat, CUBE]), flat).tolist() == [0, 0]
+    # Boxes that touch have no common volume.
+    assert box_ious(np.array([CUBE + 1]), CUBE).tolist() == [0]
 
 
 def test_a_tie_at_a_threshold_is_below_it_for_the_epsilon() -> None:
