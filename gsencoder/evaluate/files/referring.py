@@ -5,8 +5,8 @@ reads. The box of the object may stand there as bbox, and unique_multiple and ot
 there comes from the labels of the scans and from ScanNet's label map. A prediction is {scene_id, object_id, ann_id,
 bbox, unique_multiple, others}; the last two are optional, and are taken where the truth does not say them, as
 ScanRefer's own tool takes them. A bbox is a list of the eight corners of an axis-aligned box, or of its lower and upper
-corner. A prediction may have bboxes, a list of boxes with the likeliest first, in place of or beside bbox, which is then
-the first of them; [] or null stands for no box.
+corner. A prediction may have bboxes, a list of boxes with the likeliest first, in place of or beside bbox, which is
+then the first of them; [] or null stands for no box.
 """
 
 from collections.abc import Sequence

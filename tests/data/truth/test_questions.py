@@ -150,8 +150,6 @@ def test_files_of_sqa3d_must_belong_together(
 def test_the_other_data_set_is_told_apart(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected SQA3D's object with questions"):
         read_sqa3d(scanqa(tmp_path, [entry()]))
-    with pytest.raises(
-        InputError, match="expected a list of objects with scene_id, question_id, question and"
-    ):
+    with pytest.raises(InputError, match="expected a list of objects with scene_id, question_id, question and"):
         read_scanqa(sqa3d(tmp_path, [question()], []))
     assert read_questions(scanqa(tmp_path, [])) == ()
