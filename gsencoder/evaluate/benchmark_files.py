@@ -30,7 +30,8 @@ from gsencoder.evaluate.protocols.referring import (
     read_expressions,
 )
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, predict_semantics, semantic_truth
-from gsencoder.evaluate.score_files import score_instances, score_recognition, score_referring, score_semantics
+from gsencoder.evaluate.score_boxes import score_referring
+from gsencoder.evaluate.score_files import score_instances, score_recognition, score_semantics
 from gsencoder.evaluate.score_report import ScoreReport
 from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames
 from gsencoder.evaluate.scores.referring import PredictedBoxes

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.types import Box, Localization, Scene, SceneObject
 
 
@@ -93,4 +94,4 @@ def score_boxes(scene: Scene, localization: Localization, targets: Sequence[Scen
 def accuracy(hits: Iterable[Hit], threshold: float, *, oracle: bool = False) -> float:
     """The share of hits whose IoU is at least `threshold`; NaN without hits."""
     ious = [hit.oracle_iou if oracle else hit.iou for hit in hits]
-    return float(np.mean([iou >= threshold for iou in ious])) if ious else float("nan")
+    return mean_of([float(iou >= threshold) for iou in ious])

@@ -16,7 +16,8 @@ from gsencoder.core.files.json_values import write_bytes
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.data.truth.split_files import read_split
 from gsencoder.evaluate.files.class_files import load_classes
-from gsencoder.evaluate.score_files import score_instances, score_recognition, score_referring, score_semantics
+from gsencoder.evaluate.score_boxes import score_referring
+from gsencoder.evaluate.score_files import score_instances, score_recognition, score_semantics
 from gsencoder.evaluate.score_report import ScoreReport
 from gsencoder.evaluate.score_texts import score_answer_files, score_caption_files
 from gsencoder.evaluate.scores.instance_matches import MIN_REGION
