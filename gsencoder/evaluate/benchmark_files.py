@@ -16,6 +16,7 @@ from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.expression_boxes import boxes_from_labels
 from gsencoder.data.truth.expressions import Expression, write_scanrefer
 from gsencoder.data.truth.number_files import write_whole_numbers
+from gsencoder.data.truth.scannet_labels import find_scannet_files
 from gsencoder.data.truth.scene_labels import find_labels
 from gsencoder.evaluate.files.instances import write_instance_prediction
 from gsencoder.evaluate.files.recognition import write_recognition_predictions, write_recognition_truth
@@ -185,13 +186,14 @@ def score_written(folder: Path, protocol: BenchmarkProtocol, classes: ClassTable
 def _expressions(
     scene: Scene, mesh: MeshLabels | None, given: Sequence[Expression], raw_ids: Mapping[str, int] | None
 ) -> tuple[Expression, ...]:
-    """The sentences about a scene, with the boxes of the labels where they have none, and with what is known of their
-    kinds: by ScanNet's label map, or by the names themselves where the names are what is asked."""
+    """The sentences about a scene, with the boxes of a ScanNet scan's labels where they have none, and with what is known
+    of their kinds: by ScanNet's label map, or by the names themselves where the names are what is asked."""
     if not given:
         asked = expressions_of_objects(scene)
         return with_kinds(asked, {each.object_name: each.object_name for each in asked})
     asked = tuple(each for each in given if each.scene == scene.name)
-    if mesh is not None and any(each.aabb is None for each in asked):
+    lacking = any(each.aabb is None for each in asked)
+    if lacking and mesh is not None and scene.folder is not None and find_scannet_files(scene.folder) is not None:
         asked = boxes_from_labels(asked, mesh)
     if raw_ids is None:
         return asked
