@@ -199,7 +199,7 @@ def test_all_boxes_of_a_word_are_one_object_whose_inside_stays() -> None:
     other = (np.abs(places[:, 1] - 11.5) < 6) & (places[:, 0] > 11.5) & (places[:, 0] < 17.5)
     stain = one & (np.abs(places - [11, 11, 0]).max(axis=1) < 0.5)
     vectors = np.tile(np.eye(8)[1], (len(places), 1))
-    vectors[one], vectors[other] = np.eye(8)[0], 0.9 * np.eye(8)[0] + 0.1 * np.eye(8)[1]
+    vectors[one], vectors[other] = np.eye(8)[0], 0.5 * np.eye(8)[0] + 0.5 * np.eye(8)[1]
     relevancy = vectors[:, 0].copy()
     vectors[stain] = np.eye(8)[1]
     parts = ((np.flatnonzero(one), np.flatnonzero(other)),)
