@@ -125,7 +125,7 @@ def test_a_note_counts_what_was_never_seen_and_features_stand_under_the_name_of_
 
 
 def test_equal_features_have_equal_colors_others_differ_and_unseen_ones_are_grey() -> None:
-    kinds = np.array([0, 1, 2, 3, 2, 1, 0, 3])
+    kinds = np.array([0, 1, 1, 3, 2, 1, 0, 3])
     colors = pca_bytes(features_of(np.eye(6)[kinds], kinds < 3))
     assert (colors[kinds == 3] == 90).all()
     for kind in range(3):
