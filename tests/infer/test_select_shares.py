@@ -36,8 +36,9 @@ def shares(
     seen: np.ndarray | None = None,
     relevancy: np.ndarray | None = None,
     same: np.ndarray | None = None,
+    blank: float = np.nan,
 ) -> np.ndarray:
-    """The share of each Gaussian; −1 for those that are not asked."""
+    """The share of each Gaussian; −1 for those that are not asked. What was not seen has the relevancy `blank`."""
     seen = np.ones(len(places), bool) if seen is None else seen
     relevancy = vectors[:, 0] if relevancy is None else relevancy
     features = GaussianFeatures(
@@ -50,7 +51,7 @@ def shares(
         features,
         places.astype(np.float32),
         np.flatnonzero(part),
-        np.where(seen, relevancy, np.nan).astype(np.float32),
+        np.where(seen, relevancy, blank).astype(np.float32),
         spacing=SPACING,
         reach=REACH,
         same=np.flatnonzero(part if same is None else same),
@@ -76,9 +77,10 @@ def test_what_was_not_seen_has_no_share_and_changes_no_other_one() -> None:
     added = np.arange(len(places)) >= len(PLACES)
     part = np.concatenate([PART, np.abs(places[len(PLACES) :, :2]).max(axis=1) < 4])
     vectors = np.concatenate([VECTORS, np.tile(TABLE, (200, 1))])
-    made = shares(places, vectors, part, seen=~added)
-    assert np.isnan(made[added & (made != -1) & ~part]).all()
-    np.testing.assert_allclose(made[:-200], shares(), atol=1e-6)
+    for blank in (np.nan, -1.0):
+        made = shares(places, vectors, part, seen=~added, blank=blank)
+        assert np.isnan(made[added & (made != -1) & ~part]).all()
+        np.testing.assert_allclose(made[:-200], shares(), atol=1e-6)
 
 
 def test_surroundings_lie_between_one_spacing_and_twice_the_reach() -> None:
@@ -137,10 +139,26 @@ def test_the_purest_quarter_of_a_part_stands_for_the_object() -> None:
     np.testing.assert_allclose(same[strip], 1)
 
 
+def test_the_inside_of_a_part_stands_for_the_object_near_it_even_where_others_are_purer() -> None:
+    """A part of two materials, of which the left one answers the word better."""
+    right = PLACES[:, 0] > 0.5
+    vectors = np.where(
+        right[:, None], np.where(VECTORS[:, :1] > 0, VECTORS @ np.eye(8)[[3, 1, 2, 0, 4, 5, 6, 7]], TABLE), VECTORS
+    )
+    relevancy = np.where(PART, np.where(right, 0.9, 1.0), 0.0)
+    made = shares(vectors=vectors, relevancy=relevancy)
+    np.testing.assert_allclose(made[RIM & (PLACES[:, 0] > 4.5)], 0.3, atol=0.02)
+    np.testing.assert_allclose(made[RIM & (PLACES[:, 0] < -4.5)], 0.3, atol=0.02)
+
+
 def test_where_object_and_surroundings_have_one_feature_all_stays_as_it_started() -> None:
-    made = shares(vectors=np.tile(OBJECT + TABLE, (len(PLACES), 1)), relevancy=PART.astype(float))
-    assert (made[PART] == 1).all()
-    assert (made[(made > -1) & ~PART] == 0).all()
+    one = np.tile(OBJECT + TABLE, (len(PLACES), 1)).astype(np.float32)
+    # Or features that differ by rounding alone.
+    nearly = np.where(PART[:, None], np.nextafter(one, np.float32(2)), one)
+    for vectors in (one, nearly):
+        made = shares(vectors=vectors, relevancy=PART.astype(float))
+        assert (made[PART] == 1).all()
+        assert (made[(made > -1) & ~PART] == 0).all()
 
 
 def test_only_what_is_farther_than_two_spacings_from_all_others_is_inside() -> None:

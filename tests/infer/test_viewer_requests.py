@@ -15,6 +15,8 @@ from PIL import Image
 from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
 from viewer_requests import at, call, head, sent
 
+from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.infer.viewer.container import read_container
 from gsencoder.infer.viewer.page import served_page
 from gsencoder.infer.viewer.page_scene import scene_container
@@ -44,6 +46,7 @@ def searches(tmp_path_factory: pytest.TempPathFactory) -> list[SceneSearch]:
     first.shown = replace(first.shown, scene=replace(first.shown.scene, views=room_scene().views))
     second = search_of(folder / "features", max_gaussians=2000)
     second.shown = replace(second.shown, scene=replace(second.shown.scene, views=None))
+    second.config = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.37))
     return [first, second]
 
 
