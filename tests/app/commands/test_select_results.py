@@ -11,7 +11,8 @@ from selected_rooms import EMBEDDINGS, selected_room, words
 
 from gsencoder.app import cli
 from gsencoder.data.splats import load_splat
-from gsencoder.fusion.store.folder import WORDS_FILE, save_features
+from gsencoder.data.up import with_up
+from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
 from gsencoder.infer.select.holes import find_holes
 from gsencoder.infer.select.labels_file import read_labels
 from gsencoder.infer.select.select import select
@@ -115,10 +116,13 @@ def test_results_go_to_a_folder_of_the_scene_and_its_up_is_estimated_where_nobod
 ) -> None:
     monkeypatch.chdir(tmp_path)
     folder = stored(tmp_path / "features", replace(SCENE, up=None))
-    run(folder, "query=book", "write=labels", "quiet=true")
+    run(folder, "query=mug", "write=labels", "quiet=true")
     made = json.loads((tmp_path / "outputs" / "table" / "selection" / "labels.json").read_text())
     upward = np.array(made["labels"][1]["obb"]["rotation"])[:, 2]
-    np.testing.assert_allclose(upward, [0, 0, 1], atol=0.01)
+    known = with_up(load_features(folder))[0].up
+    assert known is not None
+    np.testing.assert_allclose(known, [0, 0, 1], atol=0.1)
+    np.testing.assert_allclose(upward, known, atol=1e-6)
 
 
 def test_no_camera_is_placed_where_no_view_is_looked_at(tmp_path: Path) -> None:
