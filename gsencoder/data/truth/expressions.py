@@ -1,0 +1,212 @@
+"""Expressions that refer to one object of a scene: ScanRefer, Nr3D, and Scan2Cap's captions, in their own files.
+
+ScanRefer (Chen et al. 2020): ScanRefer_filtered_{train,val}.json, a list of {scene_id, object_id, object_name, ann_id,
+description, token}. Scan2Cap's benchmark adds to each entry the box of the object as `bbox`, eight corners
+(ScanRefer_filtered_{train,val}_gt_bbox.json). Nr3D (ReferIt3D, Achlioptas et al. 2020): nr3d.csv.
+"""
+
+import ast
+import csv
+import io
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.entries import (
+    MAX_TEXT,
+    Corner,
+    corner_bounds,
+    id_value,
+    object_id,
+    object_of,
+    read_benchmark_json,
+    refuse_pickle,
+    scene_name,
+    shown,
+    text_list,
+    text_value,
+)
+
+NR3D_COLUMNS = ("assignmentid", "utterance", "instance_type", "scan_id", "target_id", "tokens")
+"""Columns that an Nr3D file must have; `stimulus_id`, `mentions_target_class` and `correct_guess` are read if present."""
+PREDICTED = ("answer_top10", "pred_answers_at10", "caption", "aabb", "boxes")
+"""Keys that predictions have and annotations have not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Expression:
+    """What one annotator wrote of one object.
+
+    Attributes:
+        scene: name of the scene.
+        object_id: `objectId` of ScanNet's aggregation file, from 0.
+        object_name: as the file writes it; ScanRefer has underscores between words.
+        annotation: id of the expression among those of the object.
+        text: what was written.
+        tokens: the words of the text as the data set cuts it, lower case in ScanRefer.
+        aabb: lower and upper corner of the object's box, in the axes of the aligned scan and its unit; None where the
+            file has none.
+        same_class: objects of the target's class in the scene, the target included (Nr3D's stimulus); None where the
+            file does not say. More than two are hard (ReferIt3D).
+        mentions_class: whether the text names the class of the object; None where the file does not say.
+        understood: whether a listener found the object; None where the file does not say.
+    """
+
+    scene: str
+    object_id: int
+    object_name: str
+    annotation: str
+    text: str
+    tokens: tuple[str, ...]
+    aabb: tuple[Corner, Corner] | None = None
+    same_class: int | None = None
+    mentions_class: bool | None = None
+    understood: bool | None = None
+
+    @property
+    def key(self) -> tuple[str, int, str]:
+        """Scene, object and annotation, which together belong to one expression only."""
+        return self.scene, self.object_id, self.annotation
+
+
+def read_scanrefer(path: str | Path) -> tuple[Expression, ...]:
+    """Reads ScanRefer's JSON, with or without boxes.
+
+    Raises:
+        InputError: not such a file, two entries with one id, or two boxes or names of one object.
+    """
+    file = Path(path)
+    rows = read_benchmark_json(file)
+    if not isinstance(rows, list):
+        raise InputError(
+            f"{file}: expected a list of expressions with scene_id, object_id, ann_id and description, got a JSON "
+            f"{type(rows).__name__}; were predictions and truth swapped?"
+        )
+    expressions = tuple(_scanrefer(row, f"{file}: entry {index}") for index, row in enumerate(rows))
+    _check_unique(expressions, file)
+    _check_objects(expressions, file)
+    return expressions
+
+
+def read_nr3d(path: str | Path) -> tuple[Expression, ...]:
+    """Reads Nr3D's CSV.
+
+    Raises:
+        InputError: not such a table, or two rows with one id.
+    """
+    file = Path(path)
+    expressions = tuple(_nr3d(row, where) for row, where in _csv_rows(file, NR3D_COLUMNS))
+    _check_unique(expressions, file)
+    return expressions
+
+
+def _scanrefer(row: Any, where: str) -> Expression:
+    entry = object_of(row, where, "scene_id, object_id, ann_id and description")
+    if "description" not in entry:
+        swapped = next((key for key in PREDICTED if key in entry), None)
+        hint = f", got {swapped}: these are predictions" if swapped else ""
+        raise InputError(f"{where}: expected an expression with a description{hint}")
+    box = entry.get("bbox")
+    return Expression(
+        scene=scene_name(entry.get("scene_id"), where),
+        object_id=object_id(entry.get("object_id"), where),
+        object_name=text_value(entry.get("object_name"), where, "object_name"),
+        annotation=id_value(entry.get("ann_id"), where, "ann_id"),
+        text=text_value(entry["description"], where, "description"),
+        tokens=text_list(entry.get("token"), where, "token", empty=True),
+        aabb=None if box is None else corner_bounds(box, where, "bbox"),
+    )
+
+
+def _nr3d(row: Mapping[str, str], where: str) -> Expression:
+    return Expression(
+        scene=scene_name(row["scan_id"], where),
+        object_id=object_id(row["target_id"], where, "target_id"),
+        object_name=text_value(row["instance_type"], where, "instance_type"),
+        annotation=id_value(row["assignmentid"], where, "assignmentid"),
+        text=text_value(row["utterance"], where, "utterance"),
+        tokens=_literal_tokens(row["tokens"], where),
+        same_class=_stimulus_count(row.get("stimulus_id"), where),
+        mentions_class=_truth_value(row.get("mentions_target_class"), where, "mentions_target_class"),
+        understood=_truth_value(row.get("correct_guess"), where, "correct_guess"),
+    )
+
+
+def _csv_rows(path: Path, columns: Sequence[str]) -> Iterable[tuple[dict[str, str], str]]:
+    refuse_pickle(path)
+    try:
+        reader = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True)
+        lines = [(line, reader.line_num) for line in reader if line]
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"{path}: not a readable CSV file ({' '.join(str(error).split())[:120]})") from error
+    header = lines[0][0] if lines else []
+    missing = [column for column in columns if column not in header]
+    if missing or len(set(header)) < len(header):
+        wrong = f"lacks {', '.join(missing)}" if missing else "has a column twice"
+        raise InputError(f"{path}: expected a CSV with the columns {', '.join(columns)}; its first line {wrong}")
+    for line, number in lines[1:]:
+        if len(line) != len(header):
+            raise InputError(f"{path}: line {number} has {len(line)} cells and the first line {len(header)}")
+        yield dict(zip(header, line, strict=True)), f"{path}: line {number}"
+
+
+def _literal_tokens(text: str, where: str) -> tuple[str, ...]:
+    """A list of words as Python writes it, which is what the file has; nothing is executed."""
+    if len(text) > MAX_TEXT:
+        raise InputError(f"{where}: tokens has {len(text):,} characters, expected at most {MAX_TEXT:,}")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SyntaxWarning)
+            warnings.simplefilter("ignore", DeprecationWarning)
+            value = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        value = None
+    if not isinstance(value, list):
+        raise InputError(f"{where}: tokens must be a list of words such as ['the', 'chair'], got {shown(text)}")
+    return text_list(value, where, "tokens", empty=True)
+
+
+def _stimulus_count(stimulus: str | None, where: str) -> int | None:
+    """Objects of the class, from scene-class-count-target-distractor-distractor."""
+    if stimulus is None:
+        return None
+    parts = stimulus.split("-")
+    if len(parts) < 4 or not parts[2].isdecimal() or len(parts) != int(parts[2]) + 3:
+        raise InputError(
+            f"{where}: stimulus_id must be scene-class-count-target and count - 1 other objects, got {shown(stimulus)}"
+        )
+    return int(parts[2])
+
+
+def _truth_value(text: str | None, where: str, column: str) -> bool | None:
+    if text is None:
+        return None
+    if text.strip().lower() not in ("true", "false"):
+        raise InputError(f"{where}: {column} must be True or False, got {shown(text)}")
+    return text.strip().lower() == "true"
+
+
+def _check_unique(expressions: Sequence[Expression], path: Path) -> None:
+    first: dict[tuple[str, int, str], int] = {}
+    for index, each in enumerate(expressions):
+        if each.key in first:
+            raise InputError(
+                f"{path}: entries {first[each.key]} and {index} have one id: scene {each.scene}, object "
+                f"{each.object_id}, annotation {each.annotation[:40]}"
+            )
+        first[each.key] = index
+
+
+def _check_objects(expressions: Sequence[Expression], path: Path) -> None:
+    first: dict[tuple[str, int], int] = {}
+    for index, each in enumerate(expressions):
+        row = first.setdefault((each.scene, each.object_id), index)
+        other = expressions[row]
+        if (other.object_name, other.aabb) != (each.object_name, each.aabb):
+            what = "names" if other.object_name != each.object_name else "boxes"
+            raise InputError(
+                f"{path}: entries {row} and {index} give object {each.object_id} of {each.scene} different {what}"
+            )
