@@ -47,11 +47,13 @@ class SeenScene:
         name: of the scene.
         objects: all that its labels list, in the order of their ids.
         min_pixels: the area, in some photograph, from which an object may be asked about.
+        metres_per_unit: of the scene's files, which boxes were multiplied with.
     """
 
     name: str
     objects: tuple[SeenObject, ...]
     min_pixels: int
+    metres_per_unit: float = 1.0
 
     def shown(self, thing: SeenObject) -> bool:
         """Whether some photograph shows a thing well enough to be asked about."""
@@ -123,7 +125,10 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
         for row, thing in enumerate(scene.objects)
     ]
     return SeenScene(
-        name=scene.name, objects=tuple(sorted(things, key=lambda thing: thing.id)), min_pixels=min_pixels
+        name=scene.name,
+        objects=tuple(sorted(things, key=lambda thing: thing.id)),
+        min_pixels=min_pixels,
+        metres_per_unit=unit,
     )
 
 
