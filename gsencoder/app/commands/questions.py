@@ -13,7 +13,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
 from gsencoder.data.truth.made_expressions import make_expressions
-from gsencoder.data.truth.made_questions import ABSENT, KINDS, QuestionsConfig, kind_of, make_questions
+from gsencoder.data.truth.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
 from gsencoder.data.truth.made_situations import make_situations
 from gsencoder.data.truth.questions import write_scanqa
 from gsencoder.data.truth.seen_objects import SeenScene, see_objects
@@ -23,7 +23,7 @@ QUESTIONS, EXPRESSIONS, SITUATED = "questions.json", "expressions.json", "situat
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class QuestionsCommandConfig(CommonConfig):
+class QuestionsCommandConfig(QuestionsConfig, CommonConfig):
     """Settings of `questions`."""
 
     paths: tuple[str, ...] = field(
@@ -34,45 +34,28 @@ class QuestionsCommandConfig(CommonConfig):
             "required": True,
         },
     )
-    seed: int = field(default=0, metadata={"help": "of the choice among all that can be asked"})
-    per_kind: int = field(default=10, metadata={"help": "most questions of a kind about a scene"})
     per_object: int = field(default=3, metadata={"help": "most expressions that mean one object"})
     objects: int = field(default=0, metadata={"help": "most objects of a scene with expressions; 0 = all"})
-    min_pixels: int = field(
-        default=200,
-        metadata={"help": "pixels that some photograph shows of an object before anything is asked about it"},
-    )
-    balance: bool = field(
-        default=True, metadata={"help": "as many questions of each kind as there are of the rarest; false = all"}
-    )
-    absent: tuple[str, ...] = field(
-        default=ABSENT, metadata={"help": "names that are asked about where a scene does not have them"}
-    )
     data: SceneConfig = field(default_factory=SceneConfig)
 
     def __post_init__(self) -> None:
-        self.questions()
+        QuestionsConfig.__post_init__(self)
         if self.per_object < 1 or self.objects < 0:
             raise InputError(
                 f"per_object, objects: expected per_object from 1 and objects from 0, got {self.per_object}, "
                 f"{self.objects}"
             )
 
-    def questions(self) -> QuestionsConfig:
-        """The settings of the questions alone."""
-        names = ("seed", "per_kind", "min_pixels", "balance", "absent")
-        return QuestionsConfig(**{name: getattr(self, name) for name in names})
-
 
 def run(config: QuestionsCommandConfig, summary: Summary) -> None:
-    """Reads the labels of all scenes, makes what can be asked, and writes it in the files of ScanQA, SQA3D, ScanRefer."""
+    """Reads the labels of all scenes and writes what can be asked as ScanQA, SQA3D and ScanRefer write it."""
     out = config.out or Path("outputs") / "questions"
     screen = console(config.quiet)
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         with summary.step("labels"):
             scenes = list(_seen(config, Progress(quiet=config.quiet)))
         with summary.step("make"):
-            questions = make_questions(scenes, config.questions())
+            questions = make_questions(scenes, config)
             situations = make_situations(scenes, seed=config.seed, per_kind=config.per_kind)
             expressions = make_expressions(
                 scenes, seed=config.seed, per_object=config.per_object, per_scene=config.objects

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 
 
 class ColorRange(NamedTuple):
-    """Pixels that people call by one word: bounds of hue (degrees), saturation and value of HSV, lower ones included."""
+    """Pixels that people call by one word: bounds of hue (degrees), saturation and value, the lower ones included."""
 
     word: str
     hue: tuple[float, float]
