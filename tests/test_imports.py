@@ -48,6 +48,8 @@ TORCH_FREE = [
     "gsencoder.infer.onnx.runtime",
     "gsencoder.app.commands.encode",
     "gsencoder.text.encoder",
+    "gsencoder.evaluate.files.answer_predictions",
+    "gsencoder.evaluate.files.caption_predictions",
     "gsencoder.infer.localize.localize",
     "gsencoder.infer.draw.boxes_ply",
     "gsencoder.infer.draw.pictures",

@@ -12,10 +12,13 @@ MAX_BYTES = 1 << 30
 """Larger files are no annotations."""
 MAX_TEXT = 20_000
 """Largest number of characters of a question, an answer or a caption; the longest published ones have some hundred."""
+MAX_ID = 200
+"""Largest number of characters of an id."""
 PICKLES = (".pkl", ".pickle", ".p", ".pt", ".pth")
 """Suffixes of files that run code when they are read."""
 
 Corner = tuple[float, float, float]
+_SIGNS = ((1, 1, 1), (1, 0, 1), (0, 0, 1), (0, 1, 1), (1, 1, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0))
 
 
 def read_benchmark_json(path: Path) -> Any:
@@ -111,7 +114,7 @@ def scene_name(value: Any, where: str) -> str:
         InputError: no text, or one that a folder cannot be called.
     """
     name = text_value(value, where, "the scene")
-    if name in (".", "..") or "/" in name or "\0" in name or len(name) > 255:
+    if name in (".", "..") or "/" in name or len(name) > 255 or not name.isprintable():
         raise InputError(f"{where}: the scene must be a name that a folder can have, got {shown(name)}")
     return name
 
@@ -120,13 +123,16 @@ def id_value(value: Any, where: str, what: str) -> str:
     """An id as text; files write them as texts and as whole numbers.
 
     Raises:
-        InputError: neither of both, or empty.
+        InputError: neither of both, empty, or with characters that cannot be printed on a line.
     """
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
-    if isinstance(value, str) and value.strip() and len(value) <= MAX_TEXT:
+    if isinstance(value, str) and value.strip() and value.isprintable() and len(value) <= MAX_ID:
         return value
-    raise InputError(f"{where}: {what} must be a text or a whole number, got {shown(value)}")
+    raise InputError(
+        f"{where}: {what} must be a whole number or a text of one line with 1 to {MAX_ID} characters, got "
+        f"{shown(value)}"
+    )
 
 
 def object_id(value: Any, where: str, what: str = "object_id") -> int:
@@ -170,3 +176,10 @@ def corner_bounds(value: Any, where: str, what: str) -> tuple[Corner, Corner]:
         corners.append([number(each, where, f"{what}[{row}]") for each in corner])
     lower, upper = ([pick(axis) for axis in zip(*corners, strict=True)] for pick in (min, max))
     return (lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])
+
+
+def box_corners(lower: Corner, upper: Corner) -> list[list[float]]:
+    """The eight corners of an axis-aligned box as the official scripts of ScanRefer, Scan2Cap and ScanQA write them:
+    around the top, then around the bottom (utils/box_util.py).
+    """
+    return [[(lower, upper)[side][axis] for axis, side in enumerate(sides)] for sides in _SIGNS]

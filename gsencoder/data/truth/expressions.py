@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.json_values import write_json
 from gsencoder.data.truth.entries import (
     MAX_TEXT,
     Corner,
+    box_corners,
     corner_bounds,
     id_value,
     object_id,
@@ -31,7 +33,7 @@ from gsencoder.data.truth.entries import (
 )
 
 NR3D_COLUMNS = ("assignmentid", "utterance", "instance_type", "scan_id", "target_id", "tokens")
-"""Columns that an Nr3D file must have; `stimulus_id`, `mentions_target_class` and `correct_guess` are read if present."""
+"""Columns that Nr3D must have; `stimulus_id`, `mentions_target_class` and `correct_guess` are read if present."""
 PREDICTED = ("answer_top10", "pred_answers_at10", "caption", "aabb", "boxes")
 """Keys that predictions have and annotations have not."""
 
@@ -89,6 +91,28 @@ def read_scanrefer(path: str | Path) -> tuple[Expression, ...]:
     _check_unique(expressions, file)
     _check_objects(expressions, file)
     return expressions
+
+
+def write_scanrefer(path: str | Path, expressions: Sequence[Expression]) -> None:
+    """Writes expressions as ScanRefer's files have them, with boxes where they have some, as Scan2Cap's benchmark does.
+
+    Raises:
+        InputError: two expressions have one id, or the file cannot be written.
+    """
+    _check_unique(expressions, Path(path))
+    rows = [
+        {
+            "scene_id": each.scene,
+            "object_id": str(each.object_id),
+            "object_name": each.object_name,
+            "ann_id": each.annotation,
+            "description": each.text,
+            "token": list(each.tokens),
+        }
+        | ({"bbox": box_corners(*each.aabb)} if each.aabb else {})
+        for each in expressions
+    ]
+    write_json(path, rows)
 
 
 def read_nr3d(path: str | Path) -> tuple[Expression, ...]:

@@ -1,8 +1,9 @@
 """Questions about scenes: ScanQA and SQA3D in their own files.
 
 ScanQA (Azuma et al. 2022): ScanQA_v1.0_{train,val,test_w_obj,test_wo_obj}.json, a list of {scene_id, question_id,
-question, answers, object_ids, object_names}; the test sets have no answers. SQA3D (Ma et al. 2023): a file of questions,
-v1_balanced_questions_SPLIT_scannetv2.json, and one of annotations, v1_balanced_sqa_annotations_SPLIT_scannetv2.json.
+question, answers, object_ids, object_names}; the test sets have no answers. SQA3D (Ma et al. 2023): a file of
+questions, v1_balanced_questions_SPLIT_scannetv2.json, and one of annotations,
+v1_balanced_sqa_annotations_SPLIT_scannetv2.json.
 """
 
 from collections.abc import Mapping, Sequence

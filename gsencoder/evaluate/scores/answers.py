@@ -1,0 +1,293 @@
+"""Exact match of answers to questions about scenes, as ScanQA, SQA3D and LEO count it.
+
+- EM@1 and EM@10 (ScanQA, scripts/score.py): the first answer, or any of the first ten, is one of the right ones,
+  letter for letter.
+- EM and refined EM of cleaned answers (LEO, evaluator/scanqa_eval.py; the columns EM and EM-R of later papers): both
+  sides go through `clean_answer`, then the right answers are gone through in order, and the first that is equal, or
+  contains or is contained without blanks, decides. So EM can be 0 where a later right answer is equal, and an answer
+  that is empty when cleaned is refined right, since every text contains it: `AnswerScores.blank` counts those.
+- The F-value of `gsencoder.evaluate.scores.lemmas`, and the sentence scores of `gsencoder.evaluate.scores.sentences`.
+
+A question without a prediction scores 0 everywhere, and counts.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.questions import Question
+from gsencoder.evaluate.scores.java_metrics import JavaTools
+from gsencoder.evaluate.scores.lemmas import Lemmatize, f_value, wordnet_lemmatizer
+from gsencoder.evaluate.scores.sentences import SentenceScores, Tokens, score_sentences
+
+TOP = 10
+"""Most answers of a question."""
+_NUMBERS = (
+    *("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"),
+    *("thirteen", "fourteen", "fifteen", "sixteen", "seventeen", "eighteen", "nineteen", "twenty"),
+)
+_WORDS = (
+    ("letf", "left"),
+    ("let", "left"),
+    ("tehre", "there"),
+    ("brigth", "right"),
+    ("rght", "right"),
+    ("behine", "behind"),
+    ("tv", "TV"),
+    ("chai", "chair"),
+    ("wasing", "washing"),
+    ("waslked", "walked"),
+    ("oclock", "o'clock"),
+    ("o'[ ]+clock", "o'clock"),
+    ("0", "zero"),
+    ("none", "zero"),
+    *((str(value), name) for value, name in enumerate(_NUMBERS) if value),
+    ("23", "twenty-three"),
+)
+"""Words that LEO replaces, in this order."""
+_CLEANING = (
+    (re.compile(r"[ ]+$"), ""),
+    (re.compile(r"^[ ]+"), ""),
+    (re.compile(r" {2,}"), " "),
+    (re.compile(r"[^a-zA-Z0-9,'\s\-:]+"), ""),
+    *((re.compile(rf"\b{word}\b"), right) for word, right in _WORDS),
+    (re.compile(r"\b([a-zA-Z]+)([0-9])\b"), r"\g<1>"),
+    *((re.compile(rf"\b{article}\b ([a-zA-Z]+)"), r"\g<1>") for article in ("a", "an", "the")),
+    (re.compile(r"\bbackwards\b"), "backward"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerRow:
+    """The scores of one question.
+
+    Attributes:
+        question_id: of the question.
+        scene: it is about.
+        kind: of the question.
+        predicted: whether there is an answer; if not, all scores are 0.
+        em1: whether the first answer is right, letter for letter.
+        em10: whether one of at most ten is.
+        em_cleaned: LEO's exact match.
+        em_refined: LEO's refined exact match.
+        f_value: None where WordNet is missing.
+    """
+
+    question_id: str
+    scene: str
+    kind: str
+    predicted: bool
+    em1: bool
+    em10: bool
+    em_cleaned: bool
+    em_refined: bool
+    f_value: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerMeans:
+    """Means over some questions; fractions, NaN without questions.
+
+    Attributes:
+        count: of the questions.
+        missing: of them, those without an answer.
+        em1: see `AnswerRow`, as all others.
+        em10: see there.
+        em_cleaned: see there.
+        em_refined: see there.
+        f_value: None where WordNet is missing.
+    """
+
+    count: int
+    missing: int
+    em1: float
+    em10: float
+    em_cleaned: float
+    em_refined: float
+    f_value: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AnswerScores:
+    """Scores of a question set.
+
+    Attributes:
+        rows: one a question, in the order of the questions.
+        overall: means over all.
+        by_kind: means over each kind of question, in the order of the kinds; kinds without questions are not there.
+        by_scene: means over each scene, by name.
+        blank: answers that are empty when cleaned, and count as right in the refined match.
+        sentences: None where they were not asked for.
+        absent: why a column has no value.
+    """
+
+    rows: tuple[AnswerRow, ...]
+    overall: AnswerMeans
+    by_kind: dict[str, AnswerMeans]
+    by_scene: dict[str, AnswerMeans]
+    blank: int
+    sentences: SentenceScores | None
+    absent: dict[str, str]
+
+    def columns(self) -> dict[str, float | None]:
+        """Head and value of each column over all questions; None where it is absent."""
+        means = self.overall
+        values: dict[str, float | None] = {
+            "EM@1": means.em1,
+            "EM@10": None if "EM@10" in self.absent else means.em10,
+            "EM (cleaned)": means.em_cleaned,
+            "EM (refined)": means.em_refined,
+            "F-value": means.f_value,
+        }
+        return values | (self.sentences.columns() if self.sentences else {})
+
+
+def clean_answer(text: str) -> str:
+    """An answer as LEO compares it: lower case but for TV, no punctuation but , ' - and :, typing errors mended, whole
+    numbers to 20 and 23 in words, articles left out (data/data_utils.py; its steps that change nothing are not here).
+    """
+    text = text.lower()
+    for pattern, replacement in _CLEANING:
+        text = pattern.sub(replacement, text)
+    return text
+
+
+def match_cleaned(answer: str, references: Sequence[str]) -> tuple[bool, bool]:
+    """LEO's exact match and refined match of an answer, both sides cleaned by `clean_answer` here."""
+    cleaned = clean_answer(answer)
+    short = "".join(cleaned.split())
+    for reference in map(clean_answer, references):
+        if cleaned == reference:
+            return True, True
+        other = "".join(reference.split())
+        if short in other or other in short:
+            return False, True
+    return False, False
+
+
+def sqa3d_kind(question: str) -> str:
+    """What, is, how, can, which or other: SQA3D's kinds, by the letters that a question begins with, in any case."""
+    start = question.lstrip().lower()
+    return next((kind for kind in SQA3D_KINDS if start.startswith(kind)), "other")
+
+
+def scanqa_kind(question: str) -> str:
+    """ScanQA's kinds (scripts/score.py), by words anywhere in a question, in the case in which a sentence has them."""
+    return next((kind for kind, phrases in _SCANQA for phrase in phrases if phrase in question), "Other")
+
+
+SQA3D_KINDS = ("what", "is", "how", "can", "which")
+_SCANQA = (
+    ("Place", ("Where",)),
+    ("Number", ("How many",)),
+    ("Color", ("What color", "What is the color")),
+    ("Object nature", ("What shape", "What type", "What kind")),
+    ("Object", ("What is",)),
+)
+SCANQA_KINDS = tuple(kind for kind, _ in _SCANQA)
+
+
+def score_answers(
+    questions: Sequence[Question],
+    predictions: Mapping[str, Sequence[str]],
+    *,
+    sentences: bool = True,
+    tokens: Tokens = "auto",
+    tools: JavaTools | str | None = None,
+    lemmatize: Lemmatize | str | None = None,
+) -> AnswerScores:
+    """Scores the answers to all questions of a set.
+
+    Args:
+        questions: with right answers.
+        predictions: by the id of the question, one to ten answers, best first; a question that is missing scores 0.
+        sentences: whether to compute BLEU, METEOR, ROUGE-L and CIDEr of the first answers.
+        tokens: of those, see `gsencoder.evaluate.scores.sentences.Tokens`.
+        tools: for those, see `score_sentences`.
+        lemmatize: of `wordnet_lemmatizer`, a reason for going without, or None = look for it.
+
+    Raises:
+        InputError: questions without answers or with one id, predictions for other questions, or none or more than ten
+            answers to one.
+    """
+    _check(questions, predictions)
+    lemmatize = wordnet_lemmatizer() if lemmatize is None else lemmatize
+    rows = tuple(_row(each, predictions.get(each.id, ()), lemmatize) for each in questions)
+    absent = {"F-value": lemmatize} if isinstance(lemmatize, str) else {}
+    if all(len(answers) == 1 for answers in predictions.values()):
+        absent["EM@10"] = "no question has more than one predicted answer"
+    spoken = [str(predictions[each.id][0]) if each.id in predictions else "" for each in questions]
+    scored = None
+    if sentences:
+        scored = score_sentences(spoken, [each.answers for each in questions], tokens=tokens, tools=tools)
+        absent |= scored.absent
+    kinds = [*SQA3D_KINDS, *SCANQA_KINDS, "other", "Other"]
+    return AnswerScores(
+        rows=rows,
+        overall=mean_answers(rows),
+        by_kind=dict(sorted(_grouped(rows, lambda row: row.kind).items(), key=lambda item: kinds.index(item[0]))),
+        by_scene=dict(sorted(_grouped(rows, lambda row: row.scene).items())),
+        blank=sum(not clean_answer(answers[0]).split() for answers in predictions.values()),
+        sentences=scored,
+        absent=absent,
+    )
+
+
+def mean_answers(rows: Sequence[AnswerRow]) -> AnswerMeans:
+    """Means over questions, of one scene or kind, say."""
+    count = len(rows)
+
+    def mean(values: Sequence[float | bool]) -> float:
+        return sum(values) / count if count else float("nan")
+
+    values = [row.f_value for row in rows if row.f_value is not None]
+    return AnswerMeans(
+        count=count,
+        missing=sum(not row.predicted for row in rows),
+        em1=mean([row.em1 for row in rows]),
+        em10=mean([row.em10 for row in rows]),
+        em_cleaned=mean([row.em_cleaned for row in rows]),
+        em_refined=mean([row.em_refined for row in rows]),
+        f_value=mean(values) if len(values) == count else None,
+    )
+
+
+def _row(question: Question, answers: Sequence[str], lemmatize: Lemmatize | str) -> AnswerRow:
+    cleaned, refined = match_cleaned(answers[0], question.answers) if answers else (False, False)
+    value = None
+    if not isinstance(lemmatize, str):
+        value = f_value(answers[0], question.answers, lemmatize) if answers else 0.0
+    return AnswerRow(
+        question_id=question.id,
+        scene=question.scene,
+        kind=sqa3d_kind(question.text) if question.dataset == "sqa3d" else scanqa_kind(question.text),
+        predicted=bool(answers),
+        em1=bool(answers) and answers[0] in question.answers,
+        em10=any(answer in question.answers for answer in answers),
+        em_cleaned=cleaned,
+        em_refined=refined,
+        f_value=value,
+    )
+
+
+def _grouped(rows: Sequence[AnswerRow], key: Callable[[AnswerRow], str]) -> dict[str, AnswerMeans]:
+    groups: dict[str, list[AnswerRow]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return {name: mean_answers(group) for name, group in groups.items()}
+
+
+def _check(questions: Sequence[Question], predictions: Mapping[str, Sequence[str]]) -> None:
+    ids = {each.id for each in questions}
+    if len(ids) < len(questions):
+        raise InputError(f"{len(questions) - len(ids)} questions have the id of another one; expected each once")
+    silent = next((each.id for each in questions if not each.answers), None)
+    if silent is not None:
+        raise InputError(f"question {silent[:60]} has no right answers; it cannot be scored")
+    other = next((name for name in predictions if name not in ids), None)
+    if other is not None:
+        raise InputError(f"an answer is predicted for {other[:60]}, which is no question of the set")
+    wrong = next((name for name, answers in predictions.items() if not 1 <= len(answers) <= TOP), None)
+    if wrong is not None:
+        raise InputError(f"question {wrong[:60]} has {len(predictions[wrong])} answers; expected 1 to {TOP}")

@@ -1,0 +1,256 @@
+"""Scan2Cap's m@kIoU: sentence scores of captions that count only where their box overlaps the object (Chen 2021).
+
+Every object with captions is one sample. Its hypothesis is the caption of the predicted box that overlaps it most, of
+equal ones the first, if their IoU is above k; else it is the empty caption "sos eos". References are all captions of
+the object. Captions are wrapped in sos and eos, as lib/eval_helper.py does, and cut at blanks, without a tokenizer: sos
+and eos count as words, and an object without a caption scores above 0 in BLEU-1 and ROUGE-L. Scores are of the corpus.
+
+The script takes for each box the object that its detector was trained to assign, by the nearest center, which a file
+of boxes does not have. The benchmark (benchmark/eval.py) assigns by generalized IoU, one box to one object, and takes
+an IoU of k, too; where each object has one box of its own near it, all three agree.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.entries import Corner
+from gsencoder.data.truth.expressions import Expression
+from gsencoder.evaluate.scores.java_metrics import JavaTools
+from gsencoder.evaluate.scores.sentences import SentenceScores, score_sentences
+
+MAX_TOKENS = 30
+"""Tokens of a reference that Scan2Cap keeps (lib/config.py, MAX_DES_LEN)."""
+EMPTY = "sos eos"
+EPSILON = 1e-8
+"""Added to the union, as the official scripts of ScanRefer and Scan2Cap do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaptionedObject:
+    """A true object and what was written of it.
+
+    Attributes:
+        scene: name of the scene.
+        object_id: `objectId` of ScanNet's aggregation file, from 0.
+        object_name: as the file writes it.
+        captions: wrapped in sos and eos, tokens with blanks between them.
+        aabb: lower and upper corner; None where the truth has no boxes.
+    """
+
+    scene: str
+    object_id: int
+    object_name: str
+    captions: tuple[str, ...]
+    aabb: tuple[Corner, Corner] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaptionedBox:
+    """A predicted box and its caption.
+
+    Attributes:
+        scene: name of the scene.
+        caption: with or without sos and eos.
+        aabb: lower and upper corner.
+        objectness: probability that there is an object; it decides nothing here, and is kept in files.
+        class_probabilities: of the detector; the same.
+    """
+
+    scene: str
+    caption: str
+    aabb: tuple[Corner, Corner]
+    objectness: float = 1.0
+    class_probabilities: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedCaption:
+    """A predicted caption of a true object, where proposals are given and no boxes are predicted.
+
+    Attributes:
+        scene: name of the scene.
+        object_id: of the object.
+        caption: with or without sos and eos.
+    """
+
+    scene: str
+    object_id: int
+    caption: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DenseCaptionScores:
+    """Scores of captions; one sample an object.
+
+    Attributes:
+        min_iou: k, which the IoU must be above; None where captions belong to objects by their ids.
+        objects: the samples.
+        predictions: captions that were predicted.
+        missing: objects whose caption counts as empty: no box overlaps them enough, or none is predicted for their id.
+        ious: of each object and its best box, 0 without one; None where captions belong to objects by their ids.
+        sentences: scores of the corpus and of each object, in this order.
+    """
+
+    min_iou: float | None
+    objects: tuple[CaptionedObject, ...]
+    predictions: int
+    missing: int
+    ious: Float64[np.ndarray, "N"] | None
+    sentences: SentenceScores
+
+    def columns(self) -> dict[str, float | None]:
+        """Head and value of each column, such as CIDEr@0.5IoU; None where it is absent."""
+        suffix = "" if self.min_iou is None else f"@{self.min_iou:g}IoU"
+        return {f"{name}{suffix}": value for name, value in self.sentences.columns().items()}
+
+
+def captioned_objects(
+    expressions: Sequence[Expression], *, max_tokens: int | None = MAX_TOKENS
+) -> tuple[CaptionedObject, ...]:
+    """The objects of ScanRefer's or Nr3D's expressions with all their captions, in the order of the first ones.
+
+    Args:
+        expressions: see there.
+        max_tokens: tokens of a caption that are kept, as Scan2Cap's lib/eval_helper.py does; None = all, as its
+            benchmark does.
+    """
+    objects: dict[tuple[str, int], list[Expression]] = {}
+    for each in expressions:
+        objects.setdefault((each.scene, each.object_id), []).append(each)
+    return tuple(
+        CaptionedObject(
+            scene=scene,
+            object_id=number,
+            object_name=group[0].object_name,
+            captions=tuple(f"sos {' '.join(each.tokens[:max_tokens])} eos" for each in group),
+            aabb=group[0].aabb,
+        )
+        for (scene, number), group in objects.items()
+    )
+
+
+def wrapped_caption(text: str) -> str:
+    """A caption between sos and eos with full stops as words, as LEO wraps what a language model says; one that begins
+    with sos and ends with eos is left as it is.
+    """
+    words = text.split(" ")
+    return text if words[0] == "sos" and words[-1] == "eos" else f"sos {text} eos".replace(". ", " . ")
+
+
+def box_ious(
+    lower: Float64[np.ndarray, "*a 3"],
+    upper: Float64[np.ndarray, "*a 3"],
+    lowers: Float64[np.ndarray, "*b 3"],
+    uppers: Float64[np.ndarray, "*b 3"],
+) -> Float64[np.ndarray, "*c"]:
+    """IoU of axis-aligned boxes whose shapes broadcast, with 1e-8 added to the union."""
+    sides = np.minimum(upper, uppers) - np.maximum(lower, lowers)
+    overlap = np.prod(np.maximum(sides, 0), axis=-1)
+    volumes = np.prod(upper - lower, axis=-1) + np.prod(uppers - lowers, axis=-1)
+    return np.asarray(overlap / (volumes - overlap + EPSILON))
+
+
+def score_box_captions(
+    objects: Sequence[CaptionedObject],
+    boxes: Sequence[CaptionedBox],
+    *,
+    min_iou: float = 0.5,
+    tools: JavaTools | str | None = None,
+) -> DenseCaptionScores:
+    """m@kIoU of predicted boxes with captions.
+
+    Args:
+        objects: with boxes.
+        boxes: of the same scenes, any number a scene, in any order.
+        min_iou: k.
+        tools: see `score_sentences`.
+
+    Raises:
+        InputError: objects without boxes or twice, boxes of other scenes, or k outside [0, 1].
+    """
+    if not 0 <= min_iou <= 1:
+        raise InputError(f"the smallest IoU must lie in [0, 1], got {min_iou}")
+    _check(objects, {each.scene for each in boxes})
+    bare = next((each for each in objects if each.aabb is None), None)
+    if bare is not None:
+        raise InputError(f"object {bare.object_id} of {bare.scene} has no box; captions of boxes need true boxes")
+    ious, best = _best_boxes(objects, boxes)
+    captions = [boxes[row].caption if iou > min_iou else None for row, iou in zip(best, ious, strict=True)]
+    return _scores(objects, captions, len(boxes), min_iou, ious, tools)
+
+
+def score_named_captions(
+    objects: Sequence[CaptionedObject],
+    captions: Sequence[NamedCaption],
+    *,
+    tools: JavaTools | str | None = None,
+) -> DenseCaptionScores:
+    """The same scores where every caption says which object it is about, and none is dropped for its box.
+
+    Args:
+        objects: with or without boxes.
+        captions: at most one an object.
+        tools: see `score_sentences`.
+
+    Raises:
+        InputError: captions of other objects, or two of one.
+    """
+    _check(objects, {each.scene for each in captions})
+    found: dict[tuple[str, int], str] = {}
+    known = {(each.scene, each.object_id) for each in objects}
+    for each in captions:
+        key = each.scene, each.object_id
+        if key in found or key not in known:
+            wrong = "has two captions" if key in found else "is no object of the truth"
+            raise InputError(f"object {each.object_id} of {each.scene} {wrong}")
+        found[key] = each.caption
+    spoken = [found.get((each.scene, each.object_id)) for each in objects]
+    return _scores(objects, spoken, len(captions), None, None, tools)
+
+
+def _scores(
+    objects: Sequence[CaptionedObject],
+    captions: Sequence[str | None],
+    predictions: int,
+    min_iou: float | None,
+    ious: np.ndarray | None,
+    tools: JavaTools | str | None,
+) -> DenseCaptionScores:
+    spoken = [EMPTY if caption is None else wrapped_caption(caption) for caption in captions]
+    return DenseCaptionScores(
+        min_iou=min_iou,
+        objects=tuple(objects),
+        predictions=predictions,
+        missing=sum(caption is None for caption in captions),
+        ious=ious,
+        sentences=score_sentences(spoken, [each.captions for each in objects], tokens="given", tools=tools),
+    )
+
+
+def _best_boxes(objects: Sequence[CaptionedObject], boxes: Sequence[CaptionedBox]) -> tuple[np.ndarray, np.ndarray]:
+    """For each object the IoU with its best box, and the row of that box; 0 and −1 in scenes without boxes."""
+    ious, best = np.zeros(len(objects)), np.full(len(objects), -1)
+    rows: dict[str, list[int]] = {}
+    for row, box in enumerate(boxes):
+        rows.setdefault(box.scene, []).append(row)
+    corners = np.array([box.aabb for box in boxes], np.float64).reshape(len(boxes), 2, 3)
+    for index, each in enumerate(objects):
+        if each.scene in rows:
+            there = np.array(rows[each.scene])
+            lower, upper = np.array(each.aabb, np.float64)
+            values = box_ious(lower, upper, corners[there, 0], corners[there, 1])
+            best[index], ious[index] = there[values.argmax()], values.max()
+    return ious, best
+
+
+def _check(objects: Sequence[CaptionedObject], scenes: set[str]) -> None:
+    keys = [(each.scene, each.object_id) for each in objects]
+    if len(set(keys)) < len(keys):
+        raise InputError(f"{len(keys) - len(set(keys))} objects have the scene and id of another one")
+    other = min(scenes - {each.scene for each in objects}, default=None)
+    if other is not None:
+        raise InputError(f"captions are predicted for {other}, which is no scene of the truth")

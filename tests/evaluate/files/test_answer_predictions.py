@@ -1,0 +1,119 @@
+"""Predicted answers in ScanQA's and SQA3D's files, and every way in which they can be wrong."""
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.questions import Question
+from gsencoder.evaluate.files.answer_predictions import read_answer_predictions, write_answer_predictions
+
+SCANQA = (
+    Question(dataset="scanqa", id="q0", scene="s0", text="What?", answers=("chair",)),
+    Question(dataset="scanqa", id="q1", scene="s1", text="What?", answers=("table",)),
+)
+SQA3D = tuple(
+    Question(
+        dataset="sqa3d",
+        id=str(number),
+        scene="s0",
+        text="Which?",
+        situation="I stand.",
+        answers=("left",),
+        position=(float(number), 0.5, 0.0),
+        rotation=(0.8, 0.0, 0.0, 0.6),
+    )
+    for number in range(2)
+)
+
+
+def entry(**changes: Any) -> dict[str, Any]:
+    return {"scene_id": "s0", "question_id": "q0", "answer_top10": ["chair", "stool"]} | changes
+
+
+def written(folder: Path, content: Any) -> Path:
+    path = folder / "pred.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_scanqas_submission_is_read_with_and_without_boxes(tmp_path: Path) -> None:
+    rows = [entry(bbox=[[0, 0, 0]] * 8), {"question_id": "q1", "answer": "table"}]
+    assert read_answer_predictions(written(tmp_path, rows), SCANQA) == {"q0": ("chair", "stool"), "q1": ("table",)}
+    assert read_answer_predictions(written(tmp_path, []), SCANQA) == {}
+
+
+def test_sqa3ds_answers_are_found_by_situation_and_place(tmp_path: Path) -> None:
+    row = {"scene_id": "s0", "situation": "I stand.", "question": "Which?", "answer": "right"}
+    place = {"agent_pos": {"x": 1.0, "y": 0.5, "z": 0}, "agent_rot": {"_x": 0, "_y": 0, "_z": 0.6, "_w": 0.8}}
+    assert read_answer_predictions(written(tmp_path, [row | place]), SQA3D) == {"1": ("right",)}
+    assert read_answer_predictions(written(tmp_path, [row]), SQA3D[:1]) == {"0": ("right",)}
+    with pytest.raises(InputError, match="entry 0: scene, situation, question and place are those of 2 questions"):
+        read_answer_predictions(written(tmp_path, [row]), SQA3D)
+    with pytest.raises(InputError, match="those of no question of the truth: 'Which\\?'"):
+        read_answer_predictions(written(tmp_path, [row | place | {"situation": "I sit."}]), SQA3D)
+    assert read_answer_predictions(written(tmp_path, [{"question_id": 1, "answer": ""}]), SQA3D) == {"1": ("",)}
+
+
+@pytest.mark.parametrize("questions", [SCANQA, SQA3D])
+def test_what_is_written_is_read_again(tmp_path: Path, questions: tuple[Question, ...]) -> None:
+    predictions = {questions[1].id: ("é",)}
+    write_answer_predictions(tmp_path / "p.json", questions, predictions)
+    assert read_answer_predictions(tmp_path / "p.json", questions) == predictions
+    rows = json.loads((tmp_path / "p.json").read_text())
+    for row in rows:
+        row.pop("question_id")
+    if questions is SQA3D:
+        # The official script finds them without an id.
+        assert read_answer_predictions(written(tmp_path, rows), questions) == predictions
+
+
+def test_scanqas_boxes_are_written_as_corners(tmp_path: Path) -> None:
+    box = ((0.0, 1.0, 2.0), (3.0, 4.0, 5.0))
+    write_answer_predictions(tmp_path / "p.json", SCANQA, {"q0": ["a", "b"]}, boxes={"q0": box})
+    (row,) = json.loads((tmp_path / "p.json").read_text())
+    assert row["answer_top10"] == ["a", "b"]
+    assert row["bbox"][0] == [3.0, 4.0, 5.0]
+    with pytest.raises(InputError, match="question x is predicted and is none"):
+        write_answer_predictions(tmp_path / "p.json", SCANQA, {"x": ["a"]})
+    with pytest.raises(InputError, match="has 0 answers"):
+        write_answer_predictions(tmp_path / "p.json", SCANQA, {"q0": []})
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([entry(), entry()], "entry 1: question q0 is answered in entry 0 already"),
+        ([entry(question_id="q9")], "entry 0: question_id q9 is not in the truth"),
+        ([entry(scene_id="s9")], "entry 0: is about s9, of which the truth has no questions"),
+        ([entry(scene_id="s1")], "entry 0: question q0 is about s0, got s1"),
+        ([entry(question_id=None)], "entry 0: question_id must be"),
+        ([{"answer": "x"}], "entry 0: says not which question it answers"),
+        ([entry(answer_top10="chair")], "entry 0: answer_top10 must be a list of texts, got 'chair'"),
+        ([entry(answer_top10=[4])], r"entry 0: answer_top10\[0\] must be a text, got 4"),
+        ([entry(answer_top10=[])], "entry 0: answer_top10 has 0 answers, expected 1 to 10"),
+        ([entry(answer_top10=["a"] * 11)], "entry 0: answer_top10 has 11 answers"),
+        ([entry(answer_top10=["x" * 10_000_000])], r"entry 0: answer_top10\[0\] has 10,000,000 characters"),
+        ([{"question_id": "q0", "answer": 3}], "entry 0: answer must be a text, got 3"),
+        ([{"question_id": "q0", "answers": ["x"]}], "got answers, which truth has; were predictions and truth swapped"),
+        ({"questions": []}, "this is SQA3D's truth: were predictions and truth swapped"),
+        ({"q0": "chair"}, "expected a list of objects with question_id"),
+        ([["q0", "chair"]], "entry 0: expected an object with question_id"),
+    ],
+)
+def test_a_wrong_entry_is_named(tmp_path: Path, content: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_answer_predictions(written(tmp_path, content), SCANQA)
+    assert "pred.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 600
+
+
+def test_scanqas_pickles_are_refused(tmp_path: Path) -> None:
+    for name in ("pred.val.pkl", "pred.val"):
+        (tmp_path / name).write_bytes(pickle.dumps({"s0": {"q0": {"pred_answers_at10": ["a"]}}}))
+        with pytest.raises(InputError, match="is a pickle"):
+            read_answer_predictions(tmp_path / name, SCANQA)

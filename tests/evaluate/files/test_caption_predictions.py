@@ -1,0 +1,110 @@
+"""Predicted captions in Scan2Cap's files, and every way in which they can be wrong."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.entries import box_corners
+from gsencoder.evaluate.files.caption_predictions import (
+    read_caption_predictions,
+    write_box_captions,
+    write_named_captions,
+)
+from gsencoder.evaluate.scores.dense_captions import CaptionedBox, CaptionedObject, NamedCaption
+
+OBJECTS = tuple(
+    CaptionedObject(scene=scene, object_id=number, object_name="office_chair", captions=("sos a chair eos",))
+    for scene, number in (("s0", 3), ("s0", 4), ("s1", 3))
+)
+CORNERS = box_corners((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+
+
+def written(folder: Path, content: Any) -> Path:
+    path = folder / "pred.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def row(**changes: Any) -> dict[str, Any]:
+    return {"caption": "sos a chair eos", "box": CORNERS, "sem_prob": [0.5, 0.5], "obj_prob": [0.25, 0.75]} | changes
+
+
+def test_captions_of_boxes_are_read_as_the_benchmark_takes_them(tmp_path: Path) -> None:
+    first, second = read_caption_predictions(
+        written(tmp_path, {"s0": [row(), {"caption": "", "box": CORNERS[::-1]}], "s1": []}), OBJECTS
+    )
+    assert first == CaptionedBox(
+        scene="s0",
+        caption="sos a chair eos",
+        aabb=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)),
+        objectness=0.75,
+        class_probabilities=(0.5, 0.5),
+    )
+    assert isinstance(second, CaptionedBox)
+    assert (second.aabb, second.objectness, second.class_probabilities) == (first.aabb, 1.0, ())
+
+
+def test_captions_of_given_objects_are_read_as_scan2cap_writes_them(tmp_path: Path) -> None:
+    path = written(tmp_path, {"s0|3|office_chair": ["sos a chair eos"], "s1|3": ["b"]})
+    assert read_caption_predictions(path, OBJECTS) == (
+        NamedCaption(scene="s0", object_id=3, caption="sos a chair eos"),
+        NamedCaption(scene="s1", object_id=3, caption="b"),
+    )
+    assert read_caption_predictions(written(tmp_path, {}), OBJECTS) == ()
+
+
+def test_what_is_written_is_read_again_with_its_wrapping(tmp_path: Path) -> None:
+    box = CaptionedBox(scene="s1", caption="a chair.", aabb=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)), objectness=0.75)
+    write_box_captions(tmp_path / "a.json", [box])
+    (again,) = read_caption_predictions(tmp_path / "a.json", OBJECTS)
+    assert isinstance(again, CaptionedBox)
+    assert (again.caption, again.aabb, again.objectness) == ("sos a chair . eos", box.aabb, 0.75)
+    caption = NamedCaption(scene="s0", object_id=4, caption="b")
+    write_named_captions(tmp_path / "b.json", OBJECTS, [caption])
+    assert json.loads((tmp_path / "b.json").read_text()) == {"s0|4|office_chair": ["sos b eos"]}
+    with pytest.raises(InputError, match="has two captions"):
+        write_named_captions(tmp_path / "b.json", OBJECTS, [caption, caption])
+    with pytest.raises(InputError, match="object 9 of s0 is captioned"):
+        write_named_captions(tmp_path / "b.json", OBJECTS, [NamedCaption(scene="s0", object_id=9, caption="b")])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"s9": [row()]}, "'s9': is no scene of the truth"),
+        ({"s0": row()}, "'s0': must be a list of objects"),
+        ({"s0": ["x"]}, r"s0\[0\]: expected an object with caption and box"),
+        ({"s0": [row(), row(box=None)]}, r"s0\[1\]: box must be a list of 8 corners"),
+        ({"s0": [row(box=[[0, 0]] * 8)]}, r"s0\[0\]: box\[0\] must be a corner"),
+        ({"s0": [row(box=[["0", 0, 0]] * 8)]}, r"s0\[0\]: box\[0\] must be a number, got '0'"),
+        ({"s0": [row(box=[[float("inf"), 0, 0]] * 8)]}, r"box\[0\] must be a finite number"),
+        ({"s0": [row(caption=3)]}, r"s0\[0\]: caption must be a text, got 3"),
+        ({"s0": [row(caption="x" * 10_000_000)]}, r"s0\[0\]: caption has 10,000,000 characters"),
+        ({"s0": [row(obj_prob="high")]}, r"s0\[0\]: obj_prob must be a list of numbers"),
+        ({"s0": [row(obj_prob=[0.5, float("nan")])]}, r"obj_prob\[1\] must be a finite number"),
+        ({"s9|3": ["a"]}, "'s9|3': is no scene of the truth"),
+        ({"s0|9": ["a"]}, r"'s0\|9': is no object of the truth"),
+        ({"s0|x": ["a"]}, "object_id must be a whole number"),
+        ({"s0|3|lamp": ["a"]}, "the truth calls this object 'office_chair'"),
+        ({"s0|3": ["a"], "s0|3|office_chair": ["b"]}, r"is the same object as 's0\|3'"),
+        ({"s0|3": []}, "has 0 captions, expected one"),
+        ({"s0|3": ["a", "b"]}, "has 2 captions, expected one"),
+        ({"s0|3": "a"}, "caption must be a list of texts"),
+        ([{"ann_id": "1"}], "this is truth: were predictions and truth swapped"),
+        ([], "expected an object from scenes"),
+    ],
+)
+def test_a_wrong_entry_is_named(tmp_path: Path, content: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_caption_predictions(written(tmp_path, content), OBJECTS)
+    assert "pred.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_that_is_there_twice_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "pred.json").write_text('{"s0": [], "s0": []}')
+    with pytest.raises(InputError, match="'s0' is there twice"):
+        read_caption_predictions(tmp_path / "pred.json", OBJECTS)

@@ -1,0 +1,243 @@
+"""Exact matches of answers against cases worked out by hand from ScanQA's and LEO's scripts."""
+
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.questions import Question
+from gsencoder.evaluate.scores.answers import (
+    clean_answer,
+    match_cleaned,
+    scanqa_kind,
+    score_answers,
+    sqa3d_kind,
+)
+from gsencoder.evaluate.scores.lemmas import f_value, wordnet_lemmatizer
+from gsencoder.evaluate.scores.sentences import score_sentences
+
+NO_JAVA = "no Java here"
+NO_WORDNET = "no WordNet here"
+
+
+def singular(word: str) -> str:
+    """A lemmatizer of nouns with s."""
+    return word.removesuffix("s")
+
+
+def question(
+    name: str, *answers: str, scene: str = "s0", text: str = "What?", dataset: Literal["scanqa", "sqa3d"] = "sqa3d"
+) -> Question:
+    return Question(dataset=dataset, id=name, scene=scene, text=text, answers=answers)
+
+
+@pytest.mark.parametrize(
+    ("text", "cleaned"),
+    [
+        ("  The Brown   chair. ", "brown chair"),
+        ("on the left of a table", "on left of table"),
+        ("2", "two"),
+        ("23 chairs and 24", "twenty-three chairs and 24"),
+        ("None", "zero"),
+        ("no1 mat2 a12", "no mat a12"),
+        ("3 o'  clock, 3 oclock", "three o'clock, three o'clock"),
+        ("tv on the letf", "TV on left"),
+        ("go backwards", "go backward"),
+        ("a", "a"),
+        ("the the chair", "the chair"),
+        ("?!", ""),
+        ("black & white", "black  white"),
+    ],
+)
+def test_answers_are_cleaned_as_leo_cleans_them(text: str, cleaned: str) -> None:
+    assert clean_answer(text) == cleaned
+
+
+@pytest.mark.parametrize(
+    ("answer", "references", "match"),
+    [
+        ("Brown.", ["brown"], (True, True)),
+        ("brown wood", ["brown"], (False, True)),
+        ("book shelf", ["bookshelf"], (False, True)),
+        ("red", ["brown", "green"], (False, False)),
+        # The first reference that matches in any way decides, and hides the equal one behind it.
+        ("chair", ["brown chair", "chair"], (False, True)),
+        ("chair", ["chair", "brown chair"], (True, True)),
+        # Every text contains an empty one.
+        ("", ["chair"], (False, True)),
+        ("...", ["chair"], (False, True)),
+    ],
+)
+def test_the_refined_match_is_leos(answer: str, references: list[str], match: tuple[bool, bool]) -> None:
+    assert match_cleaned(answer, references) == match
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("What color?", "what"),
+        ("  whatever", "what"),
+        ("Is it?", "is"),
+        ("Isn't it?", "is"),
+        ("HOW many", "how"),
+        ("Can I", "can"),
+        ("Which one", "which"),
+        ("Where", "other"),
+        ("", "other"),
+    ],
+)
+def test_the_kind_of_an_sqa3d_question_is_its_first_letters(text: str, kind: str) -> None:
+    assert sqa3d_kind(text) == kind
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("Where is it?", "Place"),
+        ("where is it?", "Other"),
+        ("How many chairs?", "Number"),
+        ("What is the color of it?", "Color"),
+        ("What kind of chair is it?", "Object nature"),
+        ("What is it?", "Object"),
+        ("In the corner, What is it?", "Object"),
+        ("How is it?", "Other"),
+    ],
+)
+def test_the_kind_of_a_scanqa_question_is_the_first_that_has_a_phrase_of_it(text: str, kind: str) -> None:
+    assert scanqa_kind(text) == kind
+
+
+def test_means_are_over_all_questions_and_a_missing_one_counts_as_wrong() -> None:
+    questions = [
+        question("a", "chair", scene="s1"),
+        question("b", "two", "2", scene="s0", text="How many?"),
+        question("c", "brown table", scene="s0", text="Is it?"),
+        question("d", "left", scene="s0"),
+    ]
+    predictions = {"a": ["table", "chair"], "b": ["2"], "c": ["Brown table"]}
+    scores = score_answers(questions, predictions, tools=NO_JAVA, lemmatize=NO_WORDNET)
+    # Letter for letter: b alone of the first answers, a besides of all. Cleaned: b and c; refined: the same.
+    assert scores.overall.em1 == 1 / 4
+    assert scores.overall.em10 == 2 / 4
+    assert (scores.overall.em_cleaned, scores.overall.em_refined) == (2 / 4, 2 / 4)
+    assert (scores.overall.count, scores.overall.missing) == (4, 1)
+    assert [row.predicted for row in scores.rows] == [True, True, True, False]
+    assert list(scores.by_kind) == ["what", "is", "how"]
+    assert scores.by_kind["what"].em10 == 1 / 2
+    assert [scores.by_scene[name].em10 for name in ("s0", "s1")] == [1 / 3, 1]
+    assert scores.absent == {"F-value": NO_WORDNET, "METEOR": NO_JAVA}
+    assert scores.columns()["F-value"] is None
+
+
+def test_a_missing_answer_counts_in_the_sentence_scores_as_an_empty_one() -> None:
+    questions = [question("a", "brown chair"), question("b", "red table")]
+    scores = score_answers(questions, {"a": ["brown chair"]}, tools=NO_JAVA, lemmatize=NO_WORDNET).sentences
+    assert scores is not None
+    # c = 2 and r = 4, and what is said is right: exp(1 - 4/2).
+    assert scores.bleu[0] == pytest.approx(np.exp(-1))
+    assert scores.rouge_l == pytest.approx(0.5)
+    assert scores.cider_each[1] == 0
+
+
+def test_em10_of_single_answers_is_absent_and_blank_answers_are_counted() -> None:
+    questions = [question("a", "chair"), question("b", "table")]
+    scores = score_answers(questions, {"a": ["?"], "b": ["table"]}, sentences=False, lemmatize=NO_WORDNET)
+    assert "more than one" in scores.absent["EM@10"]
+    assert scores.columns()["EM@10"] is None
+    assert scores.blank == 1
+    assert scores.overall.em_refined == 1
+
+
+def test_the_f_value_is_one_for_an_equal_answer_and_else_the_best_f1_of_lemmas() -> None:
+    assert f_value("brown chairs", ["brown chairs"], singular) == 1
+    # Against "brown chair": both lemmas are there; against "two brown tables": P = 1/2, R = 1/3.
+    assert f_value("brown chairs", ["brown chair"], singular) == 1
+    assert f_value("brown chairs", ["two brown tables"], singular) == pytest.approx(2 * (1 / 2) * (1 / 3) / (5 / 6))
+    # A repeated word counts repeatedly: P = 2/3, R = 1/1.
+    assert f_value("the the chair", ["the"], singular) == pytest.approx(0.8)
+    assert f_value("red", ["brown chair", "red wall"], singular) == pytest.approx(2 / 3)
+    assert f_value("Red", ["red"], singular) == 0
+    assert f_value("", ["red"], singular) == f_value("red", [""], singular) == 0
+
+
+def test_the_f_value_of_a_set_is_the_mean_with_zero_for_a_missing_answer() -> None:
+    questions = [question("a", "two chairs"), question("b", "x")]
+    scores = score_answers(questions, {"a": ["chair"]}, sentences=False, lemmatize=singular)
+    assert scores.overall.f_value == pytest.approx((2 / 3) / 2)
+    assert [row.f_value for row in scores.rows] == [pytest.approx(2 / 3), 0]
+
+
+def test_without_nltk_or_its_data_the_reason_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "nltk.stem", None)
+    assert "nltk is not installed" in str(wordnet_lemmatizer())
+
+    class WordNetLemmatizer:
+        data = True
+
+        def lemmatize(self, word: str) -> str:
+            if not self.data:
+                raise LookupError("Resource wordnet not found")
+            return singular(word)
+
+    stem = ModuleType("nltk.stem")
+    stem.WordNetLemmatizer = WordNetLemmatizer  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "nltk", ModuleType("nltk"))
+    monkeypatch.setitem(sys.modules, "nltk.stem", stem)
+    found = wordnet_lemmatizer()
+    assert not isinstance(found, str)
+    assert found("chairs") == "chair"
+    WordNetLemmatizer.data = False
+    assert "no data of WordNet" in str(wordnet_lemmatizer())
+
+
+@pytest.mark.parametrize(
+    ("questions", "predictions", "message"),
+    [
+        ([question("a", "x"), question("a", "y")], {}, "id of another"),
+        ([question("a")], {}, "no right answers"),
+        ([question("a", "x")], {"b": ["x"]}, "b, which is no question"),
+        ([question("a", "x")], {"a": []}, "has 0 answers"),
+        ([question("a", "x")], {"a": ["x"] * 11}, "has 11 answers"),
+    ],
+)
+def test_predictions_must_belong_to_the_questions(
+    questions: Sequence[Question], predictions: dict[str, list[str]], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        score_answers(questions, predictions, sentences=False, lemmatize=NO_WORDNET)
+
+
+def test_no_questions_have_no_scores() -> None:
+    scores = score_answers([], {}, tools=NO_JAVA, lemmatize=NO_WORDNET)
+    assert np.isnan(scores.overall.em1)
+    assert scores.by_kind == scores.by_scene == {}
+
+
+@given(st.permutations(range(5)))
+def test_the_order_of_questions_decides_nothing(rows: list[int]) -> None:
+    answers = ["chair", "red chair", "two", "left", "none"]
+    questions = [question(str(row), answers[row], scene=f"s{row % 2}") for row in rows]
+    predictions = {str(row): [answers[(row * 2) % 5]] for row in range(5)}
+    scores = score_answers(questions, predictions, tools=NO_JAVA, lemmatize=singular)
+    other = score_answers(questions[::-1], predictions, tools=NO_JAVA, lemmatize=singular)
+    assert scores.overall == other.overall
+    assert scores.by_scene == other.by_scene
+    assert scores.sentences is not None
+    assert other.sentences is not None
+    assert scores.sentences.bleu == pytest.approx(other.sentences.bleu)
+
+
+def test_columns_on_other_tokens_say_so_in_their_heads() -> None:
+    here = score_sentences(["a chair"], [["a chair"]], tools=NO_JAVA)
+    assert list(here.columns())[:2] == ["BLEU-1 (Python tokens)", "BLEU-2 (Python tokens)"]
+    assert here.columns()["METEOR (Python tokens)"] is None
+    given_tokens = score_sentences(["a chair"], [["a chair"]], tokens="given", tools=NO_JAVA)
+    assert list(given_tokens.columns()) == ["BLEU-1", "BLEU-2", "BLEU-3", "BLEU-4", "METEOR", "ROUGE-L", "CIDEr"]
+    with pytest.raises(InputError, match="no Java here; or take tokens=python"):
+        score_sentences(["a"], [["a"]], tokens="ptb", tools=NO_JAVA)

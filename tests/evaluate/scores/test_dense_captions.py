@@ -1,0 +1,153 @@
+"""Scan2Cap's m@kIoU against cases worked out by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.expressions import Expression
+from gsencoder.evaluate.scores.dense_captions import (
+    CaptionedBox,
+    CaptionedObject,
+    NamedCaption,
+    box_ious,
+    captioned_objects,
+    score_box_captions,
+    score_named_captions,
+    wrapped_caption,
+)
+
+NO_JAVA = "no Java here"
+
+
+def true_object(number: int, low: float, *captions: str, scene: str = "s0", side: float = 1.0) -> CaptionedObject:
+    return CaptionedObject(
+        scene=scene,
+        object_id=number,
+        object_name="chair",
+        captions=captions or (f"sos object {number} eos",),
+        aabb=((low, 0.0, 0.0), (low + side, side, side)),
+    )
+
+
+def box(low: float, caption: str, scene: str = "s0", side: float = 1.0) -> CaptionedBox:
+    return CaptionedBox(scene=scene, caption=caption, aabb=((low, 0.0, 0.0), (low + side, side, side)))
+
+
+def test_the_caption_of_the_best_box_counts_where_it_overlaps_enough() -> None:
+    objects = [true_object(1, 0.0, "sos a red chair eos"), true_object(2, 10.0, "sos a table eos")]
+    # IoU of unit boxes shifted by d: (1 - d) / (1 + d): 0.1 -> 0.818, 0.2 -> 0.667, 0.5 -> 1/3.
+    boxes = [box(0.2, "wrong"), box(0.1, "a red chair"), box(10.5, "a table")]
+    scores = score_box_captions(objects, boxes, min_iou=0.5, tools=NO_JAVA)
+    assert scores.ious == pytest.approx([0.9 / 1.1, 0.5 / 1.5])
+    assert (scores.missing, scores.predictions) == (1, 3)
+    # Object 2 says "sos eos" against four words: c = 5 + 2, r = 5 + 4, all unigrams right: exp(1 - 9/7).
+    assert scores.sentences.bleu[0] == pytest.approx(np.exp(1 - 9 / 7))
+    assert scores.sentences.bleu_each[0] == pytest.approx([1.0] * 4)
+    # LCS of "sos eos": P = 1, R = 1/2.
+    assert scores.sentences.rouge_l_each == pytest.approx([1.0, 2.44 * 0.5 / (0.5 + 1.44)])
+    lower = score_box_captions(objects, boxes, min_iou=0.25, tools=NO_JAVA)
+    assert lower.missing == 0
+    assert lower.columns()["BLEU-4@0.25IoU"] == pytest.approx(1.0)
+    assert lower.sentences.absent == {"METEOR": NO_JAVA}
+
+
+def test_an_iou_of_k_is_not_enough() -> None:
+    # Half of a box in a whole one: 0.5 / (1 + 1e-8), and 1 in two with k = 0.
+    objects = [true_object(1, 0.0)]
+    half = CaptionedBox(scene="s0", caption="x", aabb=((0.0, 0.0, 0.0), (0.5, 1.0, 1.0)))
+    assert score_box_captions(objects, [half], min_iou=0.5, tools=NO_JAVA).missing == 1
+    assert score_box_captions(objects, [half], min_iou=0.499, tools=NO_JAVA).missing == 0
+    assert score_box_captions(objects, [box(5.0, "x")], min_iou=0.0, tools=NO_JAVA).missing == 1
+
+
+def test_of_equal_boxes_the_first_counts_and_one_box_may_serve_two_objects() -> None:
+    objects = [true_object(1, 0.0, "sos first eos"), true_object(2, 0.0, "sos first eos")]
+    scores = score_box_captions(objects, [box(0.0, "first"), box(0.0, "second")], tools=NO_JAVA)
+    assert scores.sentences.bleu[0] == pytest.approx(1.0)
+
+
+def test_boxes_of_another_scene_do_not_count() -> None:
+    objects = [true_object(1, 0.0), true_object(1, 0.0, scene="s1")]
+    scores = score_box_captions(objects, [box(0.0, "object 1", scene="s1")], tools=NO_JAVA)
+    assert scores.ious == pytest.approx([0, 1])
+    assert score_box_captions(objects, [], tools=NO_JAVA).missing == 2
+
+
+def test_boxes_without_volume_overlap_nothing() -> None:
+    zero, one = np.zeros(3), np.ones(3)
+    assert box_ious(zero, zero, zero, zero) == 0
+    assert box_ious(zero, one, zero, one) == pytest.approx(1.0, abs=1e-7)
+    assert box_ious(zero, one, one, 2 * one) == 0
+
+
+def test_expressions_of_one_object_become_its_references() -> None:
+    def expression(number: int, annotation: str, words: str) -> Expression:
+        return Expression(
+            scene="s0",
+            object_id=number,
+            object_name="chair",
+            annotation=annotation,
+            text=words,
+            tokens=tuple(words.split()),
+        )
+
+    expressions = [expression(3, "0", "a chair ."), expression(1, "0", "b"), expression(3, "1", " ".join("w" * 40))]
+    objects = captioned_objects(expressions)
+    assert [each.object_id for each in objects] == [3, 1]
+    assert objects[0].captions == ("sos a chair . eos", f"sos {' '.join('w' * 30)} eos")
+    assert len(captioned_objects(expressions, max_tokens=None)[0].captions[1].split()) == 42
+
+
+@pytest.mark.parametrize(
+    ("text", "wrapped"),
+    [
+        ("a chair. it is red.", "sos a chair . it is red . eos"),
+        ("sos a chair eos", "sos a chair eos"),
+        ("sos a chair", "sos sos a chair eos"),
+        ("", "sos  eos"),
+    ],
+)
+def test_captions_are_wrapped_once(text: str, wrapped: str) -> None:
+    assert wrapped_caption(text) == wrapped
+
+
+def test_captions_of_given_objects_need_no_boxes() -> None:
+    objects = [
+        CaptionedObject(scene="s0", object_id=4, object_name="x", captions=("sos a b eos",)),
+        true_object(5, 0.0),
+    ]
+    scores = score_named_captions(objects, [NamedCaption(scene="s0", object_id=4, caption="a b")], tools=NO_JAVA)
+    assert (scores.min_iou, scores.missing, scores.ious) == (None, 1, None)
+    assert scores.sentences.bleu_each[0] == pytest.approx([1.0] * 4)
+    assert "CIDEr" in scores.columns()
+    with pytest.raises(InputError, match="object 4 of s0 has no box"):
+        score_box_captions(objects, [], tools=NO_JAVA)
+
+
+def test_what_does_not_belong_together_is_an_error() -> None:
+    objects = [true_object(1, 0.0)]
+    caption = NamedCaption(scene="s0", object_id=1, caption="a")
+    with pytest.raises(InputError, match="object 1 of s0 has two captions"):
+        score_named_captions(objects, [caption, caption], tools=NO_JAVA)
+    with pytest.raises(InputError, match="object 9 of s0 is no object"):
+        score_named_captions(objects, [NamedCaption(scene="s0", object_id=9, caption="a")], tools=NO_JAVA)
+    with pytest.raises(InputError, match="s7, which is no scene"):
+        score_box_captions(objects, [box(0.0, "a", scene="s7")], tools=NO_JAVA)
+    with pytest.raises(InputError, match="1 objects have the scene and id"):
+        score_box_captions(objects * 2, [], tools=NO_JAVA)
+    with pytest.raises(InputError, match=r"in \[0, 1\], got nan"):
+        score_box_captions(objects, [], min_iou=float("nan"), tools=NO_JAVA)
+
+
+@given(st.permutations(range(6)))
+def test_the_order_of_boxes_and_objects_decides_nothing(rows: list[int]) -> None:
+    objects = [true_object(number, number * 0.7, scene=f"s{number % 2}") for number in range(6)]
+    boxes = [box(number * 0.7 + 0.01 * number, f"object {number}", scene=f"s{number % 2}") for number in range(6)]
+    first = score_box_captions(objects, boxes, tools=NO_JAVA)
+    other = score_box_captions([objects[row] for row in rows], [boxes[row] for row in rows[::-1]], tools=NO_JAVA)
+    assert first.ious is not None
+    assert other.ious == pytest.approx(first.ious[rows])
+    assert other.sentences.cider_each == pytest.approx(first.sentences.cider_each[rows])
+    assert other.sentences.bleu == pytest.approx(first.sentences.bleu)

@@ -1,0 +1,100 @@
+"""Java's tokenizer and METEOR: the protocol against stand-ins, and the real ones where they are installed."""
+
+import stat
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.evaluate.scores import java_metrics
+from gsencoder.evaluate.scores.java_metrics import JavaTools, find_java_tools, meteor, ptb_tokens
+from gsencoder.evaluate.scores.ngrams import python_tokens
+
+ECHO = """
+import sys
+if "-stdio" in sys.argv:
+    for line in sys.stdin:
+        kind, *fields = line.rstrip("\\n").split(" ||| ")
+        print(*(["0.25"] * (len(fields) + 1) if kind == "EVAL" else [str(len(fields))]), sep="\\n", flush=True)
+else:
+    print(open(sys.argv[-1], encoding="utf-8").read().lower())
+"""
+
+
+def stand_in(folder: Path, program: str) -> JavaTools:
+    """A program in Java's place."""
+    java = folder / "java"
+    java.write_text(f"#!{sys.executable}\n{program}")
+    java.chmod(java.stat().st_mode | stat.S_IXUSR)
+    return JavaTools(java=str(java), folder=folder)
+
+
+@pytest.fixture
+def real() -> JavaTools:
+    tools = find_java_tools()
+    if isinstance(tools, str):
+        pytest.skip(tools)
+    return tools
+
+
+def test_texts_keep_their_places_and_their_breaks_become_blanks(tmp_path: Path) -> None:
+    texts = ["A chair .", "", "two\nlines\r\nof\u2028it", " \n ", "É -lrb- ?"]
+    tokens = ptb_tokens(texts, stand_in(tmp_path, ECHO))
+    assert tokens == ["a chair", "", "two lines of it", "", "é -lrb-"]
+    assert ptb_tokens(["", " "], JavaTools(java="/nowhere", folder=tmp_path)) == ["", ""]
+
+
+def test_meteor_is_told_references_first_and_asked_for_all_samples_at_the_end(tmp_path: Path) -> None:
+    whole, each = meteor(["a", "b ||| c\nd"], [["a", "b"], ["c"]], stand_in(tmp_path, ECHO))
+    assert whole == 0.25
+    assert each.tolist() == [0.25, 0.25]
+    empty, none = meteor([], [], stand_in(tmp_path, ECHO))
+    assert np.isnan(empty)
+    assert len(none) == 0
+
+
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [("import sys; sys.exit('no heap')", "no heap"), ("print('nonsense')", "PTB tokenizer gave 1 lines for 2 texts")],
+)
+def test_what_java_says_when_it_fails_is_told(tmp_path: Path, program: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        ptb_tokens(["a", "b"], stand_in(tmp_path, program))
+
+
+def test_a_meteor_that_ends_early_or_gives_no_numbers_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="Java ended early.*no memory"):
+        meteor(["a"], [["a"]], stand_in(tmp_path, "import sys; sys.exit('no memory')"))
+    with pytest.raises(InputError, match="something else than scores"):
+        meteor(["a"], [["a"]], stand_in(tmp_path, "import sys\nfor line in sys.stdin: print('x\\nx\\nx', flush=True)"))
+    with pytest.raises(InputError, match="cannot be started"):
+        meteor(["a"], [["a"]], JavaTools(java="/nowhere/java", folder=tmp_path))
+
+
+def test_the_reason_for_going_without_java_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(java_metrics.shutil, "which", lambda name: None)
+    assert "no Java" in str(find_java_tools())
+    monkeypatch.setattr(java_metrics.shutil, "which", lambda name: "/usr/bin/java")
+    monkeypatch.setattr(java_metrics, "find_spec", lambda name: None)
+    assert "pycocoevalcap is not installed" in str(find_java_tools())
+    monkeypatch.setattr(java_metrics, "PACKAGE", "json")
+    monkeypatch.undo()
+    monkeypatch.setattr(java_metrics.shutil, "which", lambda name: "/usr/bin/java")
+    monkeypatch.setattr(java_metrics, "PACKAGE", "json")
+    assert "lacks tokenizer/stanford-corenlp" in str(find_java_tools())
+
+
+@pytest.mark.slow
+def test_the_treebank_tokenizer_agrees_with_ours_on_plain_texts(real: JavaTools) -> None:
+    texts = ["The chair's (brown) leg isn't here.", "twenty-three 3.5 and 1/2", "", "café, o'clock?"]
+    assert ptb_tokens(texts, real) == [python_tokens(text) for text in texts]
+
+
+@pytest.mark.slow
+def test_meteor_of_equal_sentences_is_near_one_and_of_none_zero(real: JavaTools) -> None:
+    whole, each = meteor(["a brown chair near the door", ""], [["a brown chair near the door"], ["a table"]], real)
+    assert each[0] == pytest.approx(1.0)
+    assert each[1] == 0
+    assert 0 < whole < 1
