@@ -179,7 +179,7 @@ class _Handler(BaseHTTPRequestHandler):
         body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         try:
             answer = self.server.answerer.reply(body)  # type: ignore[attr-defined]
-        except (InputError, KeyError, TypeError, AttributeError) as error:
+        except (InputError, LookupError, TypeError, AttributeError) as error:
             self._send(400, "application/json", json.dumps({"error": {"message": str(error)}}).encode())
             return
         head = {"id": "scripted", "created": 0, "model": MODEL}

@@ -12,12 +12,13 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
+from gsencoder.data.truth.expressions import write_scanrefer
 from gsencoder.data.truth.made_expressions import make_expressions
 from gsencoder.data.truth.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
 from gsencoder.data.truth.made_situations import make_situations
 from gsencoder.data.truth.questions import write_scanqa
 from gsencoder.data.truth.seen_objects import SeenScene, see_objects
-from gsencoder.data.truth.write_sets import write_scanrefer, write_sqa3d
+from gsencoder.data.truth.write_sqa3d import write_sqa3d
 
 QUESTIONS, EXPRESSIONS, SITUATED = "questions.json", "expressions.json", "situated_questions.json"
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gsencoder.data.truth.write_sets import box_corners
+from gsencoder.data.truth.entries import box_corners
 from gsencoder.infer.ask.prompts import THOUGHT
 from gsencoder.infer.ask.question_sets import Benchmark, SetQuestion
 
@@ -14,10 +14,11 @@ CLASSES = 18
 def predictions(benchmark: Benchmark, answered: Sequence[tuple[SetQuestion, Mapping[str, Any]]]) -> Any:
     """What a benchmark takes.
 
-    - ScanQA and SQA3D: a list of {scene_id, question_id, answer_top10: [the answer]} and, for ScanQA, the box of the
-      best target as bbox, where there is one.
+    - ScanQA: a list of {scene_id, question_id, answer_top10: [the answer], bbox}, the box being that of the best target
+      where there is one.
+    - SQA3D: a list of {scene_id, question_id, situation, question, answer}.
     - ScanRefer: a list of {scene_id, object_id, ann_id, bbox}; an answer that names no mark gives no entry.
-    - Scan2Cap: for each scene a list of {caption, box, obj_prob, sem_prob}.
+    - Scan2Cap: for each scene a list of {caption, box, obj_prob, sem_prob}, captions between "sos" and "eos".
 
     Boxes are eight corners. Of an answer the case and a full stop at its end are left out (`short_answer`).
 
@@ -29,28 +30,38 @@ def predictions(benchmark: Benchmark, answered: Sequence[tuple[SetQuestion, Mapp
         captions: dict[str, list[dict[str, Any]]] = {}
         for question, row in answered:
             probabilities = {"obj_prob": [0.0, 1.0], "sem_prob": [1 / CLASSES] * CLASSES} | dict(question.keys)
-            entry = {"caption": said(row["answer"]), "box": target_corners(row["targets"][0]), **probabilities}
+            entry = {
+                "caption": f"sos {said(row['answer']).lower()} eos",
+                "box": target_corners(row["targets"][0]),
+                **probabilities,
+            }
             captions.setdefault(question.scene, []).append(entry)
         return captions
     if benchmark == "scanrefer":
         return [{**question.keys, "bbox": target_corners(row["box"])} for question, row in answered if row.get("box")]
+    if benchmark == "sqa3d":
+        return [{**question.keys, "answer": short_answer(row["answer"])} for question, row in answered]
     rows = []
     for question, row in answered:
-        entry = {**question.keys, "answer_top10": [short_answer(row["answer"])]}
-        if benchmark == "scanqa" and row["targets"]:
-            entry["bbox"] = target_corners(row["targets"][0])
-        rows.append(entry)
+        box = {"bbox": target_corners(row["targets"][0])} if row["targets"] else {}
+        rows.append({**question.keys, "answer_top10": [short_answer(row["answer"])], **box})
     return rows
 
 
 def target_corners(target: Mapping[str, Any]) -> list[list[float]]:
     """The eight corners of a target's axis-aligned box."""
-    return box_corners(target["aabb_min"], target["aabb_max"])
+    low, high = ([float(value) for value in target[name]] for name in ("aabb_min", "aabb_max"))
+    return box_corners((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
 
 def said(answer: str) -> str:
     """An answer without what a model thought before it, on one line."""
     return " ".join(THOUGHT.sub("", answer).split())
+
+
+def wrapped(answer: str) -> str:
+    """A caption as Scan2Cap's scripts compare it: in lower case, full stops as words, between "sos" and "eos"."""
+    return f"sos {said(answer).lower()} eos".replace(". ", " . ")
 
 
 def short_answer(answer: str) -> str:

@@ -1,41 +1,12 @@
-"""Expressions and situated questions, written as ScanRefer's and SQA3D's files have them."""
+"""Situated questions, written as SQA3D's files have them."""
 
 from collections.abc import Sequence
-from itertools import product
 from pathlib import Path
-from typing import Any
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.truth.entries import Corner
-from gsencoder.data.truth.expressions import Expression
 from gsencoder.data.truth.questions import SITUATED, Question
-
-
-def box_corners(lower: Sequence[float], upper: Sequence[float]) -> list[list[float]]:
-    """The eight corners of an axis-aligned box, as the files have boxes; x changes slowest."""
-    return [[float(x), float(y), float(z)] for x, y, z in product(*zip(lower, upper, strict=True))]
-
-
-def write_scanrefer(path: str | Path, expressions: Sequence[Expression]) -> None:
-    """Writes expressions as ScanRefer's files have them: ids as texts, boxes as `bbox` where there are any.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    write_json(path, [_scanrefer_row(each) for each in expressions])
-
-
-def _scanrefer_row(expression: Expression) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "scene_id": expression.scene,
-        "object_id": str(expression.object_id),
-        "object_name": expression.object_name,
-        "ann_id": expression.annotation,
-        "description": expression.text,
-        "token": list(expression.tokens),
-    }
-    return row | ({"bbox": box_corners(*expression.aabb)} if expression.aabb is not None else {})
 
 
 def write_sqa3d(path: str | Path, questions: Sequence[Question]) -> Path:
