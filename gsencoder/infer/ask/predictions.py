@@ -31,7 +31,7 @@ def predictions(benchmark: Benchmark, answered: Sequence[tuple[SetQuestion, Mapp
         for question, row in answered:
             probabilities = {"obj_prob": [0.0, 1.0], "sem_prob": [1 / CLASSES] * CLASSES} | dict(question.keys)
             entry = {
-                "caption": f"sos {said(row['answer']).lower()} eos",
+                "caption": wrapped(row["answer"]),
                 "box": target_corners(row["targets"][0]),
                 **probabilities,
             }
