@@ -109,7 +109,8 @@ def balanced(units: Mapping[str, Mapping[Kind, Sequence[Unit]]], equal: bool) ->
 
     Args:
         units: of each scene.
-        equal: as many of each kind as of the rarest that there is at all; they are taken from all scenes in turn.
+        equal: as many of each kind as of the rarest that there is at all, or one more where a pair is not to be torn
+            apart; they are taken from all scenes in turn.
     """
     by_kind: dict[Kind, list[tuple[int, str, Unit]]] = {
         kind: sorted(
@@ -122,7 +123,7 @@ def balanced(units: Mapping[str, Mapping[Kind, Sequence[Unit]]], equal: bool) ->
     most = min(counts, default=0)
     chosen: list[Question] = []
     for kind, ranked in by_kind.items():
-        kept = ranked[: most // len(ranked[0][2])] if equal and ranked else ranked
+        kept = ranked[: -(-most // len(ranked[0][2]))] if equal and ranked else ranked
         numbers: dict[str, int] = {}
         for _, name, unit in sorted(kept, key=lambda one: (one[1], one[0])):
             for question in unit:
