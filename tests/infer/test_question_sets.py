@@ -82,14 +82,16 @@ def test_descriptions_of_scanrefer_are_grounded(tmp_path: Path) -> None:
     asked = read(tmp_path, SCANREFER)
     assert asked.benchmark == "scanrefer"
     assert asked.questions[1].asked.question == Question(text="the cabinet 1", task="ground")
-    box = {"aabb_min": LOW, "aabb_max": HIGH}
-    assert answers(asked, answer="1", mark=1, box=box)[1] == {
-        "scene_id": "a",
-        "object_id": "8",
-        "ann_id": "1",
-        "bbox": box_corners(LOW, HIGH),
-    }
-    assert answers(asked, answer="0", mark=0, box=None) == []
+    other = {"aabb_min": (5, 5, 5), "aabb_max": (6, 6, 6)}
+    targets = [other, {"aabb_min": LOW, "aabb_max": HIGH}]
+    keys = {"scene_id": "a", "object_id": "8", "ann_id": "1"}
+    meant, missed = box_corners(LOW, HIGH), box_corners((5.0, 5.0, 5.0), (6.0, 6.0, 6.0))
+    assert answers(asked, answer="2", mark=2, targets=targets)[1] == keys | {"bbox": meant, "bboxes": [meant, missed]}
+    nothing = keys | {"bbox": None, "bboxes": []}
+    assert answers(asked, answer="0", mark=0, targets=targets)[1] == nothing
+    assert answers(asked, answer="?", mark=None, targets=targets)[1] == nothing
+    assert predictions("scanrefer", [], asked.questions)[1] == nothing
+    assert predictions("scanqa", [], asked.questions) == []
 
 
 def test_objects_of_scanrefer_are_captioned_once_each_in_the_boxes_of_the_file(tmp_path: Path) -> None:

@@ -208,13 +208,14 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
     """Asks the questions of a benchmark about each scene that there are features of, and writes predictions.
 
     The features of one scene are in memory at a time. Questions that have no answer are counted and named, and so are
-    scenes without features; predictions have no entry for them.
+    scenes without features.
     """
     out = config.out or Path("outputs") / asked.benchmark
     wanted = asked.scenes()
     folders = scene_folders(config.paths, wanted)
     target, clock, screen = Path(os.path.realpath(out)), Clock(), console(config.quiet)
     answered: list[tuple[SetQuestion, dict[str, Any]]] = []
+    silent: list[SetQuestion] = []
     unanswered: dict[str, str] = {}
     counts: dict[str, int] = {}
     with (
@@ -248,6 +249,7 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
             write_answers(folder / name, state, rows)
             by_id = {row["id"]: row for row in rows}
             answered += [(each, by_id[each.asked.id]) for each in questions if each.asked.id in by_id]
+            silent += [each for each in questions if each.asked.id not in by_id]
             counts[name] = len(questions)
             screen.print(f"{name}: {len(rows)} of {len(questions)} questions")
         summary.add_seconds(clock.seconds)
@@ -267,14 +269,14 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
             other_scenes=others,
         )
         if server is not None:
-            entries = predictions(asked.benchmark, answered)
+            entries = predictions(asked.benchmark, answered, silent)
             write_json(folder / PREDICTIONS, entries)
             written = sum(map(len, entries.values())) if isinstance(entries, dict) else len(entries)
             summary.results.update(predictions=PREDICTIONS, predicted=written)
     if unanswered:
         first = next(iter(unanswered.values()))
         warnings.warn(
-            f"{len(unanswered)} of {sum(counts.values())} questions have no answer and no prediction: {first}",
+            f"{len(unanswered)} of {sum(counts.values())} questions have no answer: {first}",
             SceneWarning,
             stacklevel=2,
         )

@@ -11,13 +11,18 @@ CLASSES = 18
 """Classes of ScanNet's benchmark, over which `sem_prob` of Scan2Cap's predictions is even: `ask` names none."""
 
 
-def predictions(benchmark: Benchmark, answered: Sequence[tuple[SetQuestion, Mapping[str, Any]]]) -> Any:
+def predictions(
+    benchmark: Benchmark,
+    answered: Sequence[tuple[SetQuestion, Mapping[str, Any]]],
+    unanswered: Sequence[SetQuestion] = (),
+) -> Any:
     """What a benchmark takes.
 
     - ScanQA: a list of {scene_id, question_id, answer_top10: [the answer], bbox}, the box being that of the best target
       where there is one.
     - SQA3D: a list of {scene_id, question_id, situation, question, answer}.
-    - ScanRefer: a list of {scene_id, object_id, ann_id, bbox}; an answer that names no mark gives no entry.
+    - ScanRefer: a list of {scene_id, object_id, ann_id, bbox, bboxes}: the box of the mark that the answer names, and
+      the same before those of the other marks; null and none where it names no mark, and for what is unanswered.
     - Scan2Cap: for each scene a list of {caption, box, obj_prob, sem_prob}, captions between "sos" and "eos".
 
     Boxes are eight corners. Of an answer the case and a full stop at its end are left out (`short_answer`).
@@ -25,6 +30,7 @@ def predictions(benchmark: Benchmark, answered: Sequence[tuple[SetQuestion, Mapp
     Args:
         benchmark: whose form is wanted.
         answered: questions with the rows of `gsencoder.infer.ask.batch.ask_questions`.
+        unanswered: questions without one; besides ScanRefer's they have no entry.
     """
     if benchmark == "scan2cap":
         captions: dict[str, list[dict[str, Any]]] = {}
@@ -38,7 +44,8 @@ def predictions(benchmark: Benchmark, answered: Sequence[tuple[SetQuestion, Mapp
             captions.setdefault(question.scene, []).append(entry)
         return captions
     if benchmark == "scanrefer":
-        return [{**question.keys, "bbox": target_corners(row["box"])} for question, row in answered if row.get("box")]
+        missing: list[tuple[SetQuestion, Mapping[str, Any]]] = [(question, {}) for question in unanswered]
+        return [{**question.keys, **_referred(row)} for question, row in (*answered, *missing)]
     if benchmark == "sqa3d":
         return [{**question.keys, "answer": short_answer(row["answer"])} for question, row in answered]
     rows = []
@@ -46,6 +53,15 @@ def predictions(benchmark: Benchmark, answered: Sequence[tuple[SetQuestion, Mapp
         box = {"bbox": target_corners(row["targets"][0])} if row["targets"] else {}
         rows.append({**question.keys, "answer_top10": [short_answer(row["answer"])], **box})
     return rows
+
+
+def _referred(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The box that an answer means, and after it the others that it might have meant."""
+    if not row.get("mark"):
+        return {"bbox": None, "bboxes": []}
+    corners = [target_corners(target) for target in row["targets"]]
+    meant = corners.pop(row["mark"] - 1)
+    return {"bbox": meant, "bboxes": [meant, *corners]}
 
 
 def target_corners(target: Mapping[str, Any]) -> list[list[float]]:
