@@ -32,11 +32,13 @@ class StoredPrompt:
         text: the words.
         pictures: names of the files of its pictures, in their order.
         tokens: name of the file of rendered features, one set of tokens a picture; empty = none.
+        space: of these features, for people and to tell one from another.
     """
 
     text: str
     pictures: tuple[str, ...]
     tokens: str = ""
+    space: str = ""
 
 
 class PromptStore:
@@ -71,14 +73,21 @@ class PromptStore:
                 raise InputError(f"{path}: line {number} is no prompt; remove the folder to prepare it anew") from error
 
     def _take(self, row: Mapping[str, Any]) -> None:
-        prompt = StoredPrompt(text=row["text"], pictures=tuple(row["pictures"]), tokens=row["tokens"])
+        prompt = StoredPrompt(
+            text=row["text"], pictures=tuple(row["pictures"]), tokens=row["tokens"], space=row["space"]
+        )
         names = (*prompt.pictures, *([prompt.tokens] if prompt.tokens else []))
         if not isinstance(prompt.text, str) or not prompt.pictures or not all(_is_file_name(name) for name in names):
             raise ValueError(row)
         self.prompts[row["key"]] = prompt
 
     def add(
-        self, key: str, text: str, pictures: Sequence[bytes], tokens: Float16[np.ndarray, "V P D"] | None = None
+        self,
+        key: str,
+        text: str,
+        pictures: Sequence[bytes],
+        tokens: Float16[np.ndarray, "V P D"] | None = None,
+        space: str = "",
     ) -> StoredPrompt:
         """Writes a prompt.
 
@@ -87,12 +96,14 @@ class PromptStore:
             text: the words.
             pictures: encoded as JPEG or PNG.
             tokens: rendered features of the pictures on the grid of a vision tower.
+            space: of these features.
 
         Raises:
             InputError: the disk is full.
         """
         names = tuple(self._write_picture(each) for each in pictures)
-        prompt = StoredPrompt(text=text, pictures=names, tokens="" if tokens is None else self._write_tokens(tokens))
+        file = "" if tokens is None else self._write_tokens(tokens)
+        prompt = StoredPrompt(text=text, pictures=names, tokens=file, space=space)
         line = json.dumps({"key": key, **asdict(prompt)}, ensure_ascii=False).encode() + b"\n"
         path = self.folder / PROMPTS_FILE
         try:

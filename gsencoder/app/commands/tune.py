@@ -20,10 +20,9 @@ from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE, read_log
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.data.prompt_store import PromptStore
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.ask.ask import AskConfig
 from gsencoder.infer.ask.server import VlmConfig
-from gsencoder.infer.localize.localize import LocalizeConfig, select_features
+from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.train.distributed import fail_together, join_processes
@@ -159,17 +158,12 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
                 state.take(anew=not config.resume)
         store = PromptStore(prepared)
         pairs = tuning_pairs(questions, features, config.photos, recipe, store)
-        channels = None
-        if config.tokens:
-            first = load_features(features / questions[0].scene)
-            channels = select_features(first, config.tokens)[1].space.channels
         with summary.step("train"):
             done = tune(
                 pairs,
                 store,
                 model,
                 config,
-                channels=channels,
                 project=config.project,
                 work=state.path,
                 process=process,

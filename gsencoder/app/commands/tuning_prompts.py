@@ -164,17 +164,15 @@ def prepare_prompts(
     try:
         store = PromptStore(folder)
         keys = prompt_keys(questions, features, photos, recipe)
-        asker: Asker | None = None
-        given: GaussianFeatures | None = None
+        opened: tuple[str, Asker, GaussianFeatures | None] | None = None
         said: list[str] = []
         for each, key in track(list(zip(questions, keys, strict=True)), "preparing prompts"):
             if key in store.prompts:
                 continue
             with about(f"question {each.id}"):
-                if asker is None or asker.scene.name != each.scene or current != each.scene:
-                    asker, given = _asker(folders[each.scene], str(shown.get(each.scene, "")), recipe)
-                    current = each.scene
-                said += _store(store, key, asker, each, given, recipe)
+                if opened is None or opened[0] != each.scene:
+                    opened = (each.scene, *_asker(folders[each.scene], str(shown.get(each.scene, "")), recipe))
+                said += _store(store, key, opened[1], each, opened[2], recipe)
         if said:
             warnings.warn(f"{len(said)} of {len(questions)} questions: {said[0]}", SceneWarning, stacklevel=2)
     finally:

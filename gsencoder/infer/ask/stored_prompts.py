@@ -29,7 +29,8 @@ def store_prompt(
         key: states all that the prompt is made from.
         asker: of the scene.
         question: about it.
-        features: of the scene's Gaussians, that are rendered in each view as tokens of a vision tower; None = no tokens.
+        features: of the scene's Gaussians; they are rendered in each view as tokens of a vision tower; None = no
+            tokens.
         grid: rows and columns of the tower's patches.
         fit: how the tower's preprocessing makes pictures square.
 
@@ -42,11 +43,11 @@ def store_prompt(
     prompt = asker.prompt(question)
     side, kind = asker.vlm.image_side, asker.vlm.image_format
     pictures = [encoded_picture(each, side=side, kind=kind) for each in prompt.pictures]
-    tokens = None
-    if features is not None:
-        assert asker.scene.gaussians is not None
-        tokens = view_tokens(asker.scene.gaussians, prompt.views, features, grid, fit)
-    return store.add(key, prompt.text, pictures, tokens)
+    if features is None:
+        return store.add(key, prompt.text, pictures)
+    assert asker.scene.gaussians is not None
+    tokens = view_tokens(asker.scene.gaussians, prompt.views, features, grid, fit)
+    return store.add(key, prompt.text, pictures, tokens, features.space.describe())
 
 
 def view_tokens(

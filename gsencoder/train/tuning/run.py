@@ -90,7 +90,6 @@ def tune(
     model: Path,
     config: TuneConfig = TuneConfig(),
     *,
-    channels: int | None = None,
     project: bool | None = None,
     work: Path,
     process: ProcessRank = ProcessRank(),
@@ -106,8 +105,7 @@ def tune(
         store: of the prompts.
         model: folder of a vision-language model of transformers.
         config: adapters and loop.
-        channels: of the rendered features that replace the output of the model's tower; None = prompts have none.
-        project: whether a linear layer that is trained, too, leads from the features to the tower's channels; None =
+        project: for prompts with rendered features, which replace the output of the model's tower: whether a linear layer that is trained, too, leads from the features to the tower's channels; None =
             where their numbers differ.
         work: existing folder for the checkpoint and the log.
         process: rank of this process.
@@ -120,17 +118,10 @@ def tune(
             is not finite.
     """
     check_pairs(pairs)
-    stated, processor, layout = open_processor(model, with_tokens=channels is not None)
-    if any(bool(pair.prompt.tokens) != (layout is not None) for pair in pairs):
-        raise InputError(f"tune: expected prompts {'with' if layout else 'without'} tokens of rendered features")
-    if layout is not None and project is not False and (project or channels != layout.channels):
-        projected = channels
-    else:
-        projected = None
-        if layout is not None and channels != layout.channels:
-            raise InputError(
-                f"tokens: the features have {channels} channels and the tower {layout.channels}; give project=true"
-            )
+    first = pairs[0].prompt.tokens
+    stated, processor, layout = open_processor(model, with_tokens=bool(first))
+    channels = store.tokens(first).shape[2] if first else None
+    projected = None if layout is None or channels is None else _projected(channels, layout, project)
     digest = model_digest(model)
     check_agreement("the weights of the model", digest)
     seed = config.train.seed
@@ -167,11 +158,23 @@ def tune(
     return Tuned(network=network, processor=processor, layout=layout, state=state)
 
 
+def _projected(channels: int, layout: TowerLayout, project: bool | None) -> int | None:
+    """The channels of features that are projected; None where they are those of the tower."""
+    if project or (project is None and channels != layout.channels):
+        return channels
+    if channels != layout.channels:
+        raise InputError(
+            f"project=false: the features have {channels} channels and the tower has {layout.channels}; leave project= "
+            "out"
+        )
+    return None
+
+
 def check_pairs(pairs: Sequence[TuningPair]) -> None:
     """Checks that there is something to learn.
 
     Raises:
-        InputError: no pairs, or answers that are missing or empty.
+        InputError: no pairs, answers that are missing or empty, or tokens of several feature spaces.
     """
     if not pairs:
         raise InputError("tune: there are no questions to train on")
@@ -181,6 +184,11 @@ def check_pairs(pairs: Sequence[TuningPair]) -> None:
                 f"{pair.name}: {'an answer is empty' if pair.answers else 'there is no answer'}; expected answers of "
                 "one character or more; mend or remove the question"
             )
+    spaces = sorted({pair.prompt.space for pair in pairs})
+    if len(spaces) > 1:
+        raise InputError(
+            f"tokens: scenes have features of {len(spaces)} spaces ({spaces[0]}; {spaces[1]}); expected those of one"
+        )
 
 
 def pairs_digest(pairs: Sequence[TuningPair]) -> str:
@@ -229,10 +237,8 @@ def open_tuned(folder: Path, model: Path, *, with_tokens: bool = False) -> Tuned
     if layout is not None and path.is_file():
         with open_archive(path) as file:
             weight = file.array("weight", "float32", (layout.channels, "D"))
-            projection = {
-                "weight": torch.from_numpy(weight),
-                "bias": torch.from_numpy(file.array("bias", "float32", (layout.channels,))),
-            }
+            bias = file.array("bias", "float32", (layout.channels,))
+            projection = {"weight": torch.from_numpy(weight), "bias": torch.from_numpy(bias)}
     network = TunedVlm(adapted, layout, None if projection is None else projection["weight"].shape[1])
     if network.projection is not None and projection is not None:
         network.projection.load_state_dict(projection)
