@@ -73,11 +73,11 @@ class PromptStore:
                 raise InputError(f"{path}: line {number} is no prompt; remove the folder to prepare it anew") from error
 
     def _take(self, row: Mapping[str, Any]) -> None:
-        prompt = StoredPrompt(
-            text=row["text"], pictures=tuple(row["pictures"]), tokens=row["tokens"], space=row["space"]
-        )
+        text, tokens, space = row["text"], row["tokens"], row["space"]
+        prompt = StoredPrompt(text=text, pictures=tuple(row["pictures"]), tokens=tokens, space=space)
         names = (*prompt.pictures, *([prompt.tokens] if prompt.tokens else []))
-        if not isinstance(prompt.text, str) or not prompt.pictures or not all(_is_file_name(name) for name in names):
+        texts = isinstance(text, str) and isinstance(space, str) and isinstance(tokens, str)
+        if not texts or not prompt.pictures or not all(_is_file_name(name) for name in names):
             raise ValueError(row)
         self.prompts[row["key"]] = prompt
 

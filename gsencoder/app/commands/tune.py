@@ -198,8 +198,8 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
     screen = console(config.quiet)
     trained = summary.results["trained"]
     screen.print(
-        f"{out}: {done.state.step} steps on {len(questions)} questions, {trained:,} parameters of adapters; the loss of "
-        f"an answer's token went from {losses[0]:.3f} to {losses[-1]:.3f}"
+        f"{out}: {done.state.step} steps on {len(questions)} questions, {trained:,} parameters of adapters; the loss "
+        f"of an answer's token went from {losses[0]:.3f} to {losses[-1]:.3f}"
     )
     if not config.tokens:
         screen.print(f"{out}: transformers serve {out / SERVED_FOLDER}")

@@ -13,6 +13,7 @@ import torch
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.json_values import plain
+from gsencoder.core.pretrained import load_pretrained
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.prompt_store import PromptStore
 from gsencoder.train.checkpoint import TrainingState
@@ -21,7 +22,16 @@ from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig
 from gsencoder.train.tuning.network import AnswerObjective, TunedVlm
 from gsencoder.train.tuning.samples import PairSamples, TuningPair, join_pairs
 from gsencoder.train.tuning.towers import SPLIT, TowerLayout, tower_layout
-from gsencoder.train.tuning.vlm import AdapterConfig, load_adapted, load_processor, model_digest, save_adapters
+from gsencoder.train.tuning.vlm import (
+    WHAT,
+    AdapterConfig,
+    check_peft,
+    load_adapted,
+    load_processor,
+    model_digest,
+    quiet_peft,
+    save_adapters,
+)
 
 PROJECTION_FILE = "projection.safetensors"
 
@@ -105,8 +115,9 @@ def tune(
         store: of the prompts.
         model: folder of a vision-language model of transformers.
         config: adapters and loop.
-        project: for prompts with rendered features, which replace the output of the model's tower: whether a linear layer that is trained, too, leads from the features to the tower's channels; None =
-            where their numbers differ.
+        project: for prompts with rendered features, which replace the output of the model's tower: whether a linear
+            layer that is trained, too, leads from the features to the tower's channels; None = where their numbers
+            differ.
         work: existing folder for the checkpoint and the log.
         process: rank of this process.
         device: of this process.
@@ -127,7 +138,7 @@ def tune(
     seed = config.train.seed
     adapted = load_adapted(model, config.lora, base=config.base, seed=seed)
     if config.recompute:
-        adapted.get_base_model().gradient_checkpointing_enable({"use_reentrant": False})
+        recompute_activations(adapted.get_base_model())
     network = TunedVlm(adapted, layout, projected, seed=seed)
     tokenizer = processor.tokenizer
     longest = getattr(stated.get_text_config(), "max_position_embeddings", None)
@@ -156,6 +167,13 @@ def tune(
     state = trainer.run(track)
     network.eval()
     return Tuned(network=network, processor=processor, layout=layout, state=state)
+
+
+def recompute_activations(model: Any) -> None:
+    """Keeps the inputs of blocks alone for the backward pass, and computes what is in the blocks once more."""
+    # The name before version 5.20 of transformers.
+    enable = getattr(model, "activation_checkpointing_enable", None) or model.gradient_checkpointing_enable
+    enable({"use_reentrant": False})
 
 
 def _projected(channels: int, layout: TowerLayout, project: bool | None) -> int | None:
@@ -220,9 +238,6 @@ def open_tuned(folder: Path, model: Path, *, with_tokens: bool = False) -> Tuned
     Raises:
         InputError: peft is missing, or the files cannot be used.
     """
-    from gsencoder.core.pretrained import load_pretrained
-    from gsencoder.train.tuning.vlm import WHAT, check_peft
-
     check_peft()
     import peft
     from transformers import AutoModelForImageTextToText
@@ -231,7 +246,8 @@ def open_tuned(folder: Path, model: Path, *, with_tokens: bool = False) -> Tuned
     if not (folder / "adapter_model.safetensors").is_file():
         raise InputError(f"{WHAT}: {folder} has no adapter_model.safetensors; expected what tune wrote")
     base = load_pretrained(AutoModelForImageTextToText, model.resolve(), WHAT)
-    adapted = peft.PeftModel.from_pretrained(base, str(folder), use_safetensors=True)
+    with quiet_peft():
+        adapted = peft.PeftModel.from_pretrained(base, str(folder), use_safetensors=True)
     path = folder / PROJECTION_FILE
     projection = None
     if layout is not None and path.is_file():

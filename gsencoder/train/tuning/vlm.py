@@ -2,6 +2,9 @@
 
 import os
 import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -50,6 +53,14 @@ def check_peft() -> None:
         import peft  # noqa: F401
     except ImportError as error:
         raise InputError(f"{WHAT}: needs the package peft (pip install 'gsencoder[tune]')") from error
+
+
+@contextmanager
+def quiet_peft() -> Iterator[None]:
+    """Without bars, tables, and the warning that peft asks models of transformers by an old name."""
+    with quiet_transformers(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
+        yield
 
 
 def load_processor(folder: Path) -> tuple[Any, Any]:
@@ -118,7 +129,7 @@ def load_adapted(
         lora_dropout=config.dropout,
         target_modules=_layers(model, config.targets),
     )
-    with quiet_transformers():
+    with quiet_peft():
         return peft.get_peft_model(model, lora)
 
 
@@ -152,7 +163,7 @@ def save_adapters(folder: Path, adapted: Any, processor: Any) -> None:
         adapted: of `load_adapted`.
         processor: of the same model.
     """
-    with quiet_transformers():
+    with quiet_peft():
         adapted.save_pretrained(str(folder))
         processor.save_pretrained(str(folder))
     # A card with blanks to fill in, which peft writes.
