@@ -47,6 +47,7 @@ class TuneCommandConfig(TuneConfig, CommonConfig):
         metadata={
             "help": "folder of a vision-language model for transformers; also looked for in GSENCODER_MODELS",
             "required": True,
+            "like_group": True,
         },
     )
     features: str = field(

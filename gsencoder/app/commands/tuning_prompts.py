@@ -222,7 +222,10 @@ def _text(question: TruthQuestion) -> str:
 def _asker(folder: Path, photos: str, recipe: PromptRecipe) -> tuple[Asker, GaussianFeatures | None]:
     """What asks about a scene, and the features that are rendered as tokens."""
     scene = shown_scene(folder, photos, recipe.data)
-    given = select_features(scene, recipe.tokens)[1] if recipe.tokens else None
+    given = None
+    if recipe.tokens:
+        with about(f"tokens={recipe.tokens}"):
+            given = select_features(scene, recipe.tokens)[1]
     words: Words | None
     if recipe.head:
         scene, words = asked_scene(

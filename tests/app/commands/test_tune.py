@@ -66,15 +66,10 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def words(given: Path, out: Path, *more: str, dataset: Path | None = None) -> list[str]:
-    return [
-        "tune",
-        str(dataset or given / "ScanQA_v1.0_train.json"),
-        f"model={given / 'model'}",
-        f"features={given / 'features'}",
-        f"out={out}",
-        *QUICK,
-        *more,
-    ]
+    usual = [f"model={given / 'model'}", f"features={given / 'features'}", f"out={out}", *QUICK]
+    changed = {word.partition("=")[0] for word in more}
+    kept = [word for word in usual if word.partition("=")[0] not in changed]
+    return ["tune", str(dataset or given / "ScanQA_v1.0_train.json"), *kept, *more]
 
 
 def test_adapters_a_log_and_figures_are_written_and_prompts_are_kept(given: Path, tmp_path: Path) -> None:
@@ -86,7 +81,7 @@ def test_adapters_a_log_and_figures_are_written_and_prompts_are_kept(given: Path
     results = results_of(out)
     assert (results["questions"], results["scenes"], results["steps"]) == (3, 2, 3)
     assert 0 < results["trained"] < results["parameters"]
-    assert [float(row["loss"]) for row in read_log(out / "log.csv")][0] == results["first_loss"]
+    assert float(read_log(out / "log.csv")[0]["loss"]) == results["first_loss"]
     assert json.loads((out / "adapter_config.json").read_text())["r"] == 4
     assert not (tmp_path / "out.training").exists()
     assert len(PromptStore(tmp_path / "out.prepared").prompts) == 3
@@ -175,7 +170,6 @@ def test_a_folder_of_files_is_a_dataset_by_its_split(given: Path, tmp_path: Path
         scanqa(tmp_path / f"ScanQA_v1.0_{split}.json", *QUESTIONS[: 1 if split == "val" else 3])
     assert cli.main(words(given, tmp_path / "out", "prepare_only=true", "split=val", dataset=tmp_path)) == 0
     assert len(PromptStore(tmp_path / "out.prepared").prompts) == 1
-    assert cli.main(words(given, tmp_path / "few", "prepare_only=true", "scenes=room_[b]", dataset=tmp_path)) == 2
     assert cli.main(words(given, tmp_path / "few", "prepare_only=true", "scenes=*_b", dataset=tmp_path)) == 0
     assert len(PromptStore(tmp_path / "few.prepared").prompts) == 1
 
@@ -199,7 +193,8 @@ def test_situations_of_sqa3d_stand_before_their_questions(given: Path, tmp_path:
 
 def test_bad_input_is_refused_in_a_line(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refused(*more: str, dataset: Path | None = None) -> str:
-        return refusal(capsys, *words(given, tmp_path / "out", *more, dataset=dataset))
+        asked = words(given, tmp_path / "out", *more, dataset=dataset)
+        return refusal(capsys, *(word for word in asked if word != "quiet=true"))
 
     elsewhere = scanqa(tmp_path / "other.json", *QUESTIONS, ("scene0000_00", "What?", ["this"]))
     assert "has no folder for 1 of 3 scenes that are asked about: scene0000_00" in refused(dataset=elsewhere)
