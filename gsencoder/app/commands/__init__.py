@@ -83,6 +83,11 @@ COMMANDS = {
             config="QuestionsCommandConfig",
             help="make questions and expressions with their answers from the labels of scenes",
         ),
+        Command(
+            name="tune",
+            config="TuneCommandConfig",
+            help="train adapters of a vision-language model on questions about scenes and their answers",
+        ),
         Command(name="evaluate", config="EvaluateConfig", help="compute metrics on labeled scenes"),
         Command(
             name="score",
