@@ -130,12 +130,16 @@ def test_objects_are_captioned_in_boxes_that_are_given(home: Path, tmp_path: Pat
     assert captions & right
 
 
-def test_situations_are_answered_with_the_side(home: Path, tmp_path: Path) -> None:
-    predicted, answerer = answered(home, tmp_path, "situated_questions.json")
-    assert answerer.unknown_questions == 0
+def test_situations_are_said_before_their_questions(home: Path, tmp_path: Path) -> None:
+    answerer = ScriptedAnswerer(AnswerSheet())
+    with serving(answerer) as url:
+        server = (f"vlm.base_url={url}", "choose.source=frames")
+        assert ask(home, tmp_path / "out", "situated_questions.json", *server) == 0
     questions = read_questions(home / "set" / "situated_questions.json")
     read = read_answer_predictions(tmp_path / "out" / "predictions.json", questions)
-    assert len(predicted) == len(read) == len(questions)
+    assert read == {each.id: ("unknown",) for each in questions}
+    prompt = (tmp_path / "out" / ROOMS[0] / "00001" / "prompt.txt").read_text()
+    assert f"Question: {questions[0].situation} {questions[0].text}" in prompt
 
 
 def test_questions_of_other_scenes_are_counted_and_named(home: Path, tmp_path: Path) -> None:
