@@ -258,7 +258,7 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
                 f"questions: {config.questions} asks about {len(wanted)} scenes ({listed(sorted(wanted), 3)}), and "
                 f"there are features of others ({listed(sorted(counts), 3) or 'none'})"
             )
-        others = {name: count for name, count in wanted.items() if not counts.get(name)}
+        others = {name: count for name, count in wanted.items() if name not in counts}
         summary.results.update(
             benchmark=asked.benchmark,
             questions=sum(counts.values()),

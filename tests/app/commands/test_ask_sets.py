@@ -130,12 +130,16 @@ def test_objects_are_captioned_in_boxes_that_are_given(home: Path, tmp_path: Pat
     assert captions & right
 
 
-def test_situations_are_answered_with_the_side(home: Path, tmp_path: Path) -> None:
-    predicted, answerer = answered(home, tmp_path, "situated_questions.json")
-    assert answerer.unknown_questions == 0
+def test_situations_are_said_before_their_questions(home: Path, tmp_path: Path) -> None:
+    answerer = ScriptedAnswerer(AnswerSheet())
+    with serving(answerer) as url:
+        server = (f"vlm.base_url={url}", "choose.source=frames")
+        assert ask(home, tmp_path / "out", "situated_questions.json", *server) == 0
     questions = read_questions(home / "set" / "situated_questions.json")
     read = read_answer_predictions(tmp_path / "out" / "predictions.json", questions)
-    assert len(predicted) == len(read) == len(questions)
+    assert read == {each.id: ("unknown",) for each in questions}
+    prompt = (tmp_path / "out" / ROOMS[0] / "00001" / "prompt.txt").read_text()
+    assert f"Question: {questions[0].situation} {questions[0].text}" in prompt
 
 
 def test_questions_of_other_scenes_are_counted_and_named(home: Path, tmp_path: Path) -> None:
@@ -149,26 +153,33 @@ def test_questions_of_other_scenes_are_counted_and_named(home: Path, tmp_path: P
     assert (tmp_path / "one" / ROOMS[0] / "00001" / "request.json").is_file()
 
 
-def test_an_interrupted_set_goes_on_where_it_was(
+def test_refused_questions_cost_no_other_its_answer_and_a_broken_set_goes_on(
     home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     answerer = ScriptedAnswerer(AnswerSheet())
+    reply, fault = answerer.reply, [LookupError("no"), RuntimeError("broken")]
+
+    def stops(body: Any) -> str:
+        text = reply(body)
+        if fault and answerer.requests == 3:
+            raise fault[-1]
+        return text
+
+    answerer.reply = stops  # type: ignore[method-assign]
+    out, name = tmp_path / "out", "questions.json"
     with serving(answerer) as url:
-        words = (str(home / "features"), f"questions={home / 'set' / 'questions.json'}", f"vlm.base_url={url}", *QUICK)
-        reply = answerer.reply
-
-        def stops(body: Any) -> str:
-            if answerer.requests == 3:
-                raise LookupError("busy")
-            return reply(body)
-
-        # A request that is refused costs no other its answer, and is named.
-        answerer.reply = stops  # type: ignore[method-assign]
-        assert cli.main(["ask", *words, f"out={tmp_path / 'out'}", "quiet=true"]) == 0
-    results = results_of(tmp_path / "out")
-    assert len(results["unanswered"]) == results["questions"] - 3
-    assert results["predicted"] == 3
-    assert "questions have no answer" in capsys.readouterr().err
+        server = (f"vlm.base_url={url}", "vlm.retries=0", "choose.source=frames")
+        assert ask(home, out, name, *server) == 2
+        assert "2 of " in capsys.readouterr().err
+        assert not out.exists()
+        fault.pop()
+        answerer.requests = 2  # The third one is asked again, and refused.
+        assert ask(home, out, name, *server) == 0
+    results = results_of(out)
+    assert answerer.requests == results["questions"]
+    assert len(results["unanswered"]) == 1
+    assert results["predicted"] == results["questions"] - 1
+    assert "1 of " in capsys.readouterr().err
 
 
 def test_a_set_and_folders_that_do_not_fit_end_in_one_line(
