@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from selected_rooms import SPACE, selected_room, with_more, words
 
-from gsencoder.app.reports import parts, results
+from gsencoder.app.reports import demo, parts, results
 from gsencoder.app.reports.demo import TeacherResult
 from gsencoder.app.runs.summary import Summary
 from gsencoder.fusion.fuse import Fusion
@@ -212,6 +212,24 @@ def test_scores_have_a_tile_each_and_tables_of_names_and_of_scenes_that_have_fig
     results.report_scores(tmp_path, summary_of(**given | {"names": {}, "scenes": []}))
     assert last().tables == []
     assert last().headings == ["Seconds of each step"]
+
+
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_the_page_of_the_demo_counts_words_and_what_the_basis_costs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(demo, "HtmlReport", Page)
+    given = SCENE.features["names"]
+    fusion = Fusion(features=given, views=(0,), tested=(), seconds={}, truncation=0.125)
+    made = TeacherResult(
+        title="names", words=("mug", "table", "lamp"), ious=(0.9, 0.4, 0.0), fusion=fusion, localization=found()
+    )
+    demo.write_report(tmp_path / "a.html", SCENE, [made], summary_of())
+    told = last().told
+    assert (told["names localized"], told["Gaussians"], told["views"]) == ("1 of 3", len(KINDS), 8)
+    assert told["seconds before this page"] == 3.5
+    assert [row["IoU with the truth"] for row in last().tables[0]] == [0.9, 0.4, 0.0]
+    assert last().tables[1][0]["centered cosine error"] == 0.125
 
 
 def test_a_teacher_counts_what_overlaps_by_half_or_more() -> None:

@@ -155,6 +155,7 @@ def test_where_object_and_surroundings_have_one_feature_all_stays_as_it_started(
     one = np.tile(OBJECT + TABLE, (len(PLACES), 1)).astype(np.float32)
     # Or features that differ by rounding alone.
     nearly = np.where(PART[:, None], np.nextafter(one, np.float32(2)), one)
+    nearly[RIM] = np.nextafter(np.nextafter(one, np.float32(2)), np.float32(2))[RIM]
     for vectors in (one, nearly):
         made = shares(vectors=vectors, relevancy=PART.astype(float))
         assert (made[PART] == 1).all()
