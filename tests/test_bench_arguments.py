@@ -140,3 +140,12 @@ def test_a_failed_command_ends_with_its_own_line(
         ablations["run"]([sys.executable, str(script)])
     assert stop.value.code == 2
     assert capfd.readouterr().err == "error: a good line\n"
+
+
+@pytest.mark.parametrize("words", [(), ("room", "--unlabeled", "x"), ("--unlabeled", "x"), ("room", "--words", "a")])
+def test_answers_are_of_labeled_scenes_or_of_words_alone(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    assert "give labeled scenes, or --unlabeled FEATURES with --words" in refusal(
+        monkeypatch, capfd, "answers.py", *words
+    )

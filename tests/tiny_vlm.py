@@ -25,8 +25,14 @@ def tokenizer() -> Any:
     return PreTrainedTokenizerFast(tokenizer_object=made, pad_token="<pad>", bos_token="<s>", eos_token="</s>")
 
 
-def save_tiny_vlm(folder: Path) -> None:
-    """Writes a random Idefics3 with its processor, as `from_pretrained` reads them."""
+def save_tiny_vlm(folder: Path, spread: float = 1.0) -> None:
+    """Writes a random Idefics3 with its processor, as `from_pretrained` reads them.
+
+    Args:
+        folder: to write to.
+        spread: factor of the weights of the language model: random ones are so small that it neither tells questions
+            apart nor finds any answer likely.
+    """
     import torch
     from transformers import Idefics3Config, Idefics3ForConditionalGeneration, Idefics3Processor
     from transformers.models.idefics3 import Idefics3ImageProcessorPil
@@ -73,5 +79,11 @@ def save_tiny_vlm(folder: Path) -> None:
             "max_position_embeddings": 4096,
         },
     )
-    Idefics3ForConditionalGeneration(config).eval().save_pretrained(folder)
+    model = Idefics3ForConditionalGeneration(config).eval()
+    with torch.no_grad():
+        model.lm_head.weight *= spread
+        for module in model.model.text_model.modules():
+            if isinstance(module, (torch.nn.Linear, torch.nn.Embedding)):
+                module.weight *= spread
+    model.save_pretrained(folder)
     processor.save_pretrained(folder)

@@ -26,8 +26,8 @@ def room_scene() -> Scene:
 
 
 def name_features(scene: Scene, rename: dict[str, str] | None = None) -> tuple[GaussianFeatures, TextTable]:
-    """Features that are the vector of the name of the object that a Gaussian lies in, with some noise; what lies in
-    none was seen by no view where it lies high."""
+    """Features that are the vector of the name of the object that a Gaussian lies in, with some noise; of the room
+    itself what lies high was seen by no view."""
     assert scene.gaussians is not None
     rng = np.random.default_rng(0)
     means = scene.gaussians.means
@@ -38,7 +38,7 @@ def name_features(scene: Scene, rename: dict[str, str] | None = None) -> tuple[G
     vectors = np.linalg.qr(rng.normal(size=(CHANNELS, len(known))))[0].T.astype(np.float32)
     row = np.array([known.index("room"), *(known.index(name) for name in names)])[numbers]
     features = vectors[row] + NOISE * rng.normal(size=(len(means), CHANNELS)).astype(np.float32) / CHANNELS**0.5
-    seen = (numbers > 0) | (means[:, 2] < 1.0)
+    seen = (row != known.index("room")) | (means[:, 2] < 1.2)
     weights = np.where(seen, rng.uniform(0.1, 50, len(means)), 0).astype(np.float32)
     features[~seen] = 0
     mean = features[seen].mean(axis=0)

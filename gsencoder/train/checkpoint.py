@@ -55,13 +55,26 @@ def save_checkpoint(
     Raises:
         InputError: the disk is full.
     """
-    arrays = {f"model.{name}": value.detach().cpu().numpy() for name, value in model.state_dict().items()}
+    arrays = {f"model.{name}": value.detach().cpu().numpy() for name, value in trained_state(model).items()}
     for name, parameter in model.named_parameters():
         for key, value in optimizer.state.get(parameter, {}).items():
             arrays[f"optimizer.{key}.{name}"] = value.detach().float().cpu().numpy()
     with_moments = [name for name, parameter in model.named_parameters() if optimizer.state.get(parameter)]
     header = {**asdict(state), "settings": settings, "moved": with_moments}
     write_archive(path, arrays, header)
+
+
+def trained_state(model: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """What a training changes of a network: its state, or, where parameters are frozen, the others alone.
+
+    Frozen parameters, and buffers beside them, are those of a model that adapters are trained on; they are read from
+    its own files, which are many times larger than the adapters.
+    """
+    state = model.state_dict()
+    trained = {name for name, parameter in model.named_parameters() if parameter.requires_grad}
+    if all(parameter.requires_grad for parameter in model.parameters()):
+        return state
+    return {name: value for name, value in state.items() if name in trained}
 
 
 def load_checkpoint(
@@ -79,7 +92,7 @@ def load_checkpoint(
             raise InputError(f"{path}: {_describe_difference(stored_settings, settings)}")
         parameters = {
             name: torch.from_numpy(file.array(f"model.{name}", "float32", tuple(value.shape)))
-            for name, value in model.state_dict().items()
+            for name, value in trained_state(model).items()
         }
         moments: dict[torch.nn.Parameter, dict[str, torch.Tensor]] = {}
         with_moments = file.value("moved", list)
@@ -93,7 +106,8 @@ def load_checkpoint(
                 for key, size in keys
             }
         state = _read_state(file)
-    model.load_state_dict(parameters)
+    # Of a network with frozen parameters these are a part, which is complete, since it was asked for by name.
+    model.load_state_dict(parameters, strict=parameters.keys() == model.state_dict().keys())
     for parameter, values in moments.items():
         optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in values.items()}
     return state

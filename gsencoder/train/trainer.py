@@ -403,9 +403,10 @@ class Trainer:
 
 
 def _parameter_groups(network: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:
-    """Parameters with weight decay (matrices) and without (norms and biases)."""
-    matrices = [value for value in network.parameters() if value.ndim > 1]
-    vectors = [value for value in network.parameters() if value.ndim <= 1]
+    """Parameters with weight decay (matrices) and without (norms and biases); frozen ones are in neither group."""
+    trained = [value for value in network.parameters() if value.requires_grad]
+    matrices = [value for value in trained if value.ndim > 1]
+    vectors = [value for value in trained if value.ndim <= 1]
     return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
 
 

@@ -86,7 +86,7 @@ def test_no_option_has_the_name_of_a_group(command: str) -> None:
     # Hydra would take its value for the name of a member.
     groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
     groups |= {group for name in COMMANDS for group in choices_of(config_of(name)).groups}
-    assert not groups & {option.key for option in options_of(config_of(command))}
+    assert not groups & {option.hydra_key for option in options_of(config_of(command))}
 
 
 def leaves(data: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

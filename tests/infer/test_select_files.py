@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from selected_rooms import selected_room
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats import load_property, load_splat, save_splat
+from gsencoder.infer.draw.boxes_ply import word_color
 from gsencoder.infer.select.file_names import file_stems
 from gsencoder.infer.select.labels_file import LABELS_JSON, LABELS_PLY, read_labels, write_labels
 from gsencoder.infer.select.selection import Selection
@@ -53,6 +55,27 @@ def test_the_labeled_splat_is_a_splat_for_every_other_reader(written: Path) -> N
         assert (getattr(plain, name) == getattr(labeled, name)).all()
     trimesh = pytest.importorskip("trimesh")
     assert np.allclose(trimesh.load(written / LABELS_PLY).vertices - SCENE.origin, plain.means, atol=1e-4)
+
+
+def test_boxes_hold_their_gaussians_stand_upright_and_have_the_colors_of_boxes(tmp_path: Path) -> None:
+    """The scene is tilted, so that none of the axes of the world is upward."""
+    assert SCENE.gaussians is not None
+    turn = Rotation.from_euler("zyx", [30, 25, 10], degrees=True)
+    turned = replace(SCENE.gaussians, means=turn.apply(SCENE.gaussians.means).astype(np.float32))
+    up = turn.apply([0.0, 0.0, 1.0])
+    scene = replace(SCENE, gaussians=turned, up=up)
+    write_labels(tmp_path, scene, SELECTION, {0: "rest.ply", 1: "mug.ply"})
+    rest, *named = json.loads((tmp_path / LABELS_JSON).read_text())["labels"]
+    assert rest["file"] == "rest.ply"
+    assert rest["obb"] is None
+    for number, row in enumerate(named):
+        box = row["obb"]
+        members = turned.means[number + 1 == LABELS] + SCENE.origin
+        along = (members - box["center"]) @ np.array(box["rotation"])
+        np.testing.assert_allclose(along.max(axis=0), np.array(box["size"]) / 2, atol=1e-5)
+        np.testing.assert_allclose(along.min(axis=0), -np.array(box["size"]) / 2, atol=1e-5)
+        np.testing.assert_allclose(np.array(box["rotation"])[:, 2], up, atol=1e-6)
+        assert row["color"] == list(word_color(number))
 
 
 def test_words_without_gaussians_have_a_count_of_zero_and_no_box(tmp_path: Path) -> None:
@@ -132,10 +155,14 @@ def test_properties_of_text_and_truncated_files_are_read_or_refused(written: Pat
         ("\udcff", "object"),
         ("CON", "CON_2"),
         ("nul", "nul_2"),
+        ("com0", "com0_2"),
+        ("LPT9", "LPT9_2"),
+        ("\uff23\uff2f\uff2e", "CON_2"),  # wide letters
         ("rest", "rest_2"),
         ("Labels", "Labels_2"),
         ("C:\\mug", "C_mug"),
         ("x" * 500, "x" * 60),
+        ("x" * 59 + " mug", "x" * 59),
         ("杯" * 50, "杯" * 20),
     ],
 )

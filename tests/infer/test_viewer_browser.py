@@ -17,8 +17,9 @@ from viewed_rooms import HOSTILE, room_scene, save_viewed_room, search_of
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats import load_splat
 from gsencoder.fusion.store.quantize import compact
-from gsencoder.infer.localize.localize import localize
+from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.infer.viewer.bundle import Bundle, load_bundle
 from gsencoder.infer.viewer.page import file_page, served_page
 from gsencoder.infer.viewer.page_scene import FileOptions, file_container, scene_container
@@ -127,6 +128,10 @@ def find_and_click_the_mug(page: Any, scene: Scene, search: SceneSearch, asked: 
     assert red > 60
     assert max(green, blue) < 0.55 * red
     assert np.abs(after[y, x] - before[y, x]).max() > 40
+    # All but the mug is nearly grey, and darker.
+    room = after[:, : WIDTH - 300]
+    assert np.quantile(np.ptp(room, axis=2), 0.9) < 30
+    assert np.median(room) < 0.8 * np.median(before[:, : WIDTH - 300])
     found = localize(asked, ["mug"], search.words, search.config).boxes
     boxes = page.evaluate(
         "gsencoderViewer.shown[0].boxes.map(b => [b.center, b.size, b.probability, b.score, b.count])"
@@ -165,6 +170,10 @@ def test_a_served_page_finds_what_is_typed(browser: Any, bundle: Bundle, search:
         thread.start()
         shown = opened_page(browser, server.address)
         find_and_click_the_mug(shown, scene, search, search.shown.scene)
+        told = shown.evaluate("async () => Array.from((await gsencoderViewer.shown[0].answers.ask('lamp')).relevancy)")
+        exact = relevancy(search.shown.features, search.words.encode(["lamp"]), search.words.mean)[0]
+        np.testing.assert_allclose(np.array(told, float), exact, atol=2e-5)
+        assert np.isnan(exact).any()
         shown.fill("input[type=search]", "banjo")
         shown.press("input[type=search]", "Enter")
         shown.wait_for_selector(".status .bad")
@@ -203,6 +212,65 @@ def test_a_page_of_one_file_does_the_same_without_a_network(
     page.evaluate("gsencoderViewer.ask('piano')")
     page.wait_for_selector("body[data-judged=piano]")
     assert "absent" in page.inner_text(".status")
+    page.context.close()
+
+
+ANSWERED = """async ([word, cutoff]) => {
+  const shown = gsencoderViewer.shown[0];
+  shown.answer = await shown.answers.ask(word);
+  shown.judged = null;
+  shown.findBoxes(cutoff);
+  const found = shown.boxes;
+  const asked = {...shown.answer, threshold: cutoff ?? shown.answer.threshold};
+  const judged = await shown.answers.judge(asked, found);
+  return [shown.answer.threshold, judged.probability, found.length,
+    judged.boxes.map(b => [b.count, b.score, b.probability, b.center, b.size])];
+}"""
+
+
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_thresholds_boxes_and_probabilities_of_a_file_are_those_of_localize_for_every_word(
+    browser: Any, bundle: Bundle, search: SceneSearch, scene: Scene, tmp_path: Path
+) -> None:
+    """At the default threshold, and at a small one that many clusters reach."""
+    config = LocalizeConfig(min_share=0.0, min_probability=0.01)
+    loose = SceneSearch(shown=search.shown, words=search.words, config=config)
+    options = replace(OPTIONS, error=0.0005)
+    container = file_container(loose, scene.objects, options)
+    settings = {"kind": "file", "scenes": 1, "notes": []}
+    (tmp_path / "page.html").write_bytes(file_page(bundle, "room", settings, [container]))
+    (tmp_path / "splat.spz").write_bytes(container.arrays["splat"].tobytes())
+    quantized = compact(search.shown.features, error=options.error).features()
+    held = replace(
+        search.shown.scene, gaussians=load_splat(tmp_path / "splat.spz"), features={quantized.space.name: quantized}
+    )
+    page = opened_page(browser, (tmp_path / "page.html").as_uri(), offline=True)
+    clusters = found = 0
+    for word in container.meta["words"]:
+        scores = relevancy(quantized, search.words.encode([word]), search.words.mean)[0]
+        # A tenth to a fifth of the scene, where no rounding changes which Gaussians reach it.
+        scores = np.quantile(scores[np.isfinite(scores)], np.linspace(0.8, 0.9, 500), method="nearest")
+        gap = int(np.diff(scores).argmax())
+        between = float(scores[gap : gap + 2].mean())
+        for cutoff in (None, between):
+            threshold = config.threshold if cutoff is None else ThresholdConfig(kind="fixed", fixed=cutoff)
+            # The page knows the spacing of the scene before its positions were rounded.
+            expected = localize(held, [word], search.words, replace(config, threshold=threshold, eps=loose.eps))
+            default, probability, count, boxes = page.evaluate(ANSWERED, [word, cutoff])
+            if cutoff is None:
+                assert default == pytest.approx(float(expected.thresholds[0]), abs=2e-3)
+            assert [box[0] for box in boxes] == [len(box.rows) for box in expected.boxes]
+            assert probability == pytest.approx(float(expected.probabilities[0]), abs=2e-3)
+            for (_, score, likely, center, size), box in zip(boxes, expected.boxes, strict=True):
+                assert score == pytest.approx(box.score, abs=2e-3)
+                assert likely == pytest.approx(box.probability, abs=2e-3)
+                low, high = np.array(center) - np.max(size), np.array(center) + np.max(size)
+                middle = box.obb_center - search.shown.scene.origin
+                assert ((middle > low) & (middle < high)).all()
+                assert np.prod(size) == pytest.approx(np.prod(box.obb_size), rel=0.02, abs=1e-5)
+            clusters += len(boxes)
+            found += count
+    assert 2 * len(container.meta["words"]) < clusters < found  # Improbable ones are left out.
     page.context.close()
 
 

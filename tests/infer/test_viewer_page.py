@@ -15,6 +15,7 @@ from viewed_rooms import HOSTILE, STUB, name_features, room_scene, save_viewed_r
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats import load_splat
+from gsencoder.fusion.store.quantize import compact
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
@@ -120,6 +121,13 @@ def test_relevancy_from_the_arrays_of_a_page_is_that_of_the_features_within_the_
         assert np.sqrt(np.mean(difference**2)) <= np.sqrt(2 * budget) + 1e-4
 
 
+def test_words_of_a_page_lose_no_more_than_their_rounding(search: SceneSearch, written: Container) -> None:
+    quantized = compact(search.shown.features, error=OPTIONS.error).features()
+    for word, name in enumerate(search.words.names):
+        exact = relevancy(quantized, search.words.encode([name]), search.words.mean)[0]
+        np.testing.assert_allclose(cosines_of_page(written, word), exact, atol=1e-4)
+
+
 def test_a_page_orders_boxes_of_a_word_as_localize_does(search: SceneSearch, written: Container) -> None:
     found = localize(search.shown.scene, ["mug"], search.words, search.config)
     page = cosines_of_page(written, written.meta["words"].index("mug"))
@@ -145,6 +153,7 @@ def test_boxes_of_a_server_are_those_of_localize(search: SceneSearch) -> None:
     assert [box["score"] for box in sent["boxes"]] == [box.score for box in found.boxes]
     assert sent["probability"] == pytest.approx(float(found.probabilities[0]))
     assert search.boxes("piano")["boxes"] == []
+    assert search.boxes("piano")["probability"] < 0.02
 
 
 def test_the_words_of_gaussians_are_those_of_their_object(search: SceneSearch) -> None:

@@ -1,6 +1,5 @@
 """The server of `view` answers its own page, and nothing and nobody else."""
 
-import http.client
 import json
 import socket
 import threading
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
+from viewer_requests import at, call
 
 from gsencoder.core.errors import InputError
 from gsencoder.infer.viewer.container import read_container
@@ -38,31 +38,6 @@ def server(search: SceneSearch) -> Iterator[ViewServer]:
         yield made
         made.shutdown()
         thread.join()
-
-
-class Connection(http.client.HTTPConnection):
-    """Sends any letters of a path, which the library refuses."""
-
-    def _encode_request(self, request: str) -> bytes:
-        return request.encode("utf-8")
-
-
-def call(
-    server: ViewServer, method: str, path: str, body: Any = None, *, headers: dict[str, str] | None = None
-) -> tuple[int, bytes, http.client.HTTPMessage]:
-    """An answer to a request to a path behind the token; a body that is no bytes is sent as JSON."""
-    connection = Connection("127.0.0.1", server.server_address[1], timeout=10)
-    data = body if isinstance(body, bytes) or body is None else json.dumps(body).encode()
-    sent = {"Content-Type": "application/json"} if data is not None else {}
-    connection.request(method, path, data, sent | (headers or {}))
-    response = connection.getresponse()
-    read = response.read()
-    connection.close()
-    return response.status, read, response.headers
-
-
-def at(server: ViewServer, rest: str) -> str:
-    return f"/{server.token}/{rest}"
 
 
 def test_the_page_comes_with_a_policy_that_allows_its_own_script_alone(server: ViewServer) -> None:

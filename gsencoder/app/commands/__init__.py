@@ -78,6 +78,16 @@ COMMANDS = {
             help="look at a scene and its features in a browser, and search it; or write that as one file",
         ),
         Command(name="ask", config="AskCommandConfig", help="ask a vision-language model about such views"),
+        Command(
+            name="questions",
+            config="QuestionsCommandConfig",
+            help="make questions and expressions with their answers from the labels of scenes",
+        ),
+        Command(
+            name="tune",
+            config="TuneCommandConfig",
+            help="train adapters of a vision-language model on questions about scenes and their answers",
+        ),
         Command(name="evaluate", config="EvaluateConfig", help="compute metrics on labeled scenes"),
         Command(
             name="score",

@@ -1,11 +1,14 @@
 """`gsencoder ask FEATURES question=…`: the answer of a VLM that sees the best views of what the question names."""
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from gsencoder.app.commands.query_words import asked_scene, load_words
+from gsencoder.app.commands.question_scenes import localized_captions, photos_of, scene_folders
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import printable
@@ -13,19 +16,23 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question
 from gsencoder.infer.ask.batch import ANSWER, ANSWERS, PROMPT, REQUEST, ask_question, ask_questions, write_answers
+from gsencoder.infer.ask.predictions import predictions
 from gsencoder.infer.ask.prompts import Task, check_question
+from gsencoder.infer.ask.question_sets import QuestionSet, SetQuestion, is_question_set, read_question_set
 from gsencoder.infer.ask.questions import BatchQuestion, read_questions
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
 from gsencoder.infer.localize.localize import LocalizeConfig, select_features
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.text.build import TableTextConfig, TextConfig, Words
-from gsencoder.types import Scene
+
+PREDICTIONS = "predictions.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,12 +41,27 @@ class AskCommandConfig(CommonConfig):
 
     paths: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
+        metadata={
+            "help": "a folder written by fuse, encode, pack or memory; for a question set several, or a folder that "
+            "has one for each scene",
+            "metavar": "FEATURES",
+            "required": True,
+        },
     )
     question: str = field(default="", metadata={"help": "the question"})
     questions: str = field(
         default="",
-        metadata={"help": "a file of questions: JSON lines with question and, optionally, id, task, query, aabb"},
+        metadata={
+            "help": "a file of questions: JSON lines with question and, optionally, id, task, query, aabb; or the JSON "
+            "of ScanQA, SQA3D, ScanRefer or Scan2Cap"
+        },
+    )
+    proposals: str = field(
+        default="",
+        metadata={
+            "help": "for captions of a question set: a file of boxes as Scan2Cap has them, or localize = boxes of the "
+            "objects' names; empty = the boxes of the question set"
+        },
     )
     task: Task = field(
         default="answer",
@@ -62,7 +84,10 @@ class AskCommandConfig(CommonConfig):
         },
     )
     photos: str = field(
-        default="", metadata={"help": "the scene that was fused; its photographs are shown instead of renders"}
+        default="",
+        metadata={
+            "help": "the scene that was fused, or a folder of scenes; its photographs are shown instead of renders"
+        },
     )
     dry_run: bool = field(default=False, metadata={"help": "write the prompt and the pictures without sending them"})
     resume: bool = field(
@@ -76,8 +101,10 @@ class AskCommandConfig(CommonConfig):
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
-        if len(self.paths) > 1:
+        if len(self.paths) > 1 and not self.questions:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        if self.proposals and not self.questions:
+            raise InputError("proposals: are boxes for a question set; give questions=, or aabb= for one box")
         if self.questions and (self.question or self.query or self.aabb):
             raise InputError("questions: the file contains the questions; leave out question=, query= and aabb=")
         if not self.questions:
@@ -90,25 +117,23 @@ class AskCommandConfig(CommonConfig):
 
 def run(config: AskCommandConfig, summary: Summary) -> None:
     """Localizes the words of the question, chooses and renders views, asks the VLM, and writes everything."""
-    folder = Path(config.paths[0])
     server = None if config.dry_run else VlmServer(config.vlm)
     request_body([], config.vlm, named=server is not None)
+    if config.questions and is_question_set(Path(config.questions)):
+        ask_set(config, read_question_set(Path(config.questions), config.task, config.proposals), server, summary)
+        return
+    if len(config.paths) > 1 or config.proposals:
+        raise InputError(
+            f"paths, proposals: {config.questions} holds questions about one scene, one a line; give one folder of "
+            "features and no proposals"
+        )
+    folder = Path(config.paths[0])
     questions = read_questions(Path(config.questions), config.task) if config.questions else ()
     if not questions:
         check_question(config.task, config.question)
     with summary.step("load"):
-        scene = shown_scene(folder, config.photos, config.data)
-        scene, words = _scene_and_words(scene, folder, config)
-    asker = Asker(
-        scene,
-        words,
-        space=None if config.head else config.space or None,
-        config=config.ask,
-        localization=config.localize,
-        views=config.choose,
-        vlm=config.vlm,
-    )
-    out = config.out or Path("outputs") / scene.name / ("answers" if questions else "answer")
+        asker = load_asker(config, folder, config.photos)
+    out = config.out or Path("outputs") / asker.scene.name / ("answers" if questions else "answer")
     if questions:
         ask_file(out, questions, asker, server, config, summary)
         return
@@ -123,14 +148,37 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
     screen.print(f"{out}: {len(row['views'])} pictures, {PROMPT}, {REQUEST}" + (f", {ANSWER}" if server else ""))
 
 
-def _scene_and_words(scene: Scene, folder: Path, config: AskCommandConfig) -> tuple[Scene, Words | None]:
-    """The scene with the features that are asked, and the words; a box can be asked about without words."""
+def load_asker(config: AskCommandConfig, folder: Path, photos: str) -> Asker:
+    """The scene of a folder of features, and what is asked about it is looked up with.
+
+    A box can be asked about without words.
+    """
+    scene = shown_scene(folder, photos, config.data)
+    words: Words | None
     if config.head:
-        return asked_scene(scene, folder, head=config.head, space=config.space, given=config.words, text=config.text)
-    space = select_features(scene, config.space or None)[1].space
-    stated = config.words or not isinstance(config.text, TableTextConfig)
-    known = stated or table_path(folder, space.text_encoder) is not None
-    return scene, load_words(folder, space, config.words, config.text) if known else None
+        scene, words = asked_scene(
+            scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
+        )
+    else:
+        space = select_features(scene, config.space or None)[1].space
+        stated = config.words or not isinstance(config.text, TableTextConfig)
+        known = stated or table_path(folder, space.text_encoder) is not None
+        words = load_words(folder, space, config.words, config.text) if known else None
+    return Asker(
+        scene,
+        words,
+        space=None if config.head else config.space or None,
+        config=config.ask,
+        localization=config.localize,
+        views=config.choose,
+        vlm=config.vlm,
+    )
+
+
+def made_from(config: AskCommandConfig) -> dict[str, Any]:
+    """Settings that answers depend on and the asker does not know."""
+    given = settings(config)
+    return {name: given[name] for name in ("space", "photos", "data")}
 
 
 def ask_file(
@@ -143,16 +191,98 @@ def ask_file(
 ) -> None:
     """Asks the questions of a file; the answers of an interrupted run stay in a folder beside out=."""
     target, clock = Path(os.path.realpath(out)), Clock()
-    given = settings(config)
-    made_from = {name: given[name] for name in ("space", "photos", "data")}
     with (
         WorkFolder(target.with_name(f"{target.name}.answers")) as work,
         output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
     ):
         work.take(anew=not config.resume)
         track = Progress(quiet=config.quiet)
-        rows = ask_questions(questions, asker, server, work.path, made_from=made_from, clock=clock, track=track)
+        rows = ask_questions(questions, asker, server, work.path, made_from=made_from(config), clock=clock, track=track)
         write_answers(folder, work.path, rows)
         summary.add_seconds(clock.seconds)
         summary.results.update(questions=len(questions), answers=ANSWERS)
     console(config.quiet).print(f"{out}: {len(questions)} questions, {ANSWERS}")
+
+
+def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | None, summary: Summary) -> None:
+    """Asks the questions of a benchmark about each scene that there are features of, and writes predictions.
+
+    The features of one scene are in memory at a time. Questions that have no answer are counted and named, and so are
+    scenes without features.
+    """
+    out = config.out or Path("outputs") / asked.benchmark
+    wanted = asked.scenes()
+    folders = scene_folders(config.paths, wanted)
+    target, clock, screen = Path(os.path.realpath(out)), Clock(), console(config.quiet)
+    answered: list[tuple[SetQuestion, dict[str, Any]]] = []
+    silent: list[SetQuestion] = []
+    unanswered: dict[str, str] = {}
+    counts: dict[str, int] = {}
+    with (
+        WorkFolder(target.with_name(f"{target.name}.answers")) as work,
+        output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
+    ):
+        work.take(anew=not config.resume)
+        for path in folders:
+            with summary.step("load"):
+                asker = load_asker(config, path, photos_of(config.photos, path))
+            name = asker.scene.name
+            if name in counts:
+                raise InputError(f"{path}: holds features of scene {name}, and so does another folder; give one")
+            if name not in wanted:
+                counts[name] = 0
+                continue
+            questions = localized_captions(asker, asked.names[name]) if asked.names else asked.of_scene(name)
+            state = work.path / name
+            state.mkdir(exist_ok=True)
+            rows = ask_questions(
+                [each.asked for each in questions],
+                asker,
+                server,
+                state,
+                made_from=made_from(config),
+                unanswered=unanswered,
+                clock=clock,
+                track=Progress(quiet=config.quiet),
+            )
+            (folder / name).mkdir()
+            write_answers(folder / name, state, rows)
+            by_id = {row["id"]: row for row in rows}
+            answered += [(each, by_id[each.asked.id]) for each in questions if each.asked.id in by_id]
+            silent += [each for each in questions if each.asked.id not in by_id]
+            counts[name] = len(questions)
+            screen.print(f"{name}: {len(rows)} of {len(questions)} questions")
+        summary.add_seconds(clock.seconds)
+        if not any(counts.values()):
+            raise InputError(
+                f"questions: {config.questions} asks about {len(wanted)} scenes ({listed(sorted(wanted), 3)}), and "
+                f"there are features of others ({listed(sorted(counts), 3) or 'none'})"
+            )
+        others = {name: count for name, count in wanted.items() if name not in counts}
+        summary.results.update(
+            benchmark=asked.benchmark,
+            questions=sum(counts.values()),
+            answered=len(answered),
+            unanswered=unanswered,
+            scenes={name: count for name, count in counts.items() if count},
+            scenes_without_questions=sorted(name for name, count in counts.items() if not count),
+            other_scenes=others,
+        )
+        if server is not None:
+            entries = predictions(asked.benchmark, answered, silent)
+            write_json(folder / PREDICTIONS, entries)
+            written = sum(map(len, entries.values())) if isinstance(entries, dict) else len(entries)
+            summary.results.update(predictions=PREDICTIONS, predicted=written)
+    if unanswered:
+        first = next(iter(unanswered.values()))
+        warnings.warn(
+            f"{len(unanswered)} of {sum(counts.values())} questions have no answer: {first}",
+            SceneWarning,
+            stacklevel=2,
+        )
+    if others:
+        screen.print(
+            f"{sum(others.values())} questions about {len(others)} scenes without features were not asked: "
+            f"{listed(sorted(others), 3)}"
+        )
+    screen.print(f"{out}: {len(answered)} answers" + (f", {PREDICTIONS}" if server else ""))

@@ -23,6 +23,7 @@ from gsencoder.app.settings.config import CommonConfig, typed
 from gsencoder.app.settings.config_store import EXPERIMENT, store_settings
 from gsencoder.app.settings.hydra_errors import HYDRA_KEY, hydra_error
 from gsencoder.app.settings.options import (
+    LIKE_GROUP,
     Option,
     join_list,
     near,
@@ -172,15 +173,16 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
                 written = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
         elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
             written = f"[{value}]"
+        name = option.hydra_key if option is not None and option.like_group else key
         try:
-            parsed = parser.parse_override(f"{key}={written}")
+            parsed = parser.parse_override(f"{name}={written}")
             swept = parsed.is_sweep_override()
         except HydraException as error:
             message = wrong_value(option, value) if option else f"{key}={value}: {str(error).partition(chr(10))[0]}"
             raise InputError(message) from error
         if swept and not sweep and option is not None:
             raise InputError(f"{wrong_value(option, value)}; several values, one run each, need -m")
-        hydra_overrides.append(f"{key}={written}")
+        hydra_overrides.append(f"{name}={written}")
     return hydra_overrides
 
 
@@ -221,4 +223,4 @@ def plain_settings(composed: Any) -> dict[str, Any]:
     settings = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
     data = OmegaConf.to_container(settings, resolve=True)
     assert isinstance(data, dict)
-    return {str(key): value for key, value in data.items()}
+    return {str(key).removesuffix(LIKE_GROUP): value for key, value in data.items()}

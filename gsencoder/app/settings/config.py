@@ -2,8 +2,9 @@
 
 Each command owns a `@dataclass(frozen=True, slots=True, kw_only=True)` whose fields carry `metadata={"help": …}`;
 that text is what `gsencoder COMMAND --help` shows. Further metadata: `required=True` (the command cannot run without
-it), `metavar` (the word that stands for the value in the help), `secret=True` (the value is never shown or written) and
-`names=True` (a list of names, around which brackets may stand). A field whose type is a dataclass is a section, and its
+it), `metavar` (the word that stands for the value in the help), `secret=True` (the value is never shown or written),
+`names=True` (a list of names, around which brackets may stand) and `like_group=True` (a choice of other commands has
+the option's name). A field whose type is a dataclass is a section, and its
 options are written `section.name=value`. A field whose type is a union of dataclasses is a choice, written
 `section=member`: every member has a field `name: Literal["…"]`. `preset="NAME"` in the metadata of a section makes it a
 choice too, between its default, which has that name, and the presets in `conf/SECTION/*.yaml`. A mapping from names to

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.app.settings.options import field_types, member_name, section_classes
+from gsencoder.app.settings.options import LIKE_GROUP, field_types, member_name, section_classes
 
 EXPERIMENT = "experiment"
 """The group whose members set options of several sections; they are merged last, after the command's own defaults."""
@@ -66,6 +66,9 @@ def store_settings(command: str, cls: type[CommonConfig]) -> None:
 
     store = ConfigStore.instance()
     node, before, after = settings(cls()), [], []
+    for item in fields(cls):
+        if item.metadata.get("like_group"):
+            node[item.name + LIKE_GROUP] = node.pop(item.name)
     for group in groups_of(cls):
         is_experiment = group.key == EXPERIMENT
         for name, member in group.members.items():

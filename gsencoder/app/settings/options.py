@@ -29,6 +29,7 @@ class Option:
         secret: its value is never shown or written.
         several: the choice of which it takes several members, by name; empty for other options.
         names: it is a list of names, around which users of Hydra may write brackets.
+        like_group: its name is that of a choice of other commands, for which Hydra would take it.
     """
 
     key: str
@@ -42,8 +43,16 @@ class Option:
     secret: bool = False
     several: str = ""
     names: bool = False
+    like_group: bool = False
+
+    @property
+    def hydra_key(self) -> str:
+        """Its name in the settings that Hydra composes."""
+        return self.key + LIKE_GROUP if self.like_group else self.key
 
 
+LIKE_GROUP = "__option"
+"""What stands after the name of an option in Hydra's settings where a choice of other commands has that name."""
 MAX_WORD = 200
 """Number of characters of a word of the command line that an error repeats."""
 
@@ -224,6 +233,7 @@ def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = No
                     secret=item.metadata.get("secret", False),
                     several=item.metadata.get("several", ""),
                     names=item.metadata.get("names", False) or is_list_of_words(annotation),
+                    like_group=item.metadata.get("like_group", False),
                 )
             )
     return options

@@ -108,6 +108,7 @@ def ask_questions(
     work: Path,
     *,
     made_from: Mapping[str, Any] = {},
+    unanswered: dict[str, str] | None = None,
     clock: Clock | None = None,
     track: Track = untracked,
 ) -> list[dict[str, Any]]:
@@ -120,11 +121,12 @@ def ask_questions(
         server: None = a dry run.
         work: an existing folder for the rows so far, `answers.jsonl`, and one folder a question, named by its digest.
         made_from: what else answers depend on, as JSON values, such as the folders that the scene was read from.
+        unanswered: collects the ids of questions that have no answer, and why; None = these are an error.
         clock: as in `ask_question`.
         track: progress.
 
     Returns:
-        One row a question, in their order, each with its digest.
+        One row a question, in their order, each with its digest; none for those in `unanswered`.
 
     Raises:
         InputError: questions that have no answer, after all others were asked; the first is named.
@@ -134,7 +136,7 @@ def ask_questions(
     digests = {each.id: each.digest(depends_on) for each in questions}
     file = work / ANSWERS
     done = _answered(work, digests)
-    failures: list[str] = []
+    failures: dict[str, str] = {}
     # Rows of other settings, and one that was cut off, are removed before new ones are appended.
     try:
         write_bytes(file, b"".join(_line(row) for row in done.values()))
@@ -154,7 +156,7 @@ def ask_questions(
         except ServerError as error:
             raise InputError(f"{error}; {len(done)} of {len(questions)} answers are kept in {file}") from error
         except InputError as error:
-            failures.append(str(error))
+            failures[each.id] = str(error)
             continue
         row = {"id": each.id, "digest": digests[each.id], "warnings": messages, **row}
         with file.open("ab") as stream:
@@ -162,13 +164,15 @@ def ask_questions(
             stream.flush()
             os.fsync(stream.fileno())
         done[each.id] = row
-    if failures:
+    if unanswered is not None:
+        unanswered.update(failures)
+    elif failures:
         raise InputError(
-            f"{len(failures)} of {len(questions)} questions have no answer: {failures[0]}"
+            f"{len(failures)} of {len(questions)} questions have no answer: {next(iter(failures.values()))}"
             f"{' …' if len(failures) > 1 else ''}; the other answers are kept in {file}; mend or remove those lines, "
             "and run this again"
         )
-    return [done[each.id] for each in questions]
+    return [done[each.id] for each in questions if each.id in done]
 
 
 def write_answers(folder: Path, work: Path, rows: Sequence[Mapping[str, Any]]) -> None:

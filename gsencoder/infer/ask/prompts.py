@@ -121,13 +121,25 @@ def messages(text: str, pictures: Sequence[Picture], *, side: int, kind: ImageFo
 
 def data_url(picture: Picture, *, side: int, kind: ImageFormat) -> str:
     """A picture as the protocol carries it."""
+    data = encoded_picture(picture, side=side, kind=kind)
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def encoded_picture(picture: Picture, *, side: int, kind: ImageFormat) -> bytes:
+    """A picture as the bytes of a JPEG or PNG file.
+
+    Args:
+        picture: uint8 [H, W, 3].
+        side: a longer picture is made smaller, pixels.
+        kind: of the file.
+    """
     height, width = picture.shape[:2]
     if max(width, height) > side:
         factor = side / max(width, height)
         picture = resized_picture(picture, (max(1, round(width * factor)), max(1, round(height * factor))))
     held = io.BytesIO()
     Image.fromarray(picture).save(held, format=kind, **({"quality": 92} if kind == "jpeg" else {}))
-    return f"data:image/{kind};base64,{base64.b64encode(held.getvalue()).decode()}"
+    return held.getvalue()
 
 
 def number_in(text: str, count: int) -> int | None:

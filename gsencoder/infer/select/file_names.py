@@ -41,6 +41,6 @@ def _plain(word: str) -> str:
         for letter in unicodedata.normalize("NFKC", word)
     )
     stem = "_".join(letters.split())
-    while len(stem.encode("utf-8", "ignore")) > LONGEST:
+    while len(stem.encode("utf-8")) > LONGEST:
         stem = stem[:-1]
     return stem.rstrip("_") or "object"

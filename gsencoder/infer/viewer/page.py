@@ -4,6 +4,7 @@ import base64
 import gzip
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
@@ -67,8 +68,8 @@ def content_policy(bundle: Bundle, *, connect: str) -> str:
 
 
 def _script(bundle: Bundle) -> str:
-    # In a script element these would end it, or hide its end.
-    return bundle.script.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    # In a script element these would end it, in any case of letters, or hide its end.
+    return re.sub(r"</(?=script)", r"<\\/", bundle.script, flags=re.IGNORECASE).replace("<!--", "<\\!--")
 
 
 def _html(bundle: Bundle, title: str, settings: Mapping[str, Any], parts: Sequence[str], policy: str) -> str:

@@ -68,17 +68,38 @@ def photograph_of(views: Views, frame: int, cameras: Cameras, view: int) -> UInt
     """
     assert views.images is not None
     picture = views.images.photograph_at(frame) if isinstance(views.images, FramePhotographs) else views.images[frame]
-    image = Image.fromarray(picture)
+    size = int(cameras.widths[view]), int(cameras.heights[view])
+    window = photograph_window(views, frame, cameras, view, (picture.shape[1], picture.shape[0]))
+    if window is None:
+        return resized_picture(picture, size)
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS, box=window))
+
+
+def photograph_window(
+    views: Views, frame: int, cameras: Cameras, view: int, size: tuple[int, int]
+) -> tuple[float, float, float, float] | None:
+    """Which part of a frame's photograph a camera in its place shows.
+
+    Args:
+        views: of the frame.
+        frame: which of them.
+        cameras: see `photograph_of`.
+        view: which of these.
+        size: width and height of the photograph, pixels.
+
+    Returns:
+        Left, upper, right and lower edge in pixels of the photograph; None for all of it.
+    """
     frame_K, view_K = views.cameras.Ks[frame].astype(np.float64), cameras.Ks[view].astype(np.float64)
-    size = np.array([cameras.widths[view], cameras.heights[view]])
+    shown = np.array([cameras.widths[view], cameras.heights[view]])
     # Pixels of the frame's camera: where the window begins, and how large it is; then pixels as they were taken.
     zoom = np.diag(frame_K)[:2] / np.diag(view_K)[:2]
     begins = frame_K[:2, 2] - zoom * view_K[:2, 2]
-    photograph_at = np.array(image.size) / (views.cameras.widths[frame], views.cameras.heights[frame])
-    low, high = (np.clip(photograph_at * edge, 0, image.size) for edge in (begins, begins + zoom * size))
-    if max(np.abs(low).max(), np.abs(high - image.size).max()) < POSE_TOLERANCE_PIXELS:
-        return resized_picture(picture, tuple(size.tolist()))
-    return np.asarray(image.resize(tuple(size.tolist()), Image.Resampling.LANCZOS, box=(*low, *high)))
+    photograph_at = np.array(size) / (views.cameras.widths[frame], views.cameras.heights[frame])
+    low, high = (np.clip(photograph_at * edge, 0, size) for edge in (begins, begins + zoom * shown))
+    if max(np.abs(low).max(), np.abs(high - size).max()) < POSE_TOLERANCE_PIXELS:
+        return None
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
 def with_photographs(scene: Scene, photographed: Scene) -> Scene:

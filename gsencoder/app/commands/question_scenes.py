@@ -1,0 +1,67 @@
+"""The scenes that a question set is asked about: their folders of features, photographs, and boxes to be captioned."""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from gsencoder.app.commands.evaluated_features import folder_of
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.store.folder import SCENE_FILE
+from gsencoder.fusion.store.package import PACKAGE_FILE
+from gsencoder.infer.ask.ask import Asker
+from gsencoder.infer.ask.question_sets import SetQuestion, caption_question
+from gsencoder.infer.localize.localize import localize
+from gsencoder.infer.views.targets import best_boxes
+from gsencoder.text.build import closed_table
+
+
+def holds_features(folder: Path) -> bool:
+    """Whether a folder holds the features of a scene itself."""
+    return (folder / SCENE_FILE).is_file() or (folder / PACKAGE_FILE).is_file()
+
+
+def scene_folders(paths: Sequence[str], wanted: Collection[str]) -> list[Path]:
+    """The folders of features at paths: each path, or the folders in it that are called like a scene that is wanted.
+
+    Raises:
+        InputError: a path that is no folder, or that holds neither features nor any such folder.
+    """
+    folders: dict[Path, Path] = {}
+    for given in paths:
+        path = Path(given)
+        if not path.is_dir():
+            raise InputError(f"{path}: no such folder of features")
+        inner = [path] if holds_features(path) else sorted(each for each in path.iterdir() if holds_features(each))
+        if not inner:
+            raise InputError(f"{path}: holds no features, nor folders of features; expected what fuse or encode wrote")
+        for folder in inner:
+            if folder is path or folder.name in wanted:
+                folders.setdefault(folder.resolve(), folder)
+    return list(folders.values())
+
+
+def photos_of(photos: str, features: Path) -> str:
+    """The scene with the photographs of a folder of features: of a folder of scenes the one that is called like it."""
+    return str(folder_of(photos, features.name)) if photos else ""
+
+
+def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion, ...]:
+    """Questions for captions of the best boxes of names, `ask.boxes` for each; names that no table knows have none.
+
+    Raises:
+        InputError: no words lead into the features.
+    """
+    if asker.words is None:
+        raise InputError(f"proposals=localize: no words lead into the features of {asker.scene.name}; give words=")
+    table = closed_table(asker.words)
+    known = [name for name in names if table is None or table.find(name) is not None]
+    if not known:
+        return ()
+    found = localize(asker.scene, known, asker.words, asker.localization, space=asker.space)
+    questions = []
+    for number, box in enumerate(best_boxes(found, asker.config.boxes)):
+        low, high = box.aabb_min.tolist(), box.aabb_max.tolist()
+        aabb = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        keys = {"obj_prob": [1 - float(box.probability), float(box.probability)]}
+        if (box.aabb_min < box.aabb_max).all():
+            questions.append(caption_question(asker.scene.name, str(number), aabb, keys))
+    return tuple(questions)

@@ -1,0 +1,91 @@
+"""`gsencoder questions SCENE… out=FOLDER`: questions, situations and expressions with their answers, from labels."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.tracking import Track
+from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
+from gsencoder.data.truth.made_expressions import make_expressions, write_expressions
+from gsencoder.data.truth.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
+from gsencoder.data.truth.made_situations import make_situations
+from gsencoder.data.truth.questions import write_scanqa
+from gsencoder.data.truth.seen_objects import SeenScene, see_objects
+from gsencoder.data.truth.write_sqa3d import write_sqa3d
+
+QUESTIONS, EXPRESSIONS, SITUATED = "questions.json", "expressions.json", "situated_questions.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuestionsCommandConfig(QuestionsConfig, CommonConfig):
+    """Settings of `questions`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "help": "scenes with photographs, instance maps and objects.json, or folders of such",
+            "metavar": "SCENE",
+            "required": True,
+        },
+    )
+    per_object: int = field(default=3, metadata={"help": "most expressions that mean one object"})
+    objects: int = field(default=0, metadata={"help": "most objects of a scene with expressions; 0 = all"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+
+    def __post_init__(self) -> None:
+        QuestionsConfig.__post_init__(self)
+        if self.per_object < 1 or self.objects < 0:
+            raise InputError(
+                f"per_object, objects: expected per_object from 1 and objects from 0, got {self.per_object}, "
+                f"{self.objects}"
+            )
+
+
+def run(config: QuestionsCommandConfig, summary: Summary) -> None:
+    """Reads the labels of all scenes and writes what can be asked as ScanQA, SQA3D and ScanRefer write it."""
+    out = config.out or Path("outputs") / "questions"
+    screen = console(config.quiet)
+    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+        with summary.step("labels"):
+            scenes = list(_seen(config, Progress(quiet=config.quiet)))
+        with summary.step("make"):
+            questions = make_questions(scenes, config)
+            situations = make_situations(scenes, seed=config.seed, per_kind=config.per_kind)
+            expressions = make_expressions(
+                scenes, seed=config.seed, per_object=config.per_object, per_scene=config.objects
+            )
+        write_scanqa(folder / QUESTIONS, questions)
+        write_sqa3d(folder / SITUATED, situations)
+        write_expressions(folder / EXPRESSIONS, expressions)
+        counts = Counter(kind_of(each) for each in questions)
+        kinds = {kind: counts[kind] for kind in KINDS}
+        situated = Counter(each.id.rsplit("-", 2)[1] for each in situations)
+        unique = sum(each.unique for each in expressions)
+        summary.results.update(
+            scenes=[scene.name for scene in scenes],
+            questions=len(questions),
+            kinds=kinds,
+            answers=dict(Counter(each.answers[0] for each in questions).most_common()),
+            situated=len(situations),
+            situated_kinds=dict(situated),
+            expressions=len(expressions),
+            unique_expressions=unique,
+            described_objects=len({each.expression.key[:2] for each in expressions}),
+            files=[QUESTIONS, SITUATED, EXPRESSIONS],
+        )
+    for kind, count in (kinds | dict(situated)).items():
+        screen.print(f"{kind:>10}: {count} questions")
+    screen.print(f"{out}: {len(questions)} questions, {len(situations)} situated ones, {len(expressions)} expressions")
+
+
+def _seen(config: QuestionsCommandConfig, track: Track) -> Iterator[SeenScene]:
+    paths = find_scenes(config.paths)
+    check_names(paths)
+    for path in track(paths, "scenes"):
+        yield see_objects(load_scene(path, options=config.data), config.min_pixels)

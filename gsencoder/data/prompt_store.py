@@ -1,0 +1,175 @@
+"""Prompts on disk: what a VLM was or will be told and shown, prepared once and read many times.
+
+A folder has `prompts.jsonl`, one line a prompt, and beside it its pictures, encoded as they are sent, and tokens. These
+files are called by the digest of what is in them, so that questions about the same thing share theirs.
+"""
+
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float16, UInt8
+from PIL import Image
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.json_values import write_bytes
+
+PROMPTS_FILE, PICTURES_FOLDER, TOKENS_FOLDER = "prompts.jsonl", "pictures", "tokens"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredPrompt:
+    """A prompt in a store.
+
+    Attributes:
+        text: the words.
+        pictures: names of the files of its pictures, in their order.
+        tokens: name of the file of rendered features, one set of tokens a picture; empty = none.
+        space: of these features, for people and to tell one from another.
+    """
+
+    text: str
+    pictures: tuple[str, ...]
+    tokens: str = ""
+    space: str = ""
+
+
+class PromptStore:
+    """A folder of prompts. Each is on the disk when `add` returns, so that an interrupted preparation is continued.
+
+    Attributes:
+        folder: where they are.
+        prompts: by key.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Args:
+        folder: an existing one; empty, or filled by a store.
+
+        Raises:
+            InputError: it holds something else, or a line that no store wrote.
+        """
+        self.folder = folder
+        self.prompts: dict[str, StoredPrompt] = {}
+        path = folder / PROMPTS_FILE
+        if not path.is_file():
+            return
+        try:
+            # What follows the last line break was cut off.
+            lines = path.read_bytes().split(b"\n")[:-1]
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+        for number, line in enumerate(lines, start=1):
+            try:
+                self._take(json.loads(line))
+            except (ValueError, KeyError, TypeError, RecursionError) as error:
+                raise InputError(f"{path}: line {number} is no prompt; remove the folder to prepare it anew") from error
+
+    def _take(self, row: Mapping[str, Any]) -> None:
+        text, tokens, space = row["text"], row["tokens"], row["space"]
+        prompt = StoredPrompt(text=text, pictures=tuple(row["pictures"]), tokens=tokens, space=space)
+        names = (*prompt.pictures, *([prompt.tokens] if prompt.tokens else []))
+        texts = isinstance(text, str) and isinstance(space, str) and isinstance(tokens, str)
+        if not texts or not prompt.pictures or not all(_is_file_name(name) for name in names):
+            raise ValueError(row)
+        self.prompts[row["key"]] = prompt
+
+    def add(
+        self,
+        key: str,
+        text: str,
+        pictures: Sequence[bytes],
+        tokens: Float16[np.ndarray, "V P D"] | None = None,
+        space: str = "",
+    ) -> StoredPrompt:
+        """Writes a prompt.
+
+        Args:
+            key: states all that it was made from.
+            text: the words.
+            pictures: encoded as JPEG or PNG.
+            tokens: rendered features of the pictures on the grid of a vision tower.
+            space: of these features.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        names = tuple(self._write_picture(each) for each in pictures)
+        file = "" if tokens is None else self._write_tokens(tokens)
+        prompt = StoredPrompt(text=text, pictures=names, tokens=file, space=space)
+        line = json.dumps({"key": key, **asdict(prompt)}, ensure_ascii=False).encode() + b"\n"
+        path = self.folder / PROMPTS_FILE
+        try:
+            if not self.prompts:
+                path.unlink(missing_ok=True)
+            elif key not in self.prompts:
+                self._drop_cut_line(path)
+            with path.open("ab") as stream:
+                stream.write(line)
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            raise InputError(f"{path}: cannot write: {error.strerror or error}") from error
+        self.prompts[key] = prompt
+        return prompt
+
+    def _drop_cut_line(self, path: Path) -> None:
+        """Removes a last line that was cut off, to which the next would be appended."""
+        size = path.stat().st_size
+        with path.open("r+b") as stream:
+            stream.seek(max(0, size - 1))
+            if stream.read(1) != b"\n":
+                stream.seek(0)
+                stream.truncate(stream.read().rfind(b"\n") + 1)
+
+    def _write_picture(self, data: bytes) -> str:
+        name = f"{sha256(data).hexdigest()[:32]}.{'png' if data.startswith(bytes([137]) + b'PNG') else 'jpg'}"
+        folder = self.folder / PICTURES_FOLDER
+        folder.mkdir(exist_ok=True)
+        if not (folder / name).is_file():
+            write_bytes(folder / name, data)
+        return name
+
+    def _write_tokens(self, tokens: Float16[np.ndarray, "V P D"]) -> str:
+        name = f"{sha256(repr(tokens.shape).encode() + tokens.tobytes()).hexdigest()[:32]}.safetensors"
+        folder = self.folder / TOKENS_FOLDER
+        folder.mkdir(exist_ok=True)
+        if not (folder / name).is_file():
+            write_archive(folder / name, {"tokens": tokens}, {})
+        return name
+
+    def picture(self, name: str) -> UInt8[np.ndarray, "H W 3"]:
+        """A picture as a model gets it.
+
+        Raises:
+            InputError: it is gone or damaged.
+        """
+        path = self.folder / PICTURES_FOLDER / name
+        try:
+            data = path.read_bytes()
+            if sha256(data).hexdigest()[:32] != path.stem:
+                raise InputError(f"{path}: is damaged; remove {self.folder} to prepare it anew")
+            return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read; remove {self.folder} to prepare it anew") from error
+
+    def tokens(self, name: str) -> Float16[np.ndarray, "V P D"]:
+        """Rendered features of the pictures of a prompt.
+
+        Raises:
+            InputError: they are gone or damaged.
+        """
+        path = self.folder / TOKENS_FOLDER / name
+        with open_archive(path) as file:
+            return file.array("tokens", "float16", file.shape("tokens", "float16", 3))
+
+
+def _is_file_name(name: object) -> bool:
+    return isinstance(name, str) and Path(name).name == name and name not in (".", "..")

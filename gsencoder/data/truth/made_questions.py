@@ -1,0 +1,235 @@
+"""Questions about labeled scenes with their answers, made from the labels by a seed: of the kinds of ScanQA.
+
+A question is made only where people would agree on its answer:
+
+- A thing is asked about if some photograph shows at least `min_pixels` of it, by its name, if no other name of the
+  scene may stand for the same thing (`english_nouns.alike`). "The" thing is the only one of its name in the labels.
+- next_to: the nearest thing beside it, at most 0.5 m away, and nearer than any of another name by 0.1 m and by half
+  (`relations.neighbor`).
+- how_many: every object of the name that any photograph shows is shown well enough; at most ten.
+- color: nearly all pixels of it have one color word in every photograph that shows it well (`color_names`).
+- where: what it stands on, if one thing qualifies and it is in none (`relations.supporter`), or what it is next to.
+- is_there: yes where an object of the name is shown well enough; no for names that no label has, nor any name that may
+  stand for the same thing.
+"""
+
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.english_nouns import NUMBERS, alike, is_plural, plural, with_article
+from gsencoder.data.truth.questions import Question
+from gsencoder.data.truth.relations import movables, neighbor, supporter
+from gsencoder.data.truth.seen_objects import SeenObject, SeenScene
+
+Kind = Literal["next_to", "how_many", "color", "where", "is_there"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+ABSENT = (
+    "apple", "backpack", "banana", "bathtub", "bed", "bicycle", "broom", "drill", "drum", "dumbbell", "fireplace",
+    "globe", "guitar", "hammer", "helmet", "keyboard", "ladder", "lemon", "microwave", "orange", "piano", "printer",
+    "refrigerator", "scissors", "skateboard", "sofa", "stroller", "suitcase", "teddy bear", "telephone", "tent",
+    "toaster", "toilet", "treadmill", "tricycle", "trumpet", "umbrella", "violin", "washing machine", "wheelchair",
+)  # fmt: skip
+"""Names that are asked about where a scene does not have them. None is of a thing that others hide in or consist of, as
+forks lie among other utensils without a label of their own."""
+
+Unit = tuple[Question, ...]
+"""Questions that stay together, such as one whose answer is yes and one whose answer is no."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuestionsConfig:
+    """How questions are made."""
+
+    seed: int = field(default=0, metadata={"help": "of the choice among all questions that can be asked"})
+    per_kind: int = field(default=10, metadata={"help": "most questions of a kind about a scene"})
+    min_pixels: int = field(
+        default=200,
+        metadata={"help": "pixels that some photograph shows of an object before anything is asked about it"},
+    )
+    balance: bool = field(
+        default=True, metadata={"help": "as many questions of each kind, as there are of the rarest; false = all"}
+    )
+    absent: tuple[str, ...] = field(
+        default=ABSENT, metadata={"help": "names that are asked about where a scene does not have them"}
+    )
+
+    def __post_init__(self) -> None:
+        for name, least in (("seed", 0), ("per_kind", 2), ("min_pixels", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        if any(not name.strip() for name in self.absent):
+            raise InputError("absent: expected names, got an empty one")
+
+
+def make_questions(scenes: Iterable[SeenScene], config: QuestionsConfig = QuestionsConfig()) -> tuple[Question, ...]:
+    """Questions about scenes, balanced over kinds, without two of one text in a scene.
+
+    What is asked about a scene depends on the scene, its name and the seed alone; which of it is left out for balance
+    depends on the other scenes. The order of the scenes does not matter.
+
+    Raises:
+        InputError: two scenes of one name, or nothing can be asked.
+    """
+    scenes = sorted(scenes, key=lambda scene: scene.name)
+    if len({scene.name for scene in scenes}) < len(scenes):
+        raise InputError("questions: two scenes have one name")
+    units = {scene.name: scene_units(scene, config) for scene in scenes}
+    chosen = balanced(units, config.balance)
+    if not chosen:
+        raise InputError(
+            f"questions: nothing can be asked about {len(scenes)} scenes: no named object is shown by "
+            f"{config.min_pixels} pixels and is clear"
+        )
+    return chosen
+
+
+def scene_rng(seed: int, scene: str, part: int) -> np.random.Generator:
+    """Random numbers of a scene, the same whichever other scenes there are."""
+    return np.random.default_rng([seed, zlib.crc32(scene.encode()), part])
+
+
+def scene_units(scene: SeenScene, config: QuestionsConfig) -> dict[Kind, Sequence[Unit]]:
+    """What is asked about a scene: of each kind at most `per_kind` questions, and, of how_many and color, not more than
+    half of them, rounded up, with one answer."""
+    units: dict[Kind, Sequence[Unit]] = {}
+    for number, (kind, questions) in enumerate(_candidates(scene, config.absent).items()):
+        rng = scene_rng(config.seed, scene.name, number)
+        shuffled = [questions[row] for row in rng.permutation(len(questions))]
+        units[kind] = _paired(shuffled, config.per_kind) if kind == "is_there" else _varied(shuffled, config.per_kind)
+    return units
+
+
+def balanced(units: Mapping[str, Mapping[Kind, Sequence[Unit]]], equal: bool) -> tuple[Question, ...]:
+    """Questions with their ids, kind by kind, scene by scene.
+
+    Args:
+        units: of each scene.
+        equal: as many of each kind as of the rarest that there is at all, or one more where a pair is not to be torn
+            apart; they are taken from all scenes in turn.
+    """
+    by_kind: dict[Kind, list[tuple[int, str, Unit]]] = {
+        kind: sorted(
+            ((row, name, unit) for name, kinds in units.items() for row, unit in enumerate(kinds[kind])),
+            key=lambda one: one[:2],
+        )
+        for kind in KINDS
+    }
+    counts = [sum(len(unit) for _, _, unit in one) for one in by_kind.values() if one]
+    most = min(counts, default=0)
+    chosen: list[Question] = []
+    for kind, ranked in by_kind.items():
+        kept = ranked[: -(-most // len(ranked[0][2]))] if equal and ranked else ranked
+        numbers: dict[str, int] = {}
+        for _, name, unit in sorted(kept, key=lambda one: (one[1], one[0])):
+            for question in unit:
+                numbers[name] = numbers.get(name, -1) + 1
+                chosen.append(replace(question, id=f"{name}-{kind}-{numbers[name]}"))
+    return tuple(chosen)
+
+
+def kind_of(question: Question) -> Kind | None:
+    """The kind of a question that was made here; None of another one."""
+    parts = question.id.rsplit("-", 2)
+    return next((kind for kind in KINDS if len(parts) == 3 and parts[1] == kind), None)
+
+
+def clear_names(scene: SeenScene) -> tuple[str, ...]:
+    """Names all of whose objects are shown well enough, and beside which no name is that may mean the same."""
+    there = {thing.name for thing in scene.objects if thing.name and thing.pixels}
+    return tuple(name for name in scene.names() if not any(alike(name, other) for other in there))
+
+
+def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Question]]:
+    """All that can be asked, kind by kind, sorted by name."""
+    things = movables(scene.objects)
+    clear = clear_names(scene)
+    single = [thing for thing in map(scene.unique, clear) if thing is not None]
+    return {
+        "next_to": [
+            question
+            for thing in single
+            if (beside := neighbor(thing, things)) is not None and scene.shown(beside)
+            for question in [
+                _question(scene, f"What is next to the {thing.name}?", [str(beside.name)], [thing, beside])
+            ]
+        ],
+        "how_many": [
+            _question(
+                scene, f"How many {plural(name)} are there in the room?", [str(len(same)), NUMBERS[len(same)]], same
+            )
+            for name in clear
+            if not is_plural(name) and len(same := scene.named(name)) < len(NUMBERS)
+        ],
+        "color": [
+            _question(scene, f"What color {_be(thing)} the {thing.name}?", [thing.color], [thing])
+            for thing in single
+            if thing.color is not None
+        ],
+        "where": [question for thing in single if (question := _where(scene, thing, things)) is not None],
+        "is_there": [
+            *(_question(scene, _there(name), ["yes"], list(scene.named(name))) for name in clear),
+            *(_question(scene, _there(name), ["no"], []) for name in absent_names(scene, absent)),
+        ],
+    }
+
+
+def absent_names(scene: SeenScene, names: Sequence[str]) -> list[str]:
+    """The names that no label of a scene has, nor any name that may stand for the same thing."""
+    there = {thing.name for thing in scene.objects if thing.name}
+    return sorted({name for name in names if name not in there and not any(alike(name, other) for other in there)})
+
+
+def _where(scene: SeenScene, thing: SeenObject, things: Sequence[SeenObject]) -> Question | None:
+    """Where a thing is: on what, and beside what, as far as this is clear; the first of both is what must be seen."""
+    on, beside = supporter(thing, things), neighbor(thing, things)
+    answers: list[str] = []
+    needed: list[SeenObject] = []
+    for word, other in (("on", on), ("next to", beside)):
+        if other is not None and scene.shown(other):
+            answers.append(f"{word} the {other.name}")
+            needed = needed or [thing, other]
+    return _question(scene, f"Where {_be(thing)} the {thing.name}?", answers, needed) if answers else None
+
+
+def _there(name: str) -> str:
+    return f"Are there any {name} in the room?" if is_plural(name) else f"Is there {with_article(name)} in the room?"
+
+
+def _be(thing: SeenObject) -> str:
+    return "are" if thing.name and is_plural(thing.name) else "is"
+
+
+def _question(scene: SeenScene, text: str, answers: Sequence[str], needed: Sequence[SeenObject]) -> Question:
+    return Question(
+        dataset="scanqa",
+        id="",
+        scene=scene.name,
+        text=text,
+        answers=tuple(answers),
+        object_ids=tuple(thing.id for thing in needed),
+        object_names=tuple(thing.name or "" for thing in needed),
+    )
+
+
+def _varied(questions: Sequence[Question], count: int) -> list[Unit]:
+    """The first so many questions, of which no answer has more than half, rounded up."""
+    most = -(-count // 2)
+    taken: dict[str, int] = {}
+    kept: list[Unit] = []
+    for question in questions:
+        answer = question.answers[0]
+        if taken.get(answer, 0) < most and len(kept) < count:
+            taken[answer] = taken.get(answer, 0) + 1
+            kept.append((question,))
+    return kept
+
+
+def _paired(questions: Sequence[Question], count: int) -> Sequence[Unit]:
+    """Pairs of a question to be answered with yes and one with no."""
+    yes, no = ([each for each in questions if each.answers == (answer,)] for answer in ("yes", "no"))
+    return [*zip(yes, no, strict=False)][: count // 2]

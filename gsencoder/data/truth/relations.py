@@ -1,0 +1,117 @@
+"""Relations of labeled objects by their boxes, stated only where they are clear. Lengths are meters, z is up."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsencoder.data.truth.seen_objects import SeenObject
+
+NEAR = 0.5
+"""Things farther apart than this are not next to each other."""
+MARGIN = 0.1
+"""What is next to a thing is nearer to it than any other kind of thing, by this and by half."""
+TOUCHING = 0.04
+"""A thing stands on another if its lower side is at most so far from the other's upper side, …"""
+ON_SHARE = 0.6
+"""… and this share of its outline lies within the other's."""
+SAME_PLACE = 0.3
+"""Things whose boxes share more than this of the smaller one's volume are in or around each other, not beside."""
+LARGEST = 1.3
+"""The largest of some things is so many times as long, across its box, as any other."""
+
+
+def gap(a: SeenObject, b: SeenObject) -> float:
+    """The distance between two boxes; 0 where they touch or overlap."""
+    apart = np.maximum(np.maximum(a.aabb_min - b.aabb_max, b.aabb_min - a.aabb_max), 0)
+    return float(np.linalg.norm(apart))
+
+
+def stands_on(upper: SeenObject, lower: SeenObject) -> bool:
+    """Whether the lower side of a box lies on the upper side of another."""
+    if abs(upper.aabb_min[2] - lower.aabb_max[2]) > TOUCHING:
+        return False
+    return outline_share(upper, lower) >= ON_SHARE
+
+
+def outline_share(a: SeenObject, b: SeenObject) -> float:
+    """Which share of the outline of a box, seen from above, lies within that of another; 0 for a flat one."""
+    shared = np.clip(np.minimum(a.aabb_max, b.aabb_max) - np.maximum(a.aabb_min, b.aabb_min), 0, None)[:2].prod()
+    area = (a.aabb_max - a.aabb_min)[:2].prod()
+    return float(shared / area) if area > 0 else 0.0
+
+
+def interlocked(a: SeenObject, b: SeenObject) -> bool:
+    """Whether a box is largely inside of another: in it, around it, or in its hollow."""
+    shared = np.clip(np.minimum(a.aabb_max, b.aabb_max) - np.maximum(a.aabb_min, b.aabb_min), 0, None).prod()
+    smaller = min((a.aabb_max - a.aabb_min).prod(), (b.aabb_max - b.aabb_min).prod())
+    return bool(smaller > 0 and shared > SAME_PLACE * smaller)
+
+
+def is_structure(thing: SeenObject, others: Sequence[SeenObject]) -> bool:
+    """Whether a thing without a name is part of the building: its box holds the middle of half of all the others."""
+    if thing.name is not None or not others:
+        return False
+    xy = np.array([other.center[:2] for other in others])
+    inside = ((xy >= thing.aabb_min[:2]) & (xy <= thing.aabb_max[:2])).all(axis=1)
+    return bool(inside.mean() >= 0.5)
+
+
+def movables(things: Sequence[SeenObject]) -> tuple[SeenObject, ...]:
+    """All things that are no part of the building."""
+    return tuple(
+        thing for thing in things if not is_structure(thing, [other for other in things if other is not thing])
+    )
+
+
+def beside(thing: SeenObject, things: Sequence[SeenObject]) -> list[tuple[float, SeenObject]]:
+    """The things that may be beside another, nearest first, with their distances.
+
+    Left out are what it stands on or carries, what it is in or around, and what is wholly above or below it, as a
+    carpet is.
+
+    Args:
+        thing: one of `things`.
+        things: of `movables`.
+    """
+    others = [
+        (gap(thing, other), other)
+        for other in things
+        if other is not thing
+        and not stands_on(thing, other)
+        and not stands_on(other, thing)
+        and not interlocked(thing, other)
+        and min(thing.aabb_max[2], other.aabb_max[2]) > max(thing.aabb_min[2], other.aabb_min[2])
+    ]
+    return sorted(others, key=lambda pair: (pair[0], pair[1].id))
+
+
+def clearly_nearer(first: float, second: float) -> bool:
+    """Whether one distance is smaller than another by enough for people to agree."""
+    return second >= max(1.5 * first, first + MARGIN)
+
+
+def neighbor(thing: SeenObject, things: Sequence[SeenObject]) -> SeenObject | None:
+    """What a thing is next to, where people would agree on its kind: the nearest of `beside`, at most 0.5 m away, and
+    nearer than any thing of another name by 0.1 m and by half. None where it has no name or nothing is clear."""
+    ranked = beside(thing, things)
+    if not ranked or ranked[0][1].name is None or ranked[0][1].name == thing.name or ranked[0][0] > NEAR:
+        return None
+    first, nearest = ranked[0]
+    second = min((distance for distance, other in ranked if other.name != nearest.name), default=np.inf)
+    return nearest if clearly_nearer(first, second) else None
+
+
+def supporter(thing: SeenObject, things: Sequence[SeenObject]) -> SeenObject | None:
+    """What a thing stands on, where only one thing qualifies, it has a name, and the thing is in no other's box."""
+    lower = [other for other in things if other is not thing and stands_on(thing, other)]
+    inside = [other for other in things if other is not thing and interlocked(thing, other)]
+    return lower[0] if len(lower) == 1 and lower[0].name is not None and not inside else None
+
+
+def largest(things: Sequence[SeenObject]) -> SeenObject | None:
+    """The largest of several things; None where another is nearly as long across its box."""
+    sizes = np.array([np.linalg.norm(thing.aabb_max - thing.aabb_min) for thing in things])
+    if len(things) < 2:
+        return None
+    order = np.argsort(-sizes, kind="stable")
+    return things[order[0]] if sizes[order[0]] >= LARGEST * sizes[order[1]] else None

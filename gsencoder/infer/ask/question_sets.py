@@ -1,0 +1,220 @@
+"""Question sets of benchmarks, as `ask` takes them: ScanQA's, SQA3D's, ScanRefer's and Scan2Cap's files."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.entries import Corner, corner_bounds, object_of, read_benchmark_json, scene_name, shown
+from gsencoder.data.truth.expressions import Expression, read_scanrefer
+from gsencoder.data.truth.questions import Question as TruthQuestion
+from gsencoder.data.truth.questions import read_questions as read_truth
+from gsencoder.infer.ask.ask import Question
+from gsencoder.infer.ask.prompts import Task
+from gsencoder.infer.ask.questions import BatchQuestion
+
+Benchmark = Literal["scanqa", "sqa3d", "scanrefer", "scan2cap"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetQuestion:
+    """A question of a set.
+
+    Attributes:
+        scene: that it is about.
+        asked: what is asked, with an id that is unique in the set.
+        keys: by which the benchmark's predictions name it, such as question_id.
+    """
+
+    scene: str
+    asked: BatchQuestion
+    keys: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuestionSet:
+    """The questions of a benchmark's file.
+
+    Attributes:
+        benchmark: whose form the file and the predictions have.
+        questions: in the order of the file.
+        names: for captions without given boxes, the names of the objects of each scene, whose boxes are localized.
+    """
+
+    benchmark: Benchmark
+    questions: tuple[SetQuestion, ...]
+    names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def of_scene(self, scene: str) -> tuple[SetQuestion, ...]:
+        """The questions about a scene."""
+        return tuple(each for each in self.questions if each.scene == scene)
+
+    def scenes(self) -> dict[str, int]:
+        """The scenes, and how many questions there are about each: with `names` the number of these."""
+        counts: dict[str, int] = {scene: len(names) for scene, names in self.names.items()}
+        for each in self.questions:
+            counts[each.scene] = counts.get(each.scene, 0) + 1
+        return counts
+
+
+def is_question_set(path: Path) -> bool:
+    """Whether a file holds one JSON value, as the benchmarks' do, and not one question a line.
+
+    A file that cannot be read is no set; whoever reads it as lines says what is wrong.
+    """
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
+            if not start.startswith(b"{"):
+                return start.startswith(b"[")
+            stream.seek(0)
+            content = json.loads(stream.read().decode("utf-8-sig"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return "question" not in content and "query" not in content and "aabb" not in content
+
+
+def read_question_set(path: Path, task: Task = "answer", proposals: str = "") -> QuestionSet:
+    """Reads a benchmark's file, recognized by its content.
+
+    Questions of ScanQA and SQA3D are answered; a situation is said before its question. Descriptions of ScanRefer are
+    grounded or, with `task="caption"`, the objects described are captioned: in the boxes of the file (`bbox`, as
+    Scan2Cap's has them), in those of `proposals`, or in those that are localized. Answers in the file are not read.
+
+    Args:
+        path: of the file.
+        task: "answer" stands for what the benchmark asks.
+        proposals: a file of boxes, {scene: [{"box": eight corners}, …]} as Scan2Cap's predictions have them;
+            "localize" = the boxes of the objects' names; empty = those of the file.
+
+    Raises:
+        InputError: no such file, another task than the benchmark's, or boxes are missing.
+    """
+    content = read_benchmark_json(path)
+    first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}
+    if isinstance(content, dict) and "questions" not in content and "annotations" not in content:
+        _check_task(path, "Scan2Cap's boxes", task, ("answer", "caption"))
+        return QuestionSet(benchmark="scan2cap", questions=_captions(_read_boxes(content, path)))
+    if isinstance(content, list) and not content:
+        raise InputError(f"questions: {path} holds none")
+    if "description" in first:
+        _check_task(path, "ScanRefer's descriptions", task, ("answer", "ground", "caption"))
+        expressions = read_scanrefer(path)
+        return _captioned(expressions, path, proposals) if task == "caption" else _grounded(expressions)
+    questions = read_truth(path, answered=False)
+    benchmark: Benchmark = questions[0].dataset if questions else "scanqa"
+    _check_task(path, "ScanQA's questions" if benchmark == "scanqa" else "SQA3D's questions", task, ("answer",))
+    if proposals:
+        raise InputError("proposals: are for captions; leave it out")
+    return QuestionSet(benchmark=benchmark, questions=tuple(map(_answered, questions)))
+
+
+def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: Mapping[str, Any]) -> SetQuestion:
+    """The question for a caption of what is in a box.
+
+    Args:
+        scene: of the box.
+        name: of the question, unique in the scene.
+        aabb: lower and upper corner in world coordinates.
+        keys: what the prediction says besides caption and box, such as probabilities.
+    """
+    question = Question(task="caption", aabb=(*aabb[0], *aabb[1]))
+    return SetQuestion(scene=scene, asked=BatchQuestion(id=f"{scene}/{name}", question=question), keys=keys)
+
+
+def _check_task(path: Path, what: str, task: Task, allowed: Sequence[str]) -> None:
+    if task not in allowed:
+        raise InputError(f"task={task}: {path} holds {what}; expected task={' or '.join(allowed)}")
+
+
+def _answered(question: TruthQuestion) -> SetQuestion:
+    text, keys = question.text, {"scene_id": question.scene, "question_id": question.id}
+    if question.situation:
+        text = f"{question.situation} {text}"
+        keys |= {"situation": question.situation, "question": question.text}
+    return SetQuestion(
+        scene=question.scene,
+        asked=BatchQuestion(id=question.id, question=Question(text=text)),
+        keys=keys,
+    )
+
+
+def _grounded(expressions: Sequence[Expression]) -> QuestionSet:
+    return QuestionSet(
+        benchmark="scanrefer",
+        questions=tuple(
+            SetQuestion(
+                scene=each.scene,
+                asked=BatchQuestion(
+                    id=f"{each.scene}/{each.object_id}/{each.annotation}",
+                    question=Question(text=each.text, task="ground"),
+                ),
+                keys={"scene_id": each.scene, "object_id": str(each.object_id), "ann_id": each.annotation},
+            )
+            for each in expressions
+        ),
+    )
+
+
+def _captioned(expressions: Sequence[Expression], path: Path, proposals: str) -> QuestionSet:
+    if proposals == "localize":
+        names: dict[str, tuple[str, ...]] = {}
+        for each in expressions:
+            name = each.object_name.replace("_", " ")
+            names[each.scene] = tuple(dict.fromkeys((*names.get(each.scene, ()), name)))
+        return QuestionSet(benchmark="scan2cap", questions=(), names=names)
+    if proposals:
+        given = read_benchmark_json(Path(proposals))
+        boxes = _read_boxes(object_of(given, proposals, "the boxes of each scene"), Path(proposals))
+        scenes = {each.scene for each in expressions}
+        return QuestionSet(
+            benchmark="scan2cap", questions=_captions({name: rows for name, rows in boxes.items() if name in scenes})
+        )
+    unboxed = [each for each in expressions if each.aabb is None]
+    if unboxed:
+        raise InputError(
+            f"{path}: {len(unboxed)} of {len(expressions)} descriptions have no bbox to be captioned; give proposals= "
+            "(a file of boxes, or localize)"
+        )
+    objects = {(each.scene, each.object_id): each.aabb for each in expressions}
+    return QuestionSet(
+        benchmark="scan2cap",
+        questions=tuple(
+            caption_question(scene, str(number), aabb, {})
+            for (scene, number), aabb in objects.items()
+            if aabb is not None
+        ),
+    )
+
+
+def _read_boxes(
+    content: Mapping[str, Any], path: Path
+) -> dict[str, list[tuple[tuple[Corner, Corner], dict[str, Any]]]]:
+    """The boxes of each scene, and what else a prediction says of them; captions are not looked at."""
+    boxes: dict[str, list[tuple[tuple[Corner, Corner], dict[str, Any]]]] = {}
+    for name, rows in content.items():
+        scene = scene_name(name, str(path))
+        if not isinstance(rows, list):
+            raise InputError(
+                f"{path}: {scene}: expected a list of objects with a box of eight corners, got {shown(rows)}"
+            )
+        for index, row in enumerate(rows):
+            where = f"{path}: {scene}[{index}]"
+            entry = object_of(row, where, "a box of eight corners")
+            keys = {key: entry[key] for key in ("sem_prob", "obj_prob") if key in entry}
+            boxes.setdefault(scene, []).append((corner_bounds(entry.get("box"), where, "box"), keys))
+    if not boxes:
+        raise InputError(f"{path}: holds no boxes")
+    return boxes
+
+
+def _captions(
+    boxes: Mapping[str, Sequence[tuple[tuple[Corner, Corner], Mapping[str, Any]]]],
+) -> tuple[SetQuestion, ...]:
+    return tuple(
+        caption_question(scene, str(number), aabb, keys)
+        for scene, rows in boxes.items()
+        for number, (aabb, keys) in enumerate(rows)
+    )

@@ -1,0 +1,199 @@
+"""A vision-language model of transformers under low-rank adapters of peft: loaded, wrapped and written."""
+
+import os
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import nn
+
+from gsencoder.core.errors import InputError, listed
+from gsencoder.core.files.model_files import digest_files
+from gsencoder.core.pretrained import load_companion, load_pretrained, quiet_transformers, read_config, weight_files
+
+WHAT = "tune"
+SERVED_FOLDER = "served"
+MAX_RANK = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdapterConfig:
+    """Low-rank adapters (LoRA, Hu et al. 2021): a layer's W x becomes W x + (alpha / rank) · B A x."""
+
+    rank: int = field(default=16, metadata={"help": "rank of A and B"})
+    alpha: float = field(default=32.0, metadata={"help": "scale of the adapters, divided by the rank"})
+    dropout: float = field(default=0.05, metadata={"help": "share of an adapter's inputs that is dropped in training"})
+    targets: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "names": True,
+            "help": "ends of the names of the linear layers that get adapters, such as q_proj,v_proj; layers of the "
+            "vision tower get none; empty = all of the language model",
+        },
+    )
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.rank <= MAX_RANK:
+            raise InputError(f"rank: expected 1 to {MAX_RANK:,}, got {self.rank}")
+        if not 0 < self.alpha < float("inf"):
+            raise InputError(f"alpha: expected a positive number, got {self.alpha}")
+        if not 0 <= self.dropout < 1:
+            raise InputError(f"dropout: expected a share from 0 to below 1, got {self.dropout}")
+
+
+def check_peft() -> None:
+    """Raises:
+    InputError: peft is missing."""
+    try:
+        import peft  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"{WHAT}: needs the package peft (pip install 'gsencoder[tune]')") from error
+
+
+@contextmanager
+def quiet_peft() -> Iterator[None]:
+    """Without bars, tables, and the warning that peft asks models of transformers by an old name."""
+    with quiet_transformers(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
+        yield
+
+
+def load_processor(folder: Path) -> tuple[Any, Any]:
+    """Configuration and processor of a vision-language model, without its weights.
+
+    Raises:
+        InputError: transformers is missing, the model takes no pictures, or there is no processor or no chat template.
+    """
+    config = read_config(folder, WHAT)
+    from transformers import AutoProcessor
+    from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
+
+    if type(config) not in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or not hasattr(config, "vision_config"):
+        raise InputError(
+            f"{WHAT}: {folder}: a model of the kind {config.model_type} takes no pictures with its text; expected a "
+            "vision-language model, such as SmolVLM, LLaVA or Qwen2-VL"
+        )
+    weight_files(folder, WHAT)
+    processor = load_companion(AutoProcessor, folder, WHAT, "processor")
+    if getattr(processor, "image_processor", None) is None or getattr(processor, "tokenizer", None) is None:
+        raise InputError(
+            f"{WHAT}: {folder}: has no processor of pictures and text; expected processor_config.json or "
+            "preprocessor_config.json, and a tokenizer, beside the model"
+        )
+    if not getattr(processor, "chat_template", None):
+        raise InputError(
+            f"{WHAT}: {folder}: its processor has no chat template, by which `ask` and servers put pictures and "
+            "questions together; expected chat_template.jinja beside the model"
+        )
+    return config, processor
+
+
+def model_digest(folder: Path) -> str:
+    """A fingerprint of a model's configuration and weights."""
+    return digest_files(folder / "config.json", *weight_files(folder, WHAT))
+
+
+def load_adapted(
+    folder: Path, config: AdapterConfig, *, base: Literal["float32", "bfloat16"] = "float32", seed: int = 0
+) -> Any:
+    """The model of a folder with new adapters, whose parameters alone are trained. As B = 0, it answers as the model.
+
+    Args:
+        folder: of the model.
+        config: of the adapters.
+        base: the type in which the weights of the model are kept.
+        seed: of A.
+
+    Returns:
+        A `peft.PeftModel`.
+
+    Raises:
+        InputError: peft is missing, the weights cannot be used, or no layer is called as asked.
+    """
+    check_peft()
+    import peft
+    from transformers import AutoModelForImageTextToText
+
+    # Its path is written into the adapters.
+    model = load_pretrained(AutoModelForImageTextToText, folder.resolve(), WHAT)
+    model.to(getattr(torch, base))
+    torch.manual_seed(seed)
+    lora = peft.LoraConfig(
+        r=config.rank,
+        lora_alpha=config.alpha,
+        lora_dropout=config.dropout,
+        target_modules=_layers(model, config.targets),
+    )
+    with quiet_peft():
+        return peft.get_peft_model(model, lora)
+
+
+def _layers(model: Any, targets: tuple[str, ...]) -> list[str]:
+    """Full names of the linear layers that get adapters."""
+    decoder, tower, head = model.get_decoder(), model.get_encoder("image"), model.get_output_embeddings()
+    in_tower = set(tower.modules()) if tower is not model else set()
+    in_decoder = set(decoder.modules())
+    linear = {
+        name: module
+        for name, module in model.named_modules()
+        if isinstance(module, nn.Linear) and module is not head and module not in in_tower
+    }
+    if not targets:
+        return [name for name, module in linear.items() if module in in_decoder]
+    for target in targets:
+        if not any(name == target or name.endswith(f".{target}") for name in linear):
+            ends = sorted({name.rpartition(".")[2] for name in linear})
+            raise InputError(
+                f"lora.targets: no linear layer outside the vision tower is called {target[:60]}; there are "
+                f"{listed(ends, 12)}"
+            )
+    return [name for name in linear if any(name == target or name.endswith(f".{target}") for target in targets)]
+
+
+def save_adapters(folder: Path, adapted: Any, processor: Any) -> None:
+    """Writes adapters as peft does, and the processor, without which servers load no model.
+
+    Args:
+        folder: an existing one.
+        adapted: of `load_adapted`.
+        processor: of the same model.
+    """
+    with quiet_peft():
+        adapted.save_pretrained(str(folder))
+        processor.save_pretrained(str(folder))
+    # A card with blanks to fill in, which peft writes.
+    (folder / "README.md").unlink(missing_ok=True)
+
+
+def link_served(folder: Path, model: Path) -> None:
+    """Makes the folder `served`: links to the model's files and to the adapters, which transformers and its server take
+    for one model with an adapter in it.
+
+    `transformers serve` reads a configuration where the adapters are, and peft's folder has none.
+
+    Args:
+        folder: of the adapters.
+        model: that they belong to.
+    """
+    served = folder / SERVED_FOLDER
+    adapters = [each for each in sorted(folder.iterdir()) if each.is_file() and each.name.startswith("adapter_")]
+    served.mkdir()
+    for path in sorted(model.resolve().iterdir()):
+        pickled = path.suffix in (".bin", ".pt", ".pth", ".ckpt", ".pkl", ".h5", ".msgpack")
+        if path.is_file() and not path.name.startswith(("adapter_", ".")) and not pickled:
+            _link(path, served / path.name)
+    for path in adapters:
+        _link(Path(os.pardir) / path.name, served / path.name)
+
+
+def _link(target: Path, link: Path) -> None:
+    try:
+        link.symlink_to(target)
+    except OSError:
+        # Some systems have no links for everybody.
+        shutil.copyfile(link.parent / target, link)

@@ -1,0 +1,142 @@
+"""What `gsencoder select` says about its results is what the library computes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_runs import refusal, results_of
+from selected_rooms import EMBEDDINGS, selected_room, words
+
+from gsencoder.app import cli
+from gsencoder.data.splats import load_splat
+from gsencoder.data.up import with_up
+from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
+from gsencoder.infer.select.holes import find_holes
+from gsencoder.infer.select.labels_file import read_labels
+from gsencoder.infer.select.select import select
+from gsencoder.infer.select.votes import sampling
+from gsencoder.text.table import TextTable, make_text_table, save_text_table
+from gsencoder.types import Scene
+
+SCENE, KINDS = selected_room()
+
+
+def stored(folder: Path, scene: Scene = SCENE, table: TextTable | None = None) -> Path:
+    save_features(folder, scene, scene.features["names"], {})
+    save_text_table(folder / WORDS_FILE, words() if table is None else table)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return stored(tmp_path_factory.mktemp("results") / "features")
+
+
+def run(*arguments: str | Path) -> None:
+    assert cli.main(["select", *map(str, arguments)]) == 0
+
+
+def test_seeds_and_labels_are_counted_for_each_word(
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(features, "query=mug,book", "threshold=0.9", f"out={tmp_path / 'out'}", "write=[objects,labels]")
+    said = capsys.readouterr().out
+    expected, _ = select(SCENE, ("mug", "book"), words(), threshold=0.9)
+    seeds = [int((expected.seeds == label).sum()) for label in (1, 2)]
+    counts = [int((expected.labels == label).sum()) for label in (1, 2)]
+    assert seeds[0] < counts[0]
+    results = results_of(tmp_path / "out")
+    assert results["seeds"] == seeds
+    assert [row["count"] for row in results["selection"]["labels"][1:]] == counts
+    assert results["metres_per_unit"] == 1.0
+    for name, seed, count in zip(("mug", "book"), seeds, counts, strict=True):
+        assert f"{name}: {count:,} Gaussians, from {seed:,} to start with, {name}.ply" in said
+    part = load_splat(tmp_path / "out" / "mug.ply", origin=SCENE.origin)
+    assert SCENE.gaussians is not None
+    np.testing.assert_allclose(part.means, SCENE.gaussians.means[expected.labels == 1], atol=1e-4)
+
+
+def test_words_with_the_names_of_the_commands_files_get_other_files(tmp_path: Path) -> None:
+    table = make_text_table(("labels", "holes", "summary", "lamp"), EMBEDDINGS, "table")
+    folder = stored(tmp_path / "features", table=table)
+    run(folder, "query=labels,holes", f"out={tmp_path / 'out'}", "quiet=true")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "labels_2.ply", "holes_2.ply", "rest.ply", "labels.ply", "labels.json", "holes.json", "summary.json",
+    }  # fmt: skip
+    run(folder, "query=summary", f"out={tmp_path / 'other'}", "quiet=true", "write=objects")
+    assert (tmp_path / "other" / "summary_2.ply").exists()
+
+
+@pytest.mark.parametrize("under", [True, False])
+def test_holes_are_those_of_the_objects_in_each_view(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], under: bool
+) -> None:
+    scene, _ = selected_room(under=under)
+    folder = stored(tmp_path / "features", scene)
+    run(folder, "query=mug", f"out={tmp_path / 'out'}")
+    said = " ".join(capsys.readouterr().out.split())
+    made = json.loads((tmp_path / "out" / "holes.json").read_text())
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    selection, _ = select(scene, ("mug",), words())
+    cameras = scene.views.cameras
+    holes = find_holes(scene.gaussians, cameras, selection.labels > 0, sampling(cameras, views=48, pixels=100_000))
+    removed, pixels = sum(hole.removed for hole in holes), sum(hole.pixels for hole in holes)
+    assert made == {
+        "views": 8, "views_with_objects": len(holes), "views_with_holes": sum(hole.pixels > 0 for hole in holes),
+        "pixels": pixels, "removed": removed,
+        "largest_area": pytest.approx(max(hole.area for hole in holes)),
+        "by_view": [
+            {"view": scene.views.names[hole.view], "pixels": hole.pixels, "removed": hole.removed,
+             "area": pytest.approx(hole.area)}
+            for hole in holes if hole.pixels
+        ],
+    }  # fmt: skip
+    assert f"nothing is behind {pixels / removed:.0%} of the removed pixels in {len(holes)} views" in said
+
+
+def test_a_box_that_is_asked_for_and_settings_of_boxes_reach_the_selection(
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = SCENE.features["names"]
+    vectors = given.features.copy()
+    vectors[KINDS == 1] = 0.8 * EMBEDDINGS[0] + 0.2 * EMBEDDINGS[2]
+    folder = stored(tmp_path / "two", replace(SCENE, features={"names": replace(given, features=vectors)}))
+    run(folder, "query=mug", "box=1", f"out={tmp_path / 'out'}", "write=labels", "quiet=true")
+    assert ((read_labels(tmp_path / "out").labels == 1) == (KINDS == 1)).mean() > 0.99
+    common = ("select", str(features), "query=mug", f"out={tmp_path / 'none'}")
+    assert "no Gaussian of table is selected" in refusal(capsys, *common, "localize.min_samples=100000")
+    assert "siglip" in refusal(capsys, *common, "head=siglip")
+
+
+def test_results_go_to_a_folder_of_the_scene_and_its_up_is_estimated_where_nobody_knows_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = stored(tmp_path / "features", replace(SCENE, up=None))
+    run(folder, "query=mug", "write=labels", "quiet=true")
+    made = json.loads((tmp_path / "outputs" / "table" / "selection" / "labels.json").read_text())
+    upward = np.array(made["labels"][1]["obb"]["rotation"])[:, 2]
+    known = with_up(load_features(folder))[0].up
+    assert known is not None
+    np.testing.assert_allclose(known, [0, 0, 1], atol=0.1)
+    np.testing.assert_allclose(upward, known, atol=1e-6)
+
+
+def test_no_camera_is_placed_where_no_view_is_looked_at(tmp_path: Path) -> None:
+    folder = stored(tmp_path / "features", replace(SCENE, views=None))
+    run(folder, "query=mug", f"out={tmp_path / 'out'}", "select.views=0", "write=labels", "quiet=true")
+    assert results_of(tmp_path / "out")["placed_cameras"] is False
+
+
+def test_words_are_printed_on_one_line_in_their_own_direction(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    word = "\u202egum"
+    folder = stored(tmp_path / "features", table=make_text_table((word, "book", "table", "lamp"), EMBEDDINGS, "table"))
+    run(folder, f"query={word}", f"out={tmp_path / 'out'}", "write=objects")
+    said = capsys.readouterr().out
+    assert "gum" in said
+    assert "\u202e" not in said

@@ -1,0 +1,188 @@
+"""What the options of `gsencoder view` do to the page, and to the server, which is not run here."""
+
+import gzip
+import json
+import re
+from base64 import b64decode
+from dataclasses import replace
+from pathlib import Path
+from shutil import copytree
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from command_runs import refusal
+from viewed_rooms import STUB, name_features, room_scene, save_viewed_room
+
+from gsencoder.app import cli
+from gsencoder.app.commands import view
+from gsencoder.fusion.store.folder import save_features
+from gsencoder.infer.viewer.container import Container, read_container
+from gsencoder.infer.viewer.page_scene import jpeg_of
+
+pytestmark = pytest.mark.slow
+ROOM = room_scene()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("options")
+    save_viewed_room(made)
+    return made
+
+
+@pytest.fixture(autouse=True)
+def built(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view, "load_bundle", lambda: STUB)
+
+
+def written(out: Path, *arguments: str | Path) -> tuple[list[Container], dict[str, Any]]:
+    """The scenes of the page that a run writes, and the results in its summary."""
+    assert cli.main(["view", *map(str, arguments), f"out={out}", "quiet=true"]) == 0
+    found = re.findall(r'id="scene-\d+">([^<]+)<', out.read_text())
+    results: dict[str, Any] = json.loads(Path(f"{out}.summary.json").read_text())["results"]
+    return [read_container(gzip.decompress(b64decode(blob))) for blob in found], results
+
+
+def test_photographs_and_labeled_objects_come_from_the_scene_that_was_fused(folder: Path, tmp_path: Path) -> None:
+    (scene,), results = written(tmp_path / "a.HTML", folder / "features", f"photos={folder / 'room'}", "photographs=3")
+    assert [name for name in scene.meta["objects"] if name] == [each.name for each in ROOM.objects if each.name]
+    assert scene.meta["photographViews"] == [0, 2, 5]
+    assert ROOM.views is not None
+    first = scene.arrays["photographs"][: scene.meta["photographSizes"][0]].tobytes()
+    assert first == jpeg_of(ROOM.views, 0, 640)
+    assert results["left_out"][0] == f"This file knows {len(scene.meta['words'])} words."
+    (scene,), _ = written(tmp_path / "b.html", folder / "features", f"photos={folder / 'room'}", "photographs=0")
+    assert scene.meta["photographs"] is False
+
+
+def test_options_of_features_boxes_and_words_reach_the_page(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    features = folder / "features"
+    (scene,), results = written(tmp_path / "a.html", features, "localize.max_boxes=3", "error=0.03", "megabytes=1")
+    assert scene.meta["localize"]["maxBoxes"] == 3
+    assert 0.01 < scene.meta["featureError"] <= 0.03
+    assert results["feature_error"] == [scene.meta["featureError"]]
+    assert (tmp_path / "a.html").stat().st_size <= 1e6
+    assert "not even 1,000" in refusal(capsys, "view", str(features), f"out={tmp_path / 'b.html'}", "megabytes=0.02")
+    assert "siglip" in refusal(capsys, "view", str(features), f"out={tmp_path / 'b.html'}", "head=siglip")
+    assert not (tmp_path / "b.html").exists()
+
+
+def test_harmonics_stay_and_the_last_line_names_their_degree(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, degree in (("plain", 0), ("rich", 3)):
+        (tmp_path / name).mkdir()
+        assert ROOM.gaussians is not None
+        sh = np.random.default_rng(0).normal(size=(len(ROOM.gaussians), (degree + 1) ** 2, 3)) * 0.1
+        save_viewed_room(tmp_path / name, gaussians=replace(ROOM.gaussians, sh=sh.astype(np.float32)))
+    folders = [tmp_path / name / "features" for name in ("plain", "rich")]
+    capsys.readouterr()
+    assert cli.main(["view", *map(str, folders), f"out={tmp_path / 'a.html'}"]) == 0
+    assert "spherical harmonics of degree 3" in " ".join(capsys.readouterr().out.split())
+    scenes, results = written(tmp_path / "b.html", *folders)
+    assert results["sh_degree"] == [0, 3]
+    # Both folders are called features; their paths tell them apart.
+    assert [scene.meta["title"] for scene in scenes] == [str(each) for each in folders]
+
+
+def test_folders_have_their_names_as_titles_wherever_they_are_called_from(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copytree(folder / "features", tmp_path / "other")
+    monkeypatch.chdir(tmp_path / "other")
+    scenes, _ = written(tmp_path / "a.html", ".", folder / "features")
+    assert [scene.meta["title"] for scene in scenes] == ["other", "features"]
+
+
+def test_a_summary_that_exists_is_replaced_only_when_told(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.html.summary.json").write_text("mine")
+    assert "overwrite=true" in refusal(capsys, "view", str(folder / "features"), f"out={tmp_path / 'a.html'}")
+    assert (tmp_path / "a.html.summary.json").read_text() == "mine"
+
+
+def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    features, _ = name_features(ROOM)
+    dense = replace(features, space=replace(features.space, name="dense", text_encoder=""))
+    (tmp_path / "dense").mkdir()
+    save_features(tmp_path / "dense", replace(ROOM, up=None), dense)
+    (scene,), _ = written(tmp_path / "a.html", tmp_path / "dense")
+    assert scene.meta["words"] == []
+    # Nobody said what is up; the cameras tell.
+    np.testing.assert_allclose(scene.meta["up"], [0, 0, 1], atol=0.1)
+    refused = refusal(
+        capsys, "view", str(tmp_path / "dense"), f"words={folder / 'features' / 'words'}", f"out={tmp_path / 'b.html'}"
+    )
+    assert "no text encoder" in refused or "words" in refused
+    assert "none of 'names'" in refusal(capsys, "view", str(tmp_path / "dense"), "space=names")
+
+
+@pytest.mark.parametrize("option", ["host=::", "host=", "megabytes=2000", "photographs=-1", "port=-1", "error=0"])
+def test_values_out_of_range_are_refused(folder: Path, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"{option.partition('=')[0]}: expected" in refusal(capsys, "view", str(folder / "features"), option)
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """What the server was given, and the addresses that a browser was told to open."""
+    seen = SimpleNamespace(opened=[])
+
+    class Recorder:
+        address = "http://127.0.0.1:1/token/"
+
+        def __init__(self, page: Any, searches: Any, scenes: Any, **options: Any) -> None:
+            seen.page, seen.searches, seen.scenes, seen.options = page, searches, scenes, options
+
+        def __enter__(self) -> "Recorder":
+            return self
+
+        def __exit__(self, *error: object) -> None:
+            seen.closed = True
+
+        def serve_forever(self, poll_interval: float) -> None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(view, "ViewServer", Recorder)
+    monkeypatch.setattr(view.webbrowser, "open", seen.opened.append)
+    return seen
+
+
+def test_the_server_gets_the_scene_as_it_is_to_be_searched(
+    folder: Path, served: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["max_gaussians=1500", "localize.max_boxes=3", "port=4321", "host=localhost"]
+    assert cli.main(["view", str(folder / "features"), f"photos={folder / 'room'}", *arguments]) == 0
+    assert served.options == {"host": "localhost", "port": 4321}
+    (search,) = served.searches
+    assert len(search.shown.gaussians) == 1500
+    assert search.config.max_boxes == 3
+    assert search.shown.title == "features"
+    assert any(served.scenes[0].meta["objects"])
+    assert served.scenes[0].meta["photographs"] is True
+    assert served.closed
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("http://127.0.0.1:1/token/ shows ")
+
+
+@pytest.mark.parametrize(
+    ("option", "terminal", "opens"),
+    [(None, True, True), (None, False, False), ("open=true", False, True), ("open=false", True, False)],
+)
+def test_a_browser_is_opened_when_told_or_at_a_terminal(
+    folder: Path,
+    served: SimpleNamespace,
+    monkeypatch: pytest.MonkeyPatch,
+    option: str | None,
+    terminal: bool,
+    opens: bool,
+) -> None:
+    monkeypatch.setattr(view.sys.stdout, "isatty", lambda: terminal, raising=False)
+    assert cli.main(["view", str(folder / "features"), "quiet=true", *([option] if option else [])]) == 0
+    assert served.opened == (["http://127.0.0.1:1/token/"] if opens else [])

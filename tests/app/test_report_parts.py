@@ -1,0 +1,255 @@
+"""The figures of pages of results are those of the results."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from selected_rooms import SPACE, selected_room, with_more, words
+
+from gsencoder.app.reports import demo, parts, results
+from gsencoder.app.reports.demo import TeacherResult
+from gsencoder.app.runs.summary import Summary
+from gsencoder.fusion.fuse import Fusion
+from gsencoder.infer.draw.report import HtmlReport
+from gsencoder.infer.localize.localize import localize
+from gsencoder.types import FeatureBasis, Localization, Scene
+
+SCENE, KINDS = selected_room()
+
+
+class Page(HtmlReport):
+    """Records what is added to a page."""
+
+    made: ClassVar["list[Page]"] = []
+
+    def __init__(self, title: str = "", lead: str = "") -> None:
+        super().__init__(title, lead)
+        self.told: dict[str, Any] = {}
+        self.tables: list[list[dict[str, Any]]] = []
+        self.shown: list[tuple[list[np.ndarray], list[str]]] = []
+        self.headings: list[str] = []
+        Page.made.append(self)
+
+    def facts(self, facts: Any) -> None:
+        self.told |= facts
+
+    def section(self, heading: str, text: str = "") -> None:
+        self.headings.append(heading)
+
+    def pictures(self, pictures: Any, captions: Any, **options: Any) -> None:
+        assert len(pictures) == len(captions)
+        self.shown.append((list(pictures), list(captions)))
+
+    def table(self, columns: Any, rows: Any) -> None:
+        self.tables.append([dict(zip(columns, row, strict=True)) for row in rows])
+
+    def timings(self, seconds: Any) -> None:
+        self.told["steps"] = dict(seconds)
+
+    def write(self, path: Any) -> None:
+        self.path = path
+
+
+@pytest.fixture
+def page(monkeypatch: pytest.MonkeyPatch) -> Page:
+    monkeypatch.setattr(results, "HtmlReport", Page)
+    return Page()
+
+
+def last() -> Page:
+    return Page.made[-1]
+
+
+def summary_of(**given: Any) -> Summary:
+    summary = Summary("test", {})
+    summary.results.update(given)
+    summary.add_seconds({"load": 1.5, "work": 2.0})
+    return summary
+
+
+def found() -> Localization:
+    """Two boxes of the mug (the book has its feature, paler), one of the table, and none of the lamp."""
+    given = SCENE.features["names"]
+    vectors = given.features.copy()
+    vectors[KINDS == 1] = 0.8 * vectors[KINDS == 0][0] + 0.2 * vectors[KINDS == 2][-1]
+    scene = replace(SCENE, features={"names": replace(given, features=vectors)})
+    made = localize(scene, ("mug", "table", "lamp"), words())
+    counts = [sum(box.query == word for box in made.boxes) for word in made.queries]
+    assert counts == [2, 1, 0]
+    return made
+
+
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_words_have_a_row_each_of_their_best_box(page: Page) -> None:
+    made = found()
+    parts.add_words(page, SCENE, made)
+    (rows,) = page.tables
+    assert [row["word"] for row in rows] == ["mug", "table", "lamp"]
+    assert [row["boxes"] for row in rows] == [2, 1, 0]
+    assert [row["probability"] for row in rows] == made.probabilities.tolist()
+    best = next(box for box in made.boxes if box.query == "mug")
+    assert rows[0]["score"] == best.score
+    assert rows[0]["center of the first"] == ", ".join(f"{value:.2f}" for value in best.center)
+    assert (rows[2]["score"], rows[2]["center of the first"]) == (0.0, "–")
+    assert page.shown[0][1] == ["mug: 2 boxes", "table: 1 box", "lamp: no box"]
+    ious = {"mug": 0.9, "table": 0.25, "lamp": 0.0}
+    parts.add_words(page, SCENE, made, ious)
+    assert [row["IoU with the truth"] for row in page.tables[1]] == [0.9, 0.25, 0.0]
+    assert page.shown[2][1] == ["mug: IoU 0.90 with the true box", "table: IoU 0.25 with the true box", "lamp: no box"]
+
+
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_a_mark_on_the_scale_is_the_threshold_that_all_words_have(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    marks: list[float | None] = []
+
+    def scale(width: int, low: float, high: float, *, mark: float | None) -> np.ndarray:
+        marks.append(mark)
+        return np.zeros((2, width, 3), np.uint8)
+
+    monkeypatch.setattr(parts, "color_bar", scale)
+    for thresholds in ([0.5, 0.5, 0.5], [0.5, 0.25, 0.5]):
+        made = replace(found(), thresholds=np.array(thresholds, np.float32))
+        parts.add_words(page, SCENE, made)
+    assert marks == [0.5, None]
+
+
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_pictures_of_words_are_in_the_order_of_the_words(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    def drawn(*_: Any, per_word: int) -> Iterator[tuple[str, np.ndarray]]:
+        assert per_word == 1
+        for number, word in ((1, "table"), (2, "lamp"), (0, "mug")):
+            yield f"{number:02d}_{word}_view", np.full((2, 2, 3), number, np.uint8)
+
+    monkeypatch.setattr(parts, "relevancy_pictures", drawn)
+    parts.add_words(page, SCENE, found())
+    pictures, captions = page.shown[0]
+    assert [int(picture[0, 0, 0]) for picture in pictures] == [0, 1, 2]
+    assert [caption.partition(":")[0] for caption in captions] == ["mug", "table", "lamp"]
+
+
+def pictured() -> Scene:
+    """The scene with photographs of one color each: the number of their view."""
+    views = SCENE.views
+    assert views is not None
+    images = [np.full((72, 96, 3), view, np.uint8) for view in range(len(views))]
+    return replace(SCENE, views=replace(views, images=images))
+
+
+def test_four_views_from_first_to_last_are_shown_with_their_numbers(page: Page) -> None:
+    scene = with_more(pictured(), np.array([[0.0, 0.0, 0.3]]), opacity=0.5)
+    features = scene.features["names"]
+    parts.add_views(page, scene, {"names": features})
+    photographs, rendered, depths, fields = page.shown
+    views = [0, 2, 5, 7]
+    assert photographs[1] == [f"view {view}" for view in views]
+    assert [int(picture[0, 0, 0]) for picture in photographs[0]] == views
+    assert rendered[1][1] == "view 2, rendered"
+    assert depths[1][2] == "view 5, depth, bright is near"
+    assert fields[1][3] == "view 7, names"
+    # What was never seen has no part in the colors.
+    blind = replace(features, features=features.features.copy())
+    blind.features[-1] = 100
+    other = Page()
+    parts.add_views(other, pictured(), {"names": SCENE.features["names"]})
+    again = Page()
+    parts.add_views(again, replace(scene, features={"names": blind}), {"names": blind})
+    difference = np.abs(again.shown[3][0][0].astype(int) - other.shown[3][0][0].astype(int))
+    assert np.median(difference) == 0
+
+
+def test_features_have_the_figures_of_their_basis_or_none(page: Page) -> None:
+    given = SCENE.features["names"]
+    weights = given.weights.copy()
+    weights[:7] = 0
+    bare = replace(given, weights=weights)
+    basis = FeatureBasis(
+        mean=np.zeros(8, np.float32), components=np.eye(3, 8, dtype=np.float32), energy_kept=0.75, space=SPACE
+    )
+    small = replace(given, features=given.features[:, :3].copy(), basis=basis)
+    parts.add_features(page, {"bare": bare, "small": small}, {"bare": 0.0, "small": 0.125})
+    assert page.tables[0] == [
+        {"features": "bare", "channels": 8, "rank of the basis": 8, "energy kept": 1.0, "centered cosine error": 0.0,
+         "Gaussians seen": len(KINDS) - 7},
+        {"features": "small", "channels": 8, "rank of the basis": 3, "energy kept": 0.75,
+         "centered cosine error": 0.125, "Gaussians seen": len(KINDS)},
+    ]  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_pages_begin_with_counts_and_end_with_seconds(page: Page, tmp_path: Path) -> None:
+    given = SCENE.features["names"]
+    weights = given.weights.copy()
+    weights[:7] = 0
+    results.report_fusion(tmp_path, SCENE, replace(given, weights=weights), 0.125, "names", summary_of())
+    told = last().told
+    assert (told["Gaussians"], told["with features"], told["views"]) == (len(KINDS), len(KINDS) - 7, 8)
+    assert told["seconds"] == 3.5
+    assert told["steps"] == {"load": 1.5, "work": 2.0}
+    assert last().tables[0][0]["centered cosine error"] == 0.125
+    results.report_words(tmp_path, SCENE, found(), summary_of())
+    assert {name: last().told[name] for name in ("words", "with a box", "boxes")} == {
+        "words": 3, "with a box": 2, "boxes": 3,
+    }  # fmt: skip
+    assert last().path == tmp_path / "report.html"
+
+
+def test_scores_have_a_tile_each_and_tables_of_names_and_of_scenes_that_have_figures(
+    page: Page, tmp_path: Path
+) -> None:
+    names = {"mug": {"iou": 0.5, "seen": True, "count": 3}, "book": {"iou": 0.75, "seen": False, "count": 1}}
+    scenes = [{"scene": "a", "iou": 0.5, "more": 1.0}, {"scene": "b", "iou": 0.25}, "c was skipped"]
+    given = {"protocol": "naming", "miou": 0.625, "complete": True, "names": names, "scenes": scenes}
+    results.report_scores(tmp_path, summary_of(**given))
+    assert last().title == "Evaluation: naming"
+    assert set(last().told) == {"miou", "seconds", "peak memory, MiB", "steps"}
+    assert last().tables == [
+        [{"name": "mug", "iou": 0.5, "count": 3}, {"name": "book", "iou": 0.75, "count": 1}],
+        [{"scene": "a", "iou": 0.5, "more": 1.0}, {"scene": "b", "iou": 0.25, "more": "–"}],
+    ]
+    results.report_scores(tmp_path, summary_of(**given | {"names": {}, "scenes": []}))
+    assert last().tables == []
+    assert last().headings == ["Seconds of each step"]
+
+
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_the_page_of_the_demo_counts_words_and_what_the_basis_costs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(demo, "HtmlReport", Page)
+    given = SCENE.features["names"]
+    fusion = Fusion(features=given, views=(0,), tested=(), seconds={}, truncation=0.125)
+    made = TeacherResult(
+        title="names", words=("mug", "table", "lamp"), ious=(0.9, 0.4, 0.0), fusion=fusion, localization=found()
+    )
+    demo.write_report(tmp_path / "a.html", SCENE, [made], summary_of())
+    told = last().told
+    assert (told["names localized"], told["Gaussians"], told["views"]) == ("1 of 3", len(KINDS), 8)
+    assert told["seconds before this page"] == 3.5
+    assert [row["IoU with the truth"] for row in last().tables[0]] == [0.9, 0.4, 0.0]
+    assert last().tables[1][0]["centered cosine error"] == 0.125
+
+
+def test_a_teacher_counts_what_overlaps_by_half_or_more() -> None:
+    given = SCENE.features["names"]
+    weights = given.weights.copy()
+    weights[:7] = 0
+    fusion = Fusion(features=replace(given, weights=weights), views=(0,), tested=(), seconds={}, truncation=0.0)
+    localization = Localization(
+        queries=(),
+        relevancy=np.zeros((0, len(KINDS)), np.float32),
+        thresholds=np.zeros(0, np.float32),
+        probabilities=np.zeros(0, np.float32),
+        boxes=(),
+    )
+    made = TeacherResult(
+        title="names", words=("a", "b", "c"), ious=(0.5, 0.49, 1.0), fusion=fusion, localization=localization
+    )
+    assert made.num_localized == 2
+    assert made.to_dict() == {
+        "rank": 8, "channels": 8, "seen": len(KINDS) - 7, "mean_iou": pytest.approx(1.99 / 3),
+        "iou": {"a": 0.5, "b": 0.49, "c": 1.0},
+    }  # fmt: skip
+    assert replace(made, words=(), ious=()).mean_iou == 0

@@ -1,0 +1,157 @@
+"""Expressions and situations made from labels: each means one object, and holds wherever one stands."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.truth.expressions import read_scanrefer
+from gsencoder.data.truth.made_expressions import make_expressions, write_expressions
+from gsencoder.data.truth.made_situations import make_situations, side_of
+from gsencoder.data.truth.questions import read_questions
+from gsencoder.data.truth.seen_objects import SeenObject, SeenScene, see_objects
+from gsencoder.data.truth.write_sqa3d import write_sqa3d
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[SeenScene]:
+    return [
+        see_objects(make_room(seed, views=6, width=120, height=90, spacing=0.2, objects=12), min_pixels=40)
+        for seed in (0, 3)
+    ]
+
+
+def thing(label: int, name: str | None, low: tuple[float, float, float], size: float = 0.1) -> SeenObject:
+    lower = np.array(low, np.float64)
+    return SeenObject(id=label, name=name, aabb_min=lower, aabb_max=lower + size, pixels=500)
+
+
+def scene_of(*things: SeenObject) -> SeenScene:
+    return SeenScene(name="made", objects=things, min_pixels=200)
+
+
+def described(*things: SeenObject) -> dict[str, int]:
+    made = make_expressions([scene_of(*things)])
+    return {each.expression.text: each.expression.object_id for each in made}
+
+
+def test_an_only_thing_is_meant_by_its_name_and_one_of_several_is_not() -> None:
+    chairs = thing(1, "chair", (0, 0, 0)), thing(2, "chair", (5, 0, 0))
+    assert described(*chairs, thing(3, "lamp", (10, 0, 0))) == {"the only lamp in the room": 3}
+
+
+def test_one_of_several_is_meant_by_what_it_is_next_to_or_on() -> None:
+    chairs = thing(1, "chair", (0, 0, 0)), thing(2, "chair", (5, 0, 0))
+    table, lamp = thing(3, "table", (5, 5, -1), size=1.0), thing(4, "lamp", (0.2, 0, 0))
+    texts = described(*chairs, table, lamp)
+    assert texts["the chair next to the lamp"] == 1
+    # Both chairs are near the lamp.
+    assert "the chair next to the lamp" not in described(chairs[0], thing(2, "chair", (0.4, 0, 0)), lamp)
+    mugs = thing(5, "mug", (5.4, 5.4, 0)), thing(6, "mug", (9, 0, 0))
+    assert described(*mugs, table, lamp)["the mug on the table"] == 5
+    # The other mug stands on the table, too, or leans on it.
+    for other in ((5.7, 5.1, 0.0), (6.01, 5.1, -0.5)):
+        assert "the mug on the table" not in described(mugs[0], thing(6, "mug", other), table)
+
+
+def test_the_largest_is_meant_where_it_clearly_is() -> None:
+    small = thing(1, "box", (0, 0, 0)), thing(2, "box", (5, 0, 0))
+    assert described(*small, thing(3, "box", (9, 0, 0), size=0.131))["the largest box"] == 3
+    with pytest.raises(InputError, match="can be described"):
+        described(*small, thing(3, "box", (9, 0, 0), size=0.129))
+
+
+def test_each_expression_of_a_room_means_the_one_object_that_its_words_say(rooms: list[SeenScene]) -> None:
+    made = make_expressions(rooms, per_object=10)
+    assert {
+        re.sub(r"^the (only|\S+)( \S+)? .*?(next to|on|in) the .*$", r"\3", each.expression.text) for each in made
+    } == {
+        "next to",
+        "on",
+        "in",
+    }
+    scenes = {each.name: each for each in rooms}
+    for each in made:
+        things = scenes[each.expression.scene].objects
+        (meant,) = [one for one in things if one.id == each.expression.object_id]
+        assert each.needed[0] == meant.id
+        assert each.unique  # No two things of a room have one name.
+        assert each.expression.aabb is not None
+        np.testing.assert_allclose(each.expression.aabb, [meant.aabb_min, meant.aabb_max])
+        assert str(meant.name) in each.expression.text
+        assert meant.pixels >= 40
+
+
+def test_expressions_are_written_as_scanrefer_has_them(rooms: list[SeenScene], tmp_path: Path) -> None:
+    files = [tmp_path / f"{number}.json" for number in range(3)]
+    for file, scenes, seed in zip(files, (rooms, rooms[::-1], rooms), (0, 0, 1), strict=True):
+        write_expressions(file, make_expressions(scenes, seed=seed, per_object=1))
+    assert files[0].read_bytes() == files[1].read_bytes() != files[2].read_bytes()
+    assert {row["unique_multiple"] for row in json.loads(files[0].read_text())} == {0}
+    assert list(read_scanrefer(files[0])) == [each.expression for each in make_expressions(rooms, per_object=1)]
+
+
+def test_fewer_objects_may_be_asked_for(rooms: list[SeenScene]) -> None:
+    made = make_expressions(rooms, per_scene=2, per_object=1)
+    assert len(made) == 4
+    assert {each.expression.annotation for each in made} == {"0"}
+    for wrong in ({"per_object": 0}, {"per_scene": -1}):
+        with pytest.raises(InputError, match="per_object from 1"):
+            make_expressions(rooms, **wrong)
+
+
+def test_sides_are_those_of_any_place_to_stand_at(rooms: list[SeenScene]) -> None:
+    questions = make_situations(rooms, per_kind=20)
+    rng = np.random.default_rng(0)
+    scenes = {each.name: {one.name: one for one in each.objects if one.name} for each in rooms}
+    sides, nearer = 0, 0
+    for each in questions:
+        named = scenes[each.scene]
+        match = re.fullmatch(r"I am standing at the (.*) and facing the (.*)\.", str(each.situation))
+        assert match is not None
+        at, facing = named[match[1]], named[match[2]]
+        other = re.fullmatch(r"Is the (.*) on my left or on my right\?", each.text)
+        if other is not None:
+            points = [rng.uniform(one.aabb_min[:2], one.aabb_max[:2], (50, 2)) for one in (at, facing, named[other[1]])]
+            ahead, aside = points[1] - points[0], points[2] - points[0]
+            cross = ahead[:, 0] * aside[:, 1] - ahead[:, 1] * aside[:, 0]
+            assert set(np.where(cross > 0, "left", "right")) == {each.answers[0]}
+            sides += 1
+            continue
+        pair = re.fullmatch(r"Which is closer to me, the (.*) or the (.*)\?", each.text)
+        assert pair is not None
+        middle = {name: np.linalg.norm(named[name].center - at.center) for name in pair.groups()}
+        far = {name: np.linalg.norm(named[name].aabb_max - named[name].aabb_min) for name in pair.groups()}
+        nearest = min(middle, key=lambda name: middle[name] - far[name])
+        assert each.answers[0] in pair.groups()
+        assert middle[each.answers[0]] < sum(far.values()) + middle[nearest] + 1.5
+        nearer += 1
+    assert sides
+    assert nearer
+    answers = [each.answers[0] for each in questions if "left" in each.text]
+    assert answers.count("left") == answers.count("right")
+
+
+def test_a_side_is_none_straight_ahead_behind_and_where_boxes_overlap() -> None:
+    at, facing = thing(1, "table", (0, 0, 0), size=0.5), thing(2, "lamp", (5, 0.2, 0))
+    assert side_of(at, facing, thing(3, "ball", (2, 4, 0))) == "left"
+    assert side_of(at, facing, thing(3, "ball", (2, -4, 0))) == "right"
+    for spot in ((9, 0.2, 0), (-9, 0.2, 0), (0.2, 0.2, 1.0), (9, 1.5, 0)):
+        assert side_of(at, facing, thing(3, "ball", spot)) is None
+
+
+def test_situations_are_written_as_sqa3d_has_them(rooms: list[SeenScene], tmp_path: Path) -> None:
+    questions = make_situations(rooms, per_kind=4)
+    write_sqa3d(tmp_path / "situated_questions.json", questions)
+    read = read_questions(tmp_path / "situated_questions.json")
+    assert [(each.id, each.text, each.situation, each.answers) for each in read] == [
+        (each.id, each.text, each.situation, each.answers) for each in questions
+    ]
+    np.testing.assert_allclose([each.position for each in read], [each.position for each in questions])
+    np.testing.assert_allclose([each.rotation for each in read], [each.rotation for each in questions])
+    with pytest.raises(InputError, match="questions in it"):
+        write_sqa3d(tmp_path / "other.json", questions)

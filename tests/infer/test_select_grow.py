@@ -1,0 +1,234 @@
+"""How selections grow: labels by features, by the pixels of views, and by what lies around, on cases made by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from selected_rooms import MUG, SPACE, permuted, selected_room, splat_of, with_more, words
+
+from gsencoder.data.orbits import looking_cameras
+from gsencoder.infer.select.grow import (
+    NO_SHARE,
+    Candidates,
+    Labels,
+    labels_by_features,
+    labels_by_pixels,
+    labels_of_hidden,
+)
+from gsencoder.infer.select.seeds import Parts
+from gsencoder.infer.select.select import select
+from gsencoder.infer.select.selection import SelectConfig, Votes
+from gsencoder.types import GaussianFeatures, Gaussians, Scene, Views
+
+USUAL = (1.0, 10.0, 10.0, 10.0, 100.0)
+"""Weight of the Gaussians of an object on its pixels; their median is 10."""
+
+
+def label_of(
+    label: int, share: float, *, seen: bool, present: tuple[float, float], removed: tuple[float, float]
+) -> int:
+    """The label by pixels of one Gaussian that could be of an object of five others."""
+    count = len(USUAL) + 1
+    candidates = Candidates(
+        labels=np.array([1] * len(USUAL) + [label], np.int32),
+        possible=np.ones(count, np.int32),
+        shares=np.array([1.0] * len(USUAL) + [share]),
+    )
+    votes = Votes(
+        present=np.array([*((0.0, weight) for weight in USUAL), present], np.float32),
+        removed=np.array([*((0.0, 0.0) for _ in USUAL), removed], np.float32),
+    )
+    known = np.array([True] * len(USUAL) + [seen])
+    labels = labels_by_pixels(candidates, known, votes, SelectConfig(share=0.5, only=0.9))
+    assert (labels[:-1] == 1).all()
+    return int(labels[-1])
+
+
+NOTHING = (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("share", "present", "removed", "expected"),
+    [
+        (0.4, (0.5, 9.5), NOTHING, 1),  # partly the object, and before its pixels alone
+        (0.4, (1.5, 8.5), NOTHING, 0),  # as much, but beside them, too
+        (0.34, (0.0, 10.0), NOTHING, 0),  # less than 0.7 times the share
+        (0.4, NOTHING, NOTHING, 0),  # shown by no view
+        (0.4, (9.0, 1.0), (2.0, 12.0), 1),  # a ghost
+        (0.4, (9.0, 1.0), (2.0, 8.0), 0),  # fainter than the Gaussians of the object
+        (0.4, (9.0, 1.0), (14.0, 12.0), 0),  # mostly seen elsewhere
+    ],
+)
+def test_what_is_partly_object_is_taken_where_pixels_show_it_or_would_show_its_ghost(
+    share: float, present: tuple[float, float], removed: tuple[float, float], expected: int
+) -> None:
+    assert label_of(0, share, seen=True, present=present, removed=removed) == expected
+
+
+@pytest.mark.parametrize(
+    ("present", "expected"),
+    [((9.5, 0.5), 0), ((8.0, 2.0), 1), (NOTHING, 1)],
+)
+def test_what_was_taken_is_lost_only_if_its_pixels_are_of_something_else(
+    present: tuple[float, float], expected: int
+) -> None:
+    assert label_of(1, 1.0, seen=True, present=present, removed=NOTHING) == expected
+
+
+@pytest.mark.parametrize(
+    ("label", "present", "removed", "expected"),
+    [
+        (0, (4.0, 6.0), NOTHING, 1),
+        (0, (6.0, 4.0), (0.0, 10.0), 0),  # what is shown now decides
+        (0, NOTHING, (4.0, 6.0), 1),
+        (0, NOTHING, (6.0, 4.0), 0),
+        (0, NOTHING, NOTHING, 0),
+        (1, (6.0, 4.0), NOTHING, 0),
+        (1, (4.0, 6.0), NOTHING, 1),
+    ],
+)
+def test_without_a_feature_more_than_half_of_the_weight_decides(
+    label: int, present: tuple[float, float], removed: tuple[float, float], expected: int
+) -> None:
+    assert label_of(label, NO_SHARE, seen=False, present=present, removed=removed) == expected
+
+
+def test_without_any_label_that_is_possible_pixels_change_nothing() -> None:
+    none = np.zeros(3, np.int32)
+    candidates = Candidates(labels=none, possible=none, shares=np.full(3, -np.inf))
+    weights = np.ones((3, 2), np.float32)
+    made = labels_by_pixels(candidates, np.ones(3, bool), Votes(present=weights, removed=weights), SelectConfig())
+    assert (made == 0).all()
+
+
+def line(count: int) -> np.ndarray:
+    return np.arange(count, dtype=np.float64)[:, None] * [1.0, 0.0, 0.0]
+
+
+def hidden(places: np.ndarray, labels: list[int], possible: list[int], unknown: list[int]) -> list[int]:
+    """Labels of Gaussians with a spacing of 1, of which those of `unknown` are hidden."""
+    mask = np.isin(np.arange(len(labels)), unknown)
+    made = labels_of_hidden(
+        splat_of(places), np.array(labels, np.int32), np.array(possible, np.int32), mask, spacing=1.0
+    )
+    return [int(label) for label in made]
+
+
+def test_what_is_hidden_has_the_label_of_most_of_its_eight_neighbors() -> None:
+    places = line(9)
+    assert hidden(places, [1] * 5 + [0] * 3 + [0], [1] * 9, [8])[-1] == 1
+    # Half of them are not most.
+    assert hidden(places, [1] * 4 + [0] * 4 + [0], [1] * 9, [8])[-1] == 0
+    # What it had by itself does not count,
+    assert hidden(places, [0] * 8 + [1], [1] * 9, [8])[-1] == 0
+    # nor a word that is out of reach,
+    assert hidden(places, [1] * 8 + [0], [1] * 8 + [0], [8])[-1] == 0
+    # and of two words that which is within reach.
+    assert hidden(places, [2] * 8 + [0], [2] * 8 + [1], [8])[-1] == 0
+
+
+def test_what_is_hidden_has_no_label_where_the_nearest_known_one_is_farther_than_two_spacings() -> None:
+    for distance, label in ((1.9, 1), (2.1, 0)):
+        places = np.concatenate([line(8), [[7 + distance, 0, 0]]])
+        assert hidden(places, [1] * 8 + [0], [1] * 9, [8])[-1] == label
+
+
+def test_where_nothing_is_known_nothing_is_inferred() -> None:
+    assert hidden(line(3), [0, 0, 0], [1, 1, 1], [0, 1, 2]) == [0, 0, 0]
+
+
+def plate(side: int = 24) -> np.ndarray:
+    """Points on a square grid with a step of 1, a little off it."""
+    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    return grid + np.random.default_rng(4).normal(size=grid.shape) * 0.01
+
+
+def features_of(vectors: np.ndarray, seen: np.ndarray | None = None) -> GaussianFeatures:
+    weights = np.ones(len(vectors)) if seen is None else seen
+    return GaussianFeatures(
+        features=vectors.astype(np.float32),
+        weights=weights.astype(np.float32),
+        mean=np.zeros(8, np.float32),
+        space=SPACE,
+    )
+
+
+def by_features(
+    places: np.ndarray, features: GaussianFeatures, parts: Parts, relevancy: np.ndarray, **settings: float
+) -> tuple[Labels, Labels]:
+    gaussians: Gaussians = splat_of(places)
+    config = SelectConfig(**settings)  # type: ignore[arg-type]
+    made = labels_by_features(gaussians, features, parts, relevancy.astype(np.float32), config, 1.0)
+    return made.labels, made.possible
+
+
+def test_a_share_that_is_equal_to_the_limit_is_not_taken() -> None:
+    places = plate()
+    object_, rim = places[:, 0] < 10.5, (places[:, 0] > 10.5) & (places[:, 0] < 11.5)
+    vectors = np.where(object_[:, None], np.eye(8)[0], np.eye(8)[1])
+    vectors[rim] = (np.eye(8)[0] + np.eye(8)[1]) / 2
+    # The rim is as near to the object as a spacing, so that it is no surroundings.
+    places[rim, 0] = places[object_ & (places[:, 0] > 9.5), 0] + 0.9
+    parts = ((np.flatnonzero(object_),),)
+    taken, possible = by_features(places, features_of(vectors), parts, vectors[None, :, 0], share=0.5)
+    assert (possible[rim] == 1).all()
+    assert (taken[object_] == 1).all()
+    assert not taken[rim].any()
+    assert (by_features(places, features_of(vectors), parts, vectors[None, :, 0], share=0.49)[0][rim] == 1).all()
+
+
+def test_what_has_no_feature_could_be_of_the_first_of_the_words_within_reach() -> None:
+    places = plate()
+    left, right = places[:, 0] < 7.5, places[:, 0] > 14.5
+    vectors = np.eye(8)[np.where(left, 0, np.where(right, 1, 2))]
+    blind = np.abs(places - [11, 11, 0]).max(axis=1) < 0.5
+    parts = ((np.flatnonzero(left),), (np.flatnonzero(right),))
+    features = features_of(vectors, seen=~blind)
+    for order in ([0, 1], [1, 0]):
+        taken, possible = by_features(
+            places, features, tuple(parts[each] for each in order), vectors[:, order].T, reach=5.0
+        )
+        assert possible[blind].tolist() == [1]
+        assert taken[blind].tolist() == [0]
+
+
+def test_all_boxes_of_a_word_are_one_object_whose_inside_stays() -> None:
+    """A stain with the feature of the table, in the middle of an object that was found as two boxes."""
+    places = plate()
+    one = (np.abs(places[:, 1] - 11.5) < 6) & (places[:, 0] > 5.5) & (places[:, 0] < 11.5)
+    other = (np.abs(places[:, 1] - 11.5) < 6) & (places[:, 0] > 11.5) & (places[:, 0] < 17.5)
+    stain = one & (np.abs(places - [11, 11, 0]).max(axis=1) < 0.5)
+    vectors = np.tile(np.eye(8)[1], (len(places), 1))
+    vectors[one], vectors[other] = np.eye(8)[0], 0.5 * np.eye(8)[0] + 0.5 * np.eye(8)[1]
+    relevancy = vectors[:, 0].copy()
+    vectors[stain] = np.eye(8)[1]
+    parts = ((np.flatnonzero(one), np.flatnonzero(other)),)
+    taken, _ = by_features(places, features_of(vectors), parts, relevancy[None])
+    assert ((taken == 1) == (one | other)).all()
+
+
+SCENE, KINDS = selected_room()
+
+
+def from_above(scene: Scene) -> Scene:
+    """The scene with one view, that looks down at the mug."""
+    above = looking_cameras(
+        np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]]), np.array([0.0, 1.0, 0.0]), 60.0, 96, 72
+    )
+    return replace(scene, views=Views(cameras=above, names=("above",)))
+
+
+def test_without_a_feature_pixels_decide_even_where_all_neighbors_say_otherwise() -> None:
+    beside = MUG * [1, 1, 0] + np.array([0.077, 0.0, 0.05])
+    scene = with_more(SCENE, beside[None], opacity=0.3)
+    alone = select(scene, ("mug",), words(), SelectConfig(views=0))[0]
+    assert alone.labels[-1] == 1
+    assert select(from_above(scene), ("mug",), words())[0].labels[-1] == 0
+
+
+def test_the_order_of_gaussians_without_features_does_not_matter() -> None:
+    places = MUG + np.array([[0.0, 0.0, 0.075], [-0.1, -0.1, 0.01], [0.0, 0.0, -0.07], [0.0, 0.0, 0.0]])
+    scene = with_more(SCENE, places, opacity=0.6)
+    order = np.random.default_rng(5).permutation(len(KINDS) + len(places))
+    labels = select(scene, ("book", "mug"), words())[0].labels
+    assert (select(permuted(scene, order), ("book", "mug"), words())[0].labels == labels[order]).all()
