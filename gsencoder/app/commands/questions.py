@@ -12,7 +12,8 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
-from gsencoder.data.truth.made_expressions import make_expressions, write_expressions
+from gsencoder.data.truth.expressions import write_scanrefer
+from gsencoder.data.truth.made_expressions import make_expressions
 from gsencoder.data.truth.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
 from gsencoder.data.truth.made_situations import make_situations
 from gsencoder.data.truth.questions import write_scanqa
@@ -62,7 +63,7 @@ def run(config: QuestionsCommandConfig, summary: Summary) -> None:
             )
         write_scanqa(folder / QUESTIONS, questions)
         write_sqa3d(folder / SITUATED, situations)
-        write_expressions(folder / EXPRESSIONS, expressions)
+        write_scanrefer(folder / EXPRESSIONS, [each.expression for each in expressions])
         counts = Counter(kind_of(each) for each in questions)
         kinds = {kind: counts[kind] for kind in KINDS}
         situated = Counter(each.id.rsplit("-", 2)[1] for each in situations)

@@ -10,11 +10,8 @@ An object that some photograph shows well enough is described in each way in whi
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_json
-from gsencoder.data.truth.entries import box_corners
 from gsencoder.data.truth.expressions import Expression
 from gsencoder.data.truth.made_questions import scene_rng
 from gsencoder.data.truth.relations import (
@@ -137,6 +134,7 @@ def _may_be_on(thing: SeenObject, below: SeenObject, things: Sequence[SeenObject
 def _made(scene: SeenScene, thing: SeenObject, text: str, others: Sequence[SeenObject], number: int) -> MadeExpression:
     lower, upper = ((corner / scene.metres_per_unit).tolist() for corner in (thing.aabb_min, thing.aabb_max))
     name = str(thing.name)
+    unique = len([other for other in scene.objects if other.name == thing.name]) == 1
     return MadeExpression(
         expression=Expression(
             scene=scene.name,
@@ -146,34 +144,9 @@ def _made(scene: SeenScene, thing: SeenObject, text: str, others: Sequence[SeenO
             text=text,
             tokens=tuple(text.lower().split()),
             aabb=((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])),
+            multiple=not unique,
+            others=False,
         ),
-        unique=len([other for other in scene.objects if other.name == thing.name]) == 1,
+        unique=unique,
         needed=(thing.id, *(other.id for other in others)),
     )
-
-
-def write_expressions(path: str | Path, made: Sequence[MadeExpression]) -> None:
-    """Writes expressions as ScanRefer's files have them, with boxes as Scan2Cap's benchmark has them, and with the
-    flags of ScanRefer's own tool: unique_multiple (1 where the scene has several objects of the name) and others (0).
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    rows = []
-    for each in made:
-        one = each.expression
-        assert one.aabb is not None
-        rows.append(
-            {
-                "scene_id": one.scene,
-                "object_id": str(one.object_id),
-                "object_name": one.object_name,
-                "ann_id": one.annotation,
-                "description": one.text,
-                "token": list(one.tokens),
-                "bbox": box_corners(*one.aabb),
-                "unique_multiple": int(not each.unique),
-                "others": 0,
-            }
-        )
-    write_json(path, rows)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.entries import Corner, corner_bounds, object_of, read_benchmark_json, scene_name, shown
+from gsencoder.data.truth.entries import Corner, corner_bounds, entries_of, object_of, read_benchmark_json, scene_name
 from gsencoder.data.truth.expressions import Expression, read_scanrefer
 from gsencoder.data.truth.questions import Question as TruthQuestion
 from gsencoder.data.truth.questions import read_questions as read_truth
@@ -196,13 +196,7 @@ def _read_boxes(
     boxes: dict[str, list[tuple[tuple[Corner, Corner], dict[str, Any]]]] = {}
     for name, rows in content.items():
         scene = scene_name(name, str(path))
-        if not isinstance(rows, list):
-            raise InputError(
-                f"{path}: {scene}: expected a list of objects with a box of eight corners, got {shown(rows)}"
-            )
-        for index, row in enumerate(rows):
-            where = f"{path}: {scene}[{index}]"
-            entry = object_of(row, where, "a box of eight corners")
+        for entry, where in entries_of(rows, path, "a box of eight corners", key=scene):
             keys = {key: entry[key] for key in ("sem_prob", "obj_prob") if key in entry}
             boxes.setdefault(scene, []).append((corner_bounds(entry.get("box"), where, "box"), keys))
     if not boxes:

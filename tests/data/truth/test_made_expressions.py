@@ -9,8 +9,8 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.truth.expressions import read_scanrefer
-from gsencoder.data.truth.made_expressions import make_expressions, write_expressions
+from gsencoder.data.truth.expressions import read_scanrefer, write_scanrefer
+from gsencoder.data.truth.made_expressions import make_expressions
 from gsencoder.data.truth.made_situations import make_situations, side_of
 from gsencoder.data.truth.questions import read_questions
 from gsencoder.data.truth.seen_objects import SeenObject, SeenScene, see_objects
@@ -89,7 +89,8 @@ def test_each_expression_of_a_room_means_the_one_object_that_its_words_say(rooms
 def test_expressions_are_written_as_scanrefer_has_them(rooms: list[SeenScene], tmp_path: Path) -> None:
     files = [tmp_path / f"{number}.json" for number in range(3)]
     for file, scenes, seed in zip(files, (rooms, rooms[::-1], rooms), (0, 0, 1), strict=True):
-        write_expressions(file, make_expressions(scenes, seed=seed, per_object=1))
+        made = make_expressions(scenes, seed=seed, per_object=1)
+        write_scanrefer(file, [each.expression for each in made])
     assert files[0].read_bytes() == files[1].read_bytes() != files[2].read_bytes()
     assert {row["unique_multiple"] for row in json.loads(files[0].read_text())} == {0}
     assert list(read_scanrefer(files[0])) == [each.expression for each in make_expressions(rooms, per_object=1)]
