@@ -16,14 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.evaluate.files.instances import (
-    match_instance_files,
-    write_instance_prediction,
-    write_instance_truth,
-)
-from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.number_files import write_whole_numbers
+from gsencoder.evaluate.files.instances import match_instance_files, write_instance_prediction
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth
-from gsencoder.evaluate.scores.instances import instance_scores, match_instances
+from gsencoder.evaluate.scores.instance_matches import match_instances
+from gsencoder.evaluate.scores.instances import instance_scores
 
 CLASSES = ClassTable(
     names=tuple(f"class {number}" for number in range(1, 199)),
@@ -83,7 +81,7 @@ def main() -> None:
             for seed in range(FILE_SCENES):
                 truth, prediction = random_scene(seed, options.instances, kinds[0])
                 write_instance_prediction(folders[0], prediction, form=form)
-                write_instance_truth(folders[1] / f"{truth.scene}.txt", truth)
+                write_whole_numbers(folders[1] / f"{truth.scene}.txt", truth.ids)
             start = time.perf_counter()
             instance_scores(list(match_instance_files(*folders, CLASSES)), CLASSES)
             seconds = (time.perf_counter() - start) / FILE_SCENES

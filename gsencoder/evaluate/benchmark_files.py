@@ -6,37 +6,41 @@ is therefore what anyone finds who scores the same files.
 
 import json
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.truth.expressions import Expression
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.expression_boxes import boxes_from_labels
+from gsencoder.data.truth.expressions import Expression, write_scanrefer
+from gsencoder.data.truth.number_files import write_whole_numbers
+from gsencoder.data.truth.scannet_labels import find_scannet_files
 from gsencoder.data.truth.scene_labels import find_labels
-from gsencoder.evaluate.files.instances import write_instance_prediction, write_instance_truth
-from gsencoder.evaluate.files.label_files import write_whole_numbers
+from gsencoder.evaluate.files.instances import write_instance_prediction
 from gsencoder.evaluate.files.recognition import write_recognition_predictions, write_recognition_truth
-from gsencoder.evaluate.files.referring import write_referring_predictions, write_referring_truth
+from gsencoder.evaluate.files.referring import write_referring_predictions
 from gsencoder.evaluate.labeled_points import labeled_points
-from gsencoder.evaluate.protocols.instances import InstancesProtocol, instance_truth, predict_instances
+from gsencoder.evaluate.protocols.instances import InstancesProtocol, predict_instances, true_instances
 from gsencoder.evaluate.protocols.recognition import RecognitionProtocol, predict_recognition, recognition_truth
 from gsencoder.evaluate.protocols.referring import (
     ReferringProtocol,
     expressions_of_objects,
     predict_referring,
     read_expressions,
-    referring_truth,
 )
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, predict_semantics, semantic_truth
-from gsencoder.evaluate.score_files import score_instances, score_recognition, score_referring, score_semantics
+from gsencoder.evaluate.score_boxes import score_referring
+from gsencoder.evaluate.score_files import score_instances, score_recognition, score_semantics
 from gsencoder.evaluate.score_report import ScoreReport
-from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames
+from gsencoder.evaluate.scores.referring import PredictedBoxes
+from gsencoder.evaluate.scores.referring_kinds import named_classes, with_kinds
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.text.build import Words
-from gsencoder.types import Scene
+from gsencoder.types import MeshLabels, Scene
 
 PREDICTIONS, TRUTH = "predictions", "truth"
 """Names of the folders, or of the JSON files, in an output folder."""
@@ -68,6 +72,7 @@ def write_predictions(
     *,
     protocol: BenchmarkProtocol,
     class_names: Mapping[str, str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
     part: int = 0,
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
@@ -83,6 +88,7 @@ def write_predictions(
             each scene; the others write lists, `predictions.PART.json` and `truth.PART.json`.
         protocol: what is predicted.
         class_names: the class of each name that objects have, where these are not class names themselves.
+        raw_ids: nyu40id of each raw name, which tells unique sentences of a file from multiple ones.
         part: number of the process, where several have scenes of their own; `merge_lists` joins their files.
         seeds: how Gaussians are made for scenes without.
         localization: settings of `localize`.
@@ -94,19 +100,23 @@ def write_predictions(
         InputError: a scene without true objects, words of another space, or a class that `words` does not know.
     """
     done = []
-    truths: list[Any] = []
-    predictions: list[Any] = []
-    given = () if not isinstance(protocol, ReferringProtocol) else _given_expressions(protocol)
+    objects: list[NamedInstance] = []
+    names: list[RankedNames] = []
+    sentences: list[Expression] = []
+    boxes: list[PredictedBoxes] = []
+    given: tuple[Expression, ...] = ()
+    if isinstance(protocol, ReferringProtocol) and protocol.expressions:
+        given = read_expressions(Path(protocol.expressions))
     for loaded, load_seconds in scenes:
         scene, features, seconds = with_features(loaded, source, seeds)
         start = time.perf_counter()
         mesh = None if scene.folder is None else find_labels(scene.folder)
         if isinstance(protocol, ReferringProtocol):
-            asked = [each for each in given if each.scene == scene.name] if given else expressions_of_objects(scene)
+            asked = _expressions(scene, mesh, given, raw_ids)
             # Boxes of a file are in the aligned frame of its scans, those of a scene's objects in its world.
             aligned = mesh.aligned_from_world if mesh is not None and given else None
-            truths += asked
-            predictions += predict_referring(
+            sentences += asked
+            boxes += predict_referring(
                 scene, features, asked, words, protocol, localization, aligned_from_world=aligned
             )
         else:
@@ -115,27 +125,29 @@ def write_predictions(
                 points = points.renamed(class_names)
             if isinstance(protocol, RecognitionProtocol):
                 true = recognition_truth(points, protocol)
-                truths += true
-                predictions += predict_recognition(points, features, true, classes.names, words)
-            elif isinstance(protocol, SemanticsProtocol):
-                predicted = predict_semantics(points, features, classes, words)
-                for name, labels in ((TRUTH, semantic_truth(points, classes)), (PREDICTIONS, predicted)):
-                    (folder / name).mkdir(exist_ok=True)
-                    write_whole_numbers(folder / name / f"{scene.name}.txt", labels)
+                objects += true
+                names += predict_recognition(points, features, true, classes.names, words)
             else:
-                masks = predict_instances(scene, points, features, classes, words, protocol, localization)
                 for name in (TRUTH, PREDICTIONS):
                     (folder / name).mkdir(exist_ok=True)
-                write_instance_truth(folder / TRUTH / f"{scene.name}.txt", instance_truth(points, classes))
-                write_instance_prediction(folder / PREDICTIONS, masks, form="npz")
+                truth_file = folder / TRUTH / f"{scene.name}.txt"
+                if isinstance(protocol, SemanticsProtocol):
+                    assert scene.gaussians is not None
+                    labels = predict_semantics(points, scene.gaussians, features, classes, words, protocol)
+                    write_whole_numbers(truth_file, semantic_truth(points, classes))
+                    write_whole_numbers(folder / PREDICTIONS / f"{scene.name}.txt", labels)
+                else:
+                    masks = predict_instances(scene, points, features, classes, words, protocol, localization)
+                    write_whole_numbers(truth_file, true_instances(points, classes).ids)
+                    write_instance_prediction(folder / PREDICTIONS, masks, form="npz")
         seconds = {"load": load_seconds, **seconds, protocol.name: time.perf_counter() - start}
         done.append(PredictedScene(scene=scene.name, gaussians=len(features), seconds=seconds))
     if isinstance(protocol, RecognitionProtocol):
-        write_recognition_truth(folder / f"{TRUTH}.{part}.json", truths)
-        write_recognition_predictions(folder / f"{PREDICTIONS}.{part}.json", predictions)
+        write_recognition_truth(folder / f"{TRUTH}.{part}.json", objects)
+        write_recognition_predictions(folder / f"{PREDICTIONS}.{part}.json", names)
     elif isinstance(protocol, ReferringProtocol):
-        write_referring_truth(folder / f"{TRUTH}.{part}.json", referring_truth(truths))
-        write_referring_predictions(folder / f"{PREDICTIONS}.{part}.json", predictions)
+        write_scanrefer(folder / f"{TRUTH}.{part}.json", sentences)
+        write_referring_predictions(folder / f"{PREDICTIONS}.{part}.json", boxes)
     return done
 
 
@@ -171,5 +183,18 @@ def score_written(folder: Path, protocol: BenchmarkProtocol, classes: ClassTable
     return score_referring(*files, method=method)
 
 
-def _given_expressions(protocol: ReferringProtocol) -> tuple[Expression, ...]:
-    return read_expressions(Path(protocol.expressions)) if protocol.expressions else ()
+def _expressions(
+    scene: Scene, mesh: MeshLabels | None, given: Sequence[Expression], raw_ids: Mapping[str, int] | None
+) -> tuple[Expression, ...]:
+    """The sentences about a scene, with the boxes of a ScanNet scan's labels where they have none, and with what is known
+    of their kinds: by ScanNet's label map, or by the names themselves where the names are what is asked."""
+    if not given:
+        asked = expressions_of_objects(scene)
+        return with_kinds(asked, {each.object_name: each.object_name for each in asked})
+    asked = tuple(each for each in given if each.scene == scene.name)
+    lacking = any(each.aabb is None for each in asked)
+    if lacking and mesh is not None and scene.folder is not None and find_scannet_files(scene.folder) is not None:
+        asked = boxes_from_labels(asked, mesh)
+    if raw_ids is None:
+        return asked
+    return with_kinds(asked, named_classes((each.object_name for each in asked), raw_ids))

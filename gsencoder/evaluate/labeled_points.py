@@ -1,9 +1,9 @@
 """Points with a true object each, and the Gaussians that speak for them.
 
-Benchmarks count points of a scan. Where a scene has a labeled mesh, the points are its vertices, and what is predicted
-of Gaussians reaches each vertex from the nearest one. Where a scene has instance pictures instead, the points are the
-Gaussians themselves, and the object of each is the instance on whose pixels most of its blending weight falls, less
-what measured depth says is hidden.
+Benchmarks count points of a scan. Where a scene has a labeled mesh, the points are its vertices: a mask or a feature
+reaches each vertex from the nearest Gaussian, a class from a vote of the nearest ones. Where a scene has instance
+pictures instead, the points are the Gaussians themselves, and the object of each is the instance on whose pixels most
+of its blending weight falls, less what measured depth says is hidden.
 """
 
 from collections.abc import Mapping
@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int32, Int64
+from jaxtyping import Bool, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.truth.nearest_vertices import nearest_rows
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import blend
 from gsencoder.types import MeshLabels, Scene
@@ -33,12 +34,14 @@ class LabeledPoints:
         objects: id of the object of each point, 0 = none.
         names: the class of each object that has one, by its id.
         gaussians: row of the Gaussian that each point takes predictions from, -1 = none is near.
+        positions: of vertices, in the frame of the Gaussians; None where the points are the Gaussians themselves.
     """
 
     scene: str
     objects: Int32[np.ndarray, " P"]
     names: Mapping[int, str]
     gaussians: Int64[np.ndarray, " P"]
+    positions: Float64[np.ndarray, "P 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -56,10 +59,6 @@ class LabeledPoints:
         """The Gaussians that speak for the points of an object, ascending, each once."""
         rows = np.unique(self.gaussians[self.objects == number])
         return rows[rows >= 0]
-
-    def from_gaussians(self, values: np.ndarray, nothing: int) -> np.ndarray:
-        """A value of each Gaussian carried to the points; `nothing` for points that no Gaussian is near."""
-        return np.where(self.gaussians >= 0, values[self.gaussians], nothing)
 
     def masked(self, rows: Int64[np.ndarray, " n"], count: int) -> Bool[np.ndarray, " P"]:
         """Which points take their prediction from some of `count` Gaussians."""
@@ -110,13 +109,12 @@ def labeled_points(
 
 
 def _vertices(scene: Scene, mesh: MeshLabels, max_distance: float) -> LabeledPoints:
-    from scipy.spatial import cKDTree
-
     assert scene.gaussians is not None
-    if not len(scene.gaussians):
-        rows = np.full(len(mesh), -1, np.int64)
-    else:
-        vertices = mesh.vertices.astype(np.float64) - scene.origin
-        distances, nearest = cKDTree(scene.gaussians.means.astype(np.float64)).query(vertices)
-        rows = np.where(distances <= max_distance, nearest, -1).astype(np.int64)
-    return LabeledPoints(scene=scene.name, objects=mesh.instances, names=dict(mesh.objects), gaussians=rows)
+    positions = mesh.vertices.astype(np.float64) - scene.origin
+    return LabeledPoints(
+        scene=scene.name,
+        objects=mesh.instances,
+        names=dict(mesh.objects),
+        gaussians=nearest_rows(positions, scene.gaussians.means.astype(np.float64), max_distance=max_distance),
+        positions=positions,
+    )

@@ -1,21 +1,19 @@
-"""Scores of files of predictions against files of truth, by protocol: what `score` and `evaluate` both report."""
+"""Scores of files of instances, labels and recognized objects: what `score` and `evaluate` both report."""
 
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
+from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.files.instances import match_instance_files
 from gsencoder.evaluate.files.recognition import read_recognition_truth, recognize_files
-from gsencoder.evaluate.files.referring import compare_box_files
 from gsencoder.evaluate.files.semantics import count_label_files
 from gsencoder.evaluate.result_table import table_of
 from gsencoder.evaluate.score_report import ScoreReport, spread
-from gsencoder.evaluate.scores.class_table import ClassTable
-from gsencoder.evaluate.scores.instances import MIN_REGION, OVERLAPS, InstanceAverages, instance_scores
+from gsencoder.evaluate.scores.instance_matches import MIN_REGION, OVERLAPS
+from gsencoder.evaluate.scores.instances import InstanceAverages, instance_scores
 from gsencoder.evaluate.scores.recognition import recognition_scores
-from gsencoder.evaluate.scores.referring import IOUS, ReferringTable, referring_scores
 from gsencoder.evaluate.scores.semantics import BACKGROUND, SemanticAverages, semantic_scores
 
 EQUAL_SCORES = (
@@ -30,6 +28,7 @@ def score_instances(
     *,
     method: str = "predictions",
     scenes: Collection[str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
     class_agnostic: bool = False,
     min_region: int = MIN_REGION,
 ) -> ScoreReport:
@@ -37,10 +36,11 @@ def score_instances(
 
     Args:
         predictions: folder of SCENE.txt or SCENE.npz.
-        truth: folder of SCENE.txt.
+        truth: folder of SCENE.txt, or of ScanNet's scans.
         classes: that are scored.
         method: name of the predictions' row in the table.
         scenes: names of those to score; None = all of the truth.
+        raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
         class_agnostic: leave the classes of masks out of account.
         min_region: smallest number of vertices of a true object and of a mask that count.
 
@@ -49,7 +49,13 @@ def score_instances(
     """
     matches = list(
         match_instance_files(
-            predictions, truth, classes, scenes=scenes, class_agnostic=class_agnostic, min_region=min_region
+            predictions,
+            truth,
+            classes,
+            scenes=scenes,
+            raw_ids=raw_ids,
+            class_agnostic=class_agnostic,
+            min_region=min_region,
         )
     )
     scores = instance_scores(matches, classes)
@@ -97,22 +103,24 @@ def score_semantics(
     *,
     method: str = "predictions",
     scenes: Collection[str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
     excluded: Collection[str] = BACKGROUND,
 ) -> ScoreReport:
     """IoU and accuracy of the labels of vertices (`gsencoder.evaluate.scores.semantics`).
 
     Args:
         predictions: folder of SCENE.txt.
-        truth: folder of SCENE.txt.
+        truth: folder of SCENE.txt, or of ScanNet's scans.
         classes: that are scored.
         method: name of the predictions' row in the table.
         scenes: names of those to score; None = all of the truth.
+        raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
         excluded: classes that are not of the foreground.
 
     Raises:
         InputError: files that cannot be used or that do not belong together.
     """
-    counts = list(count_label_files(predictions, truth, classes, scenes=scenes))
+    counts = list(count_label_files(predictions, truth, classes, scenes=scenes, raw_ids=raw_ids))
     scores = semantic_scores(counts, classes, excluded=excluded)
     overall = asdict(scores.overall) | _foreground(scores.foreground)
     by_scene = [
@@ -199,93 +207,9 @@ def score_recognition(
     )
 
 
-def score_referring(
-    predictions: Path,
-    truth: Path,
-    *,
-    method: str = "predictions",
-    ks: Sequence[int] = (5,),
-    allow_missing: bool = False,
-) -> ScoreReport:
-    """Accuracy of the boxes of sentences (`gsencoder.evaluate.scores.referring`).
-
-    Args:
-        predictions: JSON of boxes by sentence.
-        truth: JSON of sentences with their box.
-        method: name of the predictions' rows in the table.
-        ks: numbers of boxes of which the best counts, besides the first and all.
-        allow_missing: count sentences without a prediction as wrong, instead of refusing them.
-
-    Raises:
-        InputError: files that cannot be used or that do not belong together.
-    """
-    sentences, unscored = compare_box_files(predictions, truth, allow_missing=allow_missing)
-    scores = referring_scores(sentences, ks=ks)
-    by_scene_name = defaultdict(list)
-    for each in sentences:
-        by_scene_name[each.scene].append(each)
-    by_scene = [
-        {"scene": scene, "sentences": len(each), **_accuracies(referring_scores(each, ks=ks).top1)}
-        for scene, each in by_scene_name.items()
-    ]
-    kinds = {method: scores.top1}
-    kinds |= {f"{method}, best of {k}": scores.best_of[k] for k in ks}
-    kinds |= {f"{method}, best of all": scores.best}
-    measured = {name: _accuracies(table) | _by_uniqueness(table) for name, table in kinds.items()}
-    overall, best = measured[method], measured[f"{method}, best of all"]
-    notes = [f"{count} sentences are not scored: {reason}." for reason, count in unscored.items()]
-    return ScoreReport(
-        results={
-            "protocol": "referring",
-            "sentences": scores.sentences,
-            "without_box": scores.without_box,
-            "not_scored": unscored,
-            "thresholds": list(IOUS),
-            **overall,
-            "best_of": {str(k): _accuracies(scores.best_of[k]) for k in ks} | {"all": _accuracies(scores.best)},
-            "tables": {"top_1": _plain(scores.top1), "best": _plain(scores.best)},
-            "spread": spread(by_scene, ["acc_25", "acc_50"]),
-        },
-        table=table_of("Referring", measured, published="splatdistill_5_referring", notes=notes),
-        rows={
-            "scenes": by_scene,
-            "sentences": [
-                {
-                    "scene": each.scene,
-                    "object": each.object,
-                    "annotation": each.annotation,
-                    "iou": each.ious[0] if each.ious else 0.0,
-                    "best_iou": max(each.ious, default=0.0),
-                    "multiple": each.multiple,
-                }
-                for each in sentences
-            ],
-        },
-        line=f"{scores.sentences} sentences: Acc@0.25 {overall['acc_25']:.3f}, Acc@0.5 {overall['acc_50']:.3f}; "
-        f"{scores.without_box} without a box; of all boxes the best: {best['acc_25']:.3f}, {best['acc_50']:.3f}",
-    )
-
-
 def _precisions(averages: InstanceAverages) -> dict[str, float]:
     return {"ap_25": averages.ap25, "ap_50": averages.ap50, "ap": averages.ap}
 
 
 def _foreground(averages: SemanticAverages) -> dict[str, float]:
     return {f"f_{name}": value for name, value in asdict(averages).items()}
-
-
-def _accuracies(table: ReferringTable) -> dict[str, float]:
-    cell = table["overall"]["overall"]
-    return {"acc_25": cell.acc25, "acc_50": cell.acc50}
-
-
-def _by_uniqueness(table: ReferringTable) -> dict[str, float]:
-    return {
-        f"{kind}_{name}": getattr(table[kind]["overall"], field)
-        for kind in ("unique", "multiple")
-        for name, field in (("25", "acc25"), ("50", "acc50"))
-    }
-
-
-def _plain(table: ReferringTable) -> dict[str, Any]:
-    return {kind: {subset: asdict(cell) for subset, cell in cells.items()} for kind, cells in table.items()}

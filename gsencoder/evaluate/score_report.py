@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.evaluate.result_table import ResultTable
+from gsencoder.evaluate.scores.means import mean_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +40,7 @@ def spread(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> dict[st
         values = [row[column] for row in rows if row.get(column) is not None and not math.isnan(row[column])]
         figures[column] = {
             "scenes": len(values),
-            "mean": float(np.mean(values)) if values else math.nan,
+            "mean": mean_of(values),
             "std": float(np.std(values, ddof=1)) if len(values) > 1 else math.nan,
         }
     return figures

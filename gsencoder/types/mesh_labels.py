@@ -69,5 +69,5 @@ class MeshLabels:
             return {}
         lower = np.minimum.reduceat(vertices[rows], starts, axis=0)
         upper = np.maximum.reduceat(vertices[rows], starts, axis=0)
-        found = {int(number): (low, high) for number, low, high in zip(ids, lower, upper, strict=True)}
-        return {number: found[number] for number, _ in self.objects if number in found}
+        corners = {int(number): (low, high) for number, low, high in zip(ids, lower, upper, strict=True)}
+        return {number: corners[number] for number, _ in self.objects if number in corners}

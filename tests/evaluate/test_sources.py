@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from splats import random_gaussians
 
-from gsencoder.app.commands import evaluate
+from gsencoder.app.commands import evaluate_sources
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words
 from gsencoder.text.build import stating_trained
@@ -55,13 +55,17 @@ def test_the_space_is_that_which_is_named_or_that_of_the_words(
     encoder: Any = Stub()
     assert asked(encoder_source(encoder, space=name)) == name
     assert space_of_words(encoder, WORDS[name]) == name
-    monkeypatch.setattr(evaluate, "load_encoder", lambda *_: encoder)
-    source, words = evaluate._source(evaluate.EvaluateConfig(paths=("s",), weights="w", space=name))
+    monkeypatch.setattr(evaluate_sources, "load_encoder", lambda *_: encoder)
+    source, words = evaluate_sources.teacher_or_encoder(
+        evaluate_sources.EvaluateConfig(paths=("s",), weights="w", space=name)
+    )
     assert asked(source) == name
     assert words.space.text_encoder == f"{name}-words"
     save_text_table(tmp_path / "words.safetensors", WORDS[name])
-    own = replace(evaluate.LabelsConfig(), words=str(tmp_path / "words.safetensors"))
-    source, words = evaluate._source(evaluate.EvaluateConfig(paths=("s",), weights="w", teacher=own))
+    own = replace(evaluate_sources.LabelsConfig(), words=str(tmp_path / "words.safetensors"))
+    source, words = evaluate_sources.teacher_or_encoder(
+        evaluate_sources.EvaluateConfig(paths=("s",), weights="w", teacher=own)
+    )
     assert asked(source) == name
     # What the encoder was trained on is stated by the table of this space, also for words that are given.
     assert words.trained == ("cup",)
@@ -72,9 +76,11 @@ def test_two_spaces_of_one_text_encoder_are_told_apart_by_their_name_alone(monke
     encoder.spaces["b"] = replace(encoder.spaces["b"], text_encoder="a-words")
     with pytest.raises(InputError, match="those of 2 of the encoder's teachers"):
         space_of_words(encoder, WORDS["a"])
-    monkeypatch.setattr(evaluate, "load_encoder", lambda *_: encoder)
+    monkeypatch.setattr(evaluate_sources, "load_encoder", lambda *_: encoder)
     for name in ("a", "b"):
-        source, _ = evaluate._source(evaluate.EvaluateConfig(paths=("s",), weights="w", space=name))
+        source, _ = evaluate_sources.teacher_or_encoder(
+            evaluate_sources.EvaluateConfig(paths=("s",), weights="w", space=name)
+        )
         assert asked(source) == name
 
 

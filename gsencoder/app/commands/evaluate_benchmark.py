@@ -14,7 +14,8 @@ from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.label_sets import COLUMNS, read_label_map
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.evaluate.benchmark_files import (
     BenchmarkProtocol,
     PredictedScene,
@@ -24,8 +25,8 @@ from gsencoder.evaluate.benchmark_files import (
 )
 from gsencoder.evaluate.files.class_files import load_classes, write_classes
 from gsencoder.evaluate.protocols.absent import names_of
+from gsencoder.evaluate.protocols.referring import ReferringProtocol
 from gsencoder.evaluate.protocols.semantics import classes_of
-from gsencoder.evaluate.scores.class_table import ClassTable
 from gsencoder.evaluate.sources import FeatureSource
 from gsencoder.text.build import Words
 from gsencoder.train.distributed import ProcessRank, fail_together, join_processes
@@ -49,6 +50,9 @@ def run_benchmark(
             if process.is_first:
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
             classes, class_names = _classes(config)
+            raw_ids = None
+            if isinstance(protocol, ReferringProtocol) and config.label_map:
+                raw_ids = read_label_map(Path(config.label_map), COLUMNS["scannet20"])
         shared = _from_first(folder, process)
         with fail_together():
             done = write_predictions(
@@ -59,6 +63,7 @@ def run_benchmark(
                 shared,
                 protocol=protocol,
                 class_names=class_names,
+                raw_ids=raw_ids,
                 part=process.rank,
                 seeds=config.seeds,
                 localization=config.localize,
@@ -96,12 +101,12 @@ def _from_all(done: list[PredictedScene], process: ProcessRank) -> list[Predicte
 def _classes(config: EvaluateConfig) -> tuple[ClassTable, dict[str, str] | None]:
     """The classes that can be predicted, and where a label map is given the class of each raw name."""
     if not config.classes:
-        if config.label_map:
+        if config.label_map and not isinstance(config.protocol, ReferringProtocol):
             raise InputError("label_map: leads to the ids of a benchmark; give classes=scannet20 or classes=scannet200")
         return classes_of(names_of(scene for scene, _ in scenes_of(config))), None
     classes = load_classes(config.classes)
     if not config.label_map:
         return classes, None
-    name_of = dict(zip(classes.ids, classes.names, strict=True))
-    ids = read_label_map(Path(config.label_map), COLUMNS.get(config.classes, "id"))
+    name_of = classes.name_of
+    ids = read_label_map(Path(config.label_map), COLUMNS.get(config.classes, DEFAULT_COLUMN))
     return classes, {raw: name_of[number] for raw, number in ids.items() if number in name_of}

@@ -83,7 +83,8 @@ class EvaluateConfig(CommonConfig):
     label_map: str = field(
         default="",
         metadata={
-            "help": "scannetv2-labels.combined.tsv, which gives the raw names of ScanNet's objects a class of classes="
+            "help": "scannetv2-labels.combined.tsv, which gives the raw names of ScanNet's objects a class of "
+            "classes=, and of referring tells unique from multiple"
         },
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})

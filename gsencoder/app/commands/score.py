@@ -13,12 +13,14 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import write_bytes
+from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.data.truth.split_files import read_split
 from gsencoder.evaluate.files.class_files import load_classes
-from gsencoder.evaluate.score_files import score_instances, score_recognition, score_referring, score_semantics
+from gsencoder.evaluate.score_boxes import score_referring
+from gsencoder.evaluate.score_files import score_instances, score_recognition, score_semantics
 from gsencoder.evaluate.score_report import ScoreReport
 from gsencoder.evaluate.score_texts import score_answer_files, score_caption_files
-from gsencoder.evaluate.scores.instances import MIN_REGION
+from gsencoder.evaluate.scores.instance_matches import MIN_REGION
 from gsencoder.evaluate.scores.semantics import BACKGROUND
 
 TABLE = "table.md"
@@ -42,7 +44,12 @@ class ScoreConfig(CommonConfig):
         default="", metadata={"help": "file or folder of the predictions, in the benchmark's format", "required": True}
     )
     truth: str = field(
-        default="", metadata={"help": "file or folder of the truth, in the benchmark's format", "required": True}
+        default="",
+        metadata={
+            "help": "file or folder of the truth, in the benchmark's format; of instances and semantics also a folder "
+            "of ScanNet's scans, with label_map=",
+            "required": True,
+        },
     )
     method: str = field(default="predictions", metadata={"help": "name of the predictions in the table"})
     classes: str = field(
@@ -51,6 +58,17 @@ class ScoreConfig(CommonConfig):
             "help": "of instances, semantics and recognition: scannet20, scannet200, or a CSV file with the columns "
             "id, name and, if there are any, group; empty for recognition = all names of the truth"
         },
+    )
+    label_map: str = field(
+        default="",
+        metadata={
+            "help": "scannetv2-labels.combined.tsv: of instances and semantics it gives the objects of truth=SCANS a "
+            "class, of referring it tells unique from multiple where the truth does not"
+        },
+    )
+    scans: str = field(
+        default="",
+        metadata={"help": "of referring: folder of ScanNet's scans, whose labels have the boxes that truth= has not"},
     )
     scenes: str = field(
         default="",
@@ -144,6 +162,7 @@ def _instances(config: ScoreConfig) -> ScoreReport:
         load_classes(_given_classes(config)),
         method=config.method,
         scenes=_split(config),
+        raw_ids=_raw_ids(config),
         class_agnostic=config.class_agnostic,
         min_region=config.min_region,
     )
@@ -156,6 +175,7 @@ def _semantics(config: ScoreConfig) -> ScoreReport:
         load_classes(_given_classes(config)),
         method=config.method,
         scenes=_split(config),
+        raw_ids=_raw_ids(config),
         excluded=config.excluded,
     )
 
@@ -177,6 +197,8 @@ def _referring(config: ScoreConfig) -> ScoreReport:
         Path(config.truth),
         method=config.method,
         ks=[k for k in config.ks if k > 1],
+        label_map=Path(config.label_map) if config.label_map else None,
+        scans=Path(config.scans) if config.scans else None,
         allow_missing=config.allow_missing,
     )
 
@@ -208,6 +230,13 @@ def _given_classes(config: ScoreConfig) -> str:
     return config.classes
 
 
+def _raw_ids(config: ScoreConfig) -> dict[str, int] | None:
+    """Class ids of the raw names of ScanNet's objects."""
+    if not config.label_map:
+        return None
+    return read_label_map(Path(config.label_map), COLUMNS.get(config.classes, DEFAULT_COLUMN))
+
+
 def _split(config: ScoreConfig) -> tuple[str, ...] | None:
     return read_split(Path(config.scenes)) if config.scenes else None
 
@@ -222,10 +251,10 @@ PROTOCOLS: dict[str, Callable[[ScoreConfig], ScoreReport]] = {
 }
 """What can be scored."""
 TAKEN = {
-    "instances": ("classes", "scenes", "class_agnostic", "min_region"),
-    "semantics": ("classes", "scenes", "excluded"),
+    "instances": ("classes", "label_map", "scenes", "class_agnostic", "min_region"),
+    "semantics": ("classes", "label_map", "scenes", "excluded"),
     "recognition": ("classes", "ks", "allow_missing"),
-    "referring": ("ks", "allow_missing"),
+    "referring": ("label_map", "scans", "ks", "allow_missing"),
     "answers": ("java", "allow_missing"),
     "captions": ("min_iou", "java", "allow_missing"),
 }

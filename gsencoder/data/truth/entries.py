@@ -1,23 +1,25 @@
 """Checked values of the JSON files in which benchmarks of language in scenes are published."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.readers.transforms_json import read_json
+from gsencoder.data.truth.checked_files import LIST_BYTES, check_file
 
-MAX_BYTES = 1 << 30
-"""Larger files are no annotations."""
 MAX_TEXT = 20_000
 """Largest number of characters of a question, an answer or a caption; the longest published ones have some hundred."""
 MAX_ID = 200
-"""Largest number of characters of an id."""
-PICKLES = (".pkl", ".pickle", ".p", ".pt", ".pth")
-"""Suffixes of files that run code when they are read."""
+"""Largest number of characters of an id or of the name of a class."""
+MAX_COORDINATE = 1e9
+"""Larger coordinates are no places."""
 
 Corner = tuple[float, float, float]
+Entry = tuple[Mapping[str, Any], str]
+"""An object of a file, and its place for messages."""
 _SIGNS = ((1, 1, 1), (1, 0, 1), (0, 0, 1), (0, 1, 1), (1, 1, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0))
 
 
@@ -27,39 +29,51 @@ def read_benchmark_json(path: Path) -> Any:
     Raises:
         InputError: unreadable, a pickle, too large, not JSON, or a key is there twice.
     """
-    refuse_pickle(path)
+    check_file(path, max_bytes=LIST_BYTES)
     return read_json(path, unique_keys=True)
 
 
-def refuse_pickle(path: Path) -> None:
-    """Raises an error for a file that cannot be a text file of annotations.
+def entries_of(rows: Any, path: Path, expected: str, *, key: str = "") -> tuple[Entry, ...]:
+    """The entries of a list of JSON objects, each with its place for messages.
+
+    Args:
+        rows: the content of the file, or of one key of it.
+        path: of the file.
+        expected: the keys of an entry.
+        key: under which the list stands in the file; empty = the file is the list.
 
     Raises:
-        InputError: missing, too large, or a pickle, which could run any code when it is read.
+        InputError: no list, or an entry that is no object.
     """
-    try:
-        size = path.stat().st_size
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder; expected a file")
-        with open(path, "rb") as stream:
-            start = stream.read(4)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if path.suffix.lower() in PICKLES or start[:1] == b"\x80" or start == b"PK\x03\x04":
-        raise InputError(
-            f"{path}: is a pickle or an archive of one, which can run code when it is read; expected JSON: load it "
-            "where you trust it and write the same lists and names with json.dump"
-        )
-    if size > MAX_BYTES:
-        raise InputError(f"{path}: {size:,} bytes, at most {MAX_BYTES:,} in a file of annotations")
+    if not isinstance(rows, list):
+        what = f"{key} must be" if key else "expected"
+        raise InputError(f"{path}: {what} a list of objects with {expected}, got {shown(rows)}")
+    wheres = [f"{path}: {key}[{index}]" if key else f"{path}: entry {index}" for index in range(len(rows))]
+    return tuple((object_of(row, where, expected), where) for row, where in zip(rows, wheres, strict=True))
+
+
+def refuse_repeated(path: Path, keys: Iterable[Hashable], name: Callable[[Any], str], *, what: str = "id") -> None:
+    """Raises an error if two entries of a file have one key.
+
+    Args:
+        path: of the file.
+        keys: of the entries, in order.
+        name: a key in words.
+        what: what keys are.
+
+    Raises:
+        InputError: two entries have one key.
+    """
+    if repeated := first_repeated(keys):
+        key, first, second = repeated
+        raise InputError(f"{path}: entries {first} and {second} have one {what}: {name(key)}; expected each once")
 
 
 def shown(value: Any) -> str:
-    """The first characters of a value, on one line, for a message."""
-    text = value[:60] if isinstance(value, str) else value
-    return repr(text)[:60]
+    """A value for a message, on one line and cut off; the type alone of what may be large."""
+    if isinstance(value, (list, dict)):
+        return "a list" if isinstance(value, list) else "an object"
+    return "nothing" if value is None else repr(value[:60] if isinstance(value, str) else value)[:80]
 
 
 def object_of(value: Any, where: str, expected: str) -> Mapping[str, Any]:
@@ -127,12 +141,57 @@ def id_value(value: Any, where: str, what: str) -> str:
     """
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
-    if isinstance(value, str) and value.strip() and value.isprintable() and len(value) <= MAX_ID:
-        return value
+    if _is_name(value):
+        return str(value)
     raise InputError(
         f"{where}: {what} must be a whole number or a text of one line with 1 to {MAX_ID} characters, got "
-        f"{shown(value)}"
+        f"{_shown_name(value)}"
     )
+
+
+def annotation_id(value: Any, where: str, what: str = "ann_id") -> str:
+    """The number of an annotation about an object, as text: 7, "7" and "07" are the same.
+
+    Raises:
+        InputError: as `id_value`.
+    """
+    text = id_value(value, where, what)
+    return str(int(text)) if text.isascii() and text.isdigit() else text
+
+
+def name_value(value: Any, where: str, what: str) -> str:
+    """The name of a class: a text of one line.
+
+    Raises:
+        InputError: something else.
+    """
+    if not _is_name(value):
+        raise InputError(
+            f"{where}: {what} must be a text of one line with 1 to {MAX_ID} characters, got {_shown_name(value)}"
+        )
+    return str(value)
+
+
+def flag_value(value: Any, where: str, what: str) -> bool | None:
+    """0 or 1, or false or true; None if there is none.
+
+    Raises:
+        InputError: something else.
+    """
+    if value is None:
+        return None
+    if not isinstance(value, int) or value not in (0, 1):
+        raise InputError(f"{where}: {what} must be 0 or 1, got {shown(value)}")
+    return bool(value)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip()) and value.isprintable() and len(value) <= MAX_ID
+
+
+def _shown_name(value: Any) -> str:
+    too_long = isinstance(value, str) and len(value) > MAX_ID
+    return f"{len(value):,} characters" if too_long else shown(value)
 
 
 def object_id(value: Any, where: str, what: str = "object_id") -> int:
@@ -148,33 +207,45 @@ def object_id(value: Any, where: str, what: str = "object_id") -> int:
     raise InputError(f"{where}: {what} must be a whole number from 0, got {shown(value)}")
 
 
-def number(value: Any, where: str, what: str) -> float:
+def number(value: Any, where: str, what: str, *, largest: float = 1e15) -> float:
     """A finite number.
+
+    Args:
+        value: of the file.
+        where: file and entry.
+        what: name of the value.
+        largest: largest absolute value.
 
     Raises:
         InputError: something else.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{where}: {what} must be a number, got {shown(value)}")
-    if not abs(value) < 1e15 or not math.isfinite(value):
-        raise InputError(f"{where}: {what} must be a finite number, got {shown(value)}")
+    if not abs(value) <= largest or not math.isfinite(value):
+        raise InputError(f"{where}: {what} must be a finite number of at most {largest:g}, got {shown(value)}")
     return float(value)
 
 
 def corner_bounds(value: Any, where: str, what: str) -> tuple[Corner, Corner]:
-    """Lower and upper corner of a box that is written by its eight corners, as the official scripts take them.
+    """Lower and upper corner of an axis-aligned box, which is written by its eight corners, as the official scripts
+    take them and of which the lowest and highest coordinates count, or by its lower and its upper corner.
 
     Raises:
-        InputError: not eight corners of three finite numbers.
+        InputError: other corners, coordinates that are no finite numbers, or a lower corner that is above the upper.
     """
-    if not isinstance(value, list) or len(value) != 8:
-        raise InputError(f"{where}: {what} must be a list of 8 corners [x, y, z], got {shown(value)}")
+    rows = value if isinstance(value, list) else []
+    if len(rows) not in (2, 8):
+        raise InputError(
+            f"{where}: {what} must be a list of 8 corners [x, y, z], or of a lower and an upper one, got {shown(value)}"
+        )
     corners = []
-    for row, corner in enumerate(value):
+    for row, corner in enumerate(rows):
         if not isinstance(corner, list) or len(corner) != 3:
             raise InputError(f"{where}: {what}[{row}] must be a corner [x, y, z], got {shown(corner)}")
-        corners.append([number(each, where, f"{what}[{row}]") for each in corner])
+        corners.append([number(each, where, f"{what}[{row}]", largest=MAX_COORDINATE) for each in corner])
     lower, upper = ([pick(axis) for axis in zip(*corners, strict=True)] for pick in (min, max))
+    if len(corners) == 2 and lower != corners[0]:
+        raise InputError(f"{where}: {what}: the lower corner {corners[0]} is not below the upper {corners[1]}")
     return (lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])
 
 

@@ -2,7 +2,9 @@
 
 ScanRefer (Chen et al. 2020): ScanRefer_filtered_{train,val}.json, a list of {scene_id, object_id, object_name, ann_id,
 description, token}. Scan2Cap's benchmark adds to each entry the box of the object as `bbox`, eight corners
-(ScanRefer_filtered_{train,val}_gt_bbox.json). Nr3D (ReferIt3D, Achlioptas et al. 2020): nr3d.csv.
+(ScanRefer_filtered_{train,val}_gt_bbox.json). ScanRefer's predictions say unique_multiple (1 if the scene has several
+objects of the class) and others (1 if the class is none of the named ones), and both may stand here as well. Nr3D
+(ReferIt3D, Achlioptas et al. 2020): nr3d.csv.
 """
 
 import ast
@@ -12,29 +14,33 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
+from gsencoder.data.truth.checked_files import LIST_BYTES, read_checked_text
 from gsencoder.data.truth.entries import (
     MAX_TEXT,
     Corner,
+    Entry,
+    annotation_id,
     box_corners,
     corner_bounds,
+    entries_of,
+    flag_value,
     id_value,
     object_id,
-    object_of,
     read_benchmark_json,
-    refuse_pickle,
+    refuse_repeated,
     scene_name,
     shown,
     text_list,
     text_value,
 )
 
+SCANREFER = "scene_id, object_id, object_name, ann_id, description and token"
 NR3D_COLUMNS = ("assignmentid", "utterance", "instance_type", "scan_id", "target_id", "tokens")
 """Columns that Nr3D must have; `stimulus_id`, `mentions_target_class` and `correct_guess` are read if present."""
-PREDICTED = ("answer_top10", "pred_answers_at10", "caption", "aabb", "boxes")
+PREDICTED = ("answer_top10", "pred_answers_at10", "caption", "aabb", "boxes", "bboxes")
 """Keys that predictions have and annotations have not."""
 
 
@@ -55,6 +61,8 @@ class Expression:
             file does not say. More than two are hard (ReferIt3D).
         mentions_class: whether the text names the class of the object; None where the file does not say.
         understood: whether a listener found the object; None where the file does not say.
+        multiple: whether the scene has several objects of its class; None where the file does not say.
+        others: whether its class is none of ScanRefer's named ones; None where the file does not say.
     """
 
     scene: str
@@ -67,6 +75,8 @@ class Expression:
     same_class: int | None = None
     mentions_class: bool | None = None
     understood: bool | None = None
+    multiple: bool | None = None
+    others: bool | None = None
 
     @property
     def key(self) -> tuple[str, int, str]:
@@ -82,24 +92,24 @@ def read_scanrefer(path: str | Path) -> tuple[Expression, ...]:
     """
     file = Path(path)
     rows = read_benchmark_json(file)
-    if not isinstance(rows, list):
+    if isinstance(rows, dict):
         raise InputError(
-            f"{file}: expected a list of expressions with scene_id, object_id, ann_id and description, got a JSON "
-            f"{type(rows).__name__}; were predictions and truth swapped?"
+            f"{file}: expected a list of expressions with {SCANREFER}, got an object; were predictions and truth "
+            "swapped?"
         )
-    expressions = tuple(_scanrefer(row, f"{file}: entry {index}") for index, row in enumerate(rows))
-    _check_unique(expressions, file)
+    expressions = tuple(_scanrefer(entry) for entry in entries_of(rows, file, SCANREFER))
+    _refuse_repeated(file, expressions)
     _check_objects(expressions, file)
     return expressions
 
 
 def write_scanrefer(path: str | Path, expressions: Sequence[Expression]) -> None:
-    """Writes expressions as ScanRefer's files have them, with boxes where they have some, as Scan2Cap's benchmark does.
+    """Writes expressions as ScanRefer's files have them, with boxes, unique_multiple and others where these are known.
 
     Raises:
         InputError: two expressions have one id, or the file cannot be written.
     """
-    _check_unique(expressions, Path(path))
+    _refuse_repeated(Path(path), expressions)
     rows = [
         {
             "scene_id": each.scene,
@@ -110,6 +120,8 @@ def write_scanrefer(path: str | Path, expressions: Sequence[Expression]) -> None
             "token": list(each.tokens),
         }
         | ({"bbox": box_corners(*each.aabb)} if each.aabb else {})
+        | ({} if each.multiple is None else {"unique_multiple": int(each.multiple)})
+        | ({} if each.others is None else {"others": int(each.others)})
         for each in expressions
     ]
     write_json(path, rows)
@@ -123,25 +135,34 @@ def read_nr3d(path: str | Path) -> tuple[Expression, ...]:
     """
     file = Path(path)
     expressions = tuple(_nr3d(row, where) for row, where in _csv_rows(file, NR3D_COLUMNS))
-    _check_unique(expressions, file)
+    _refuse_repeated(file, expressions)
     return expressions
 
 
-def _scanrefer(row: Any, where: str) -> Expression:
-    entry = object_of(row, where, "scene_id, object_id, ann_id and description")
+def described(key: tuple[str, int | str, str]) -> str:
+    """An expression's name in messages, by scene, object and annotation."""
+    return f"sentence {key[2][:40]} about object {key[1]} of {key[0]}"
+
+
+def _scanrefer(row: Entry) -> Expression:
+    entry, where = row
     if "description" not in entry:
         swapped = next((key for key in PREDICTED if key in entry), None)
         hint = f", got {swapped}: these are predictions" if swapped else ""
-        raise InputError(f"{where}: expected an expression with a description{hint}")
+        raise InputError(
+            f"{where}: expected an expression with a description{hint}; predictions and truth may be swapped"
+        )
     box = entry.get("bbox")
     return Expression(
         scene=scene_name(entry.get("scene_id"), where),
         object_id=object_id(entry.get("object_id"), where),
         object_name=text_value(entry.get("object_name"), where, "object_name"),
-        annotation=id_value(entry.get("ann_id"), where, "ann_id"),
+        annotation=annotation_id(entry.get("ann_id"), where),
         text=text_value(entry["description"], where, "description"),
         tokens=text_list(entry.get("token"), where, "token", empty=True),
         aabb=None if box is None else corner_bounds(box, where, "bbox"),
+        multiple=flag_value(entry.get("unique_multiple"), where, "unique_multiple"),
+        others=flag_value(entry.get("others"), where, "others"),
     )
 
 
@@ -160,11 +181,10 @@ def _nr3d(row: Mapping[str, str], where: str) -> Expression:
 
 
 def _csv_rows(path: Path, columns: Sequence[str]) -> Iterable[tuple[dict[str, str], str]]:
-    refuse_pickle(path)
+    reader = csv.reader(io.StringIO(read_checked_text(path, max_bytes=LIST_BYTES), newline=""), strict=True)
     try:
-        reader = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True)
         lines = [(line, reader.line_num) for line in reader if line]
-    except (OSError, ValueError, csv.Error) as error:
+    except csv.Error as error:
         raise InputError(f"{path}: not a readable CSV file ({' '.join(str(error).split())[:120]})") from error
     header = lines[0][0] if lines else []
     missing = [column for column in columns if column not in header]
@@ -213,15 +233,8 @@ def _truth_value(text: str | None, where: str, column: str) -> bool | None:
     return text.strip().lower() == "true"
 
 
-def _check_unique(expressions: Sequence[Expression], path: Path) -> None:
-    first: dict[tuple[str, int, str], int] = {}
-    for index, each in enumerate(expressions):
-        if each.key in first:
-            raise InputError(
-                f"{path}: entries {first[each.key]} and {index} have one id: scene {each.scene}, object "
-                f"{each.object_id}, annotation {each.annotation[:40]}"
-            )
-        first[each.key] = index
+def _refuse_repeated(path: Path, expressions: Sequence[Expression]) -> None:
+    refuse_repeated(path, [each.key for each in expressions], described)
 
 
 def _check_objects(expressions: Sequence[Expression], path: Path) -> None:

@@ -7,6 +7,7 @@ Queries run in chunks, so that memory does not grow with their number.
 Reference: Li et al., SceneSplat, 2025; SceneSplat's pointcept/utils/misc.py (neighbor_voting).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,24 +60,13 @@ def labels_of_gaussians(
     Raises:
         InputError: positions that are not finite, or a distance that is not positive.
     """
-    from scipy.spatial import cKDTree
-
     _check(means, "Gaussians")
     _check(vertices, "vertices")
-    if not max_distance > 0:
-        raise InputError(f"max_distance: expected a positive length, got {max_distance}")
-    nearest = np.full(len(means), -1, np.int64)
-    if len(vertices):
-        tree = cKDTree(vertices)
-        for start in range(0, len(means), CHUNK):
-            part = slice(start, start + CHUNK)
-            # The bound excludes itself, and makes queries far from the mesh short; beyond it the row is len(vertices).
-            _, rows = tree.query(means[part], distance_upper_bound=np.nextafter(max_distance, np.inf))
-            nearest[part] = np.where(rows < len(vertices), rows, -1)
+    nearest = nearest_rows(means, vertices, max_distance=max_distance)
+    near = nearest >= 0
     result = np.full(len(means), none, np.int32)
-    found = nearest >= 0
-    result[found] = labels[nearest[found]]
-    return GaussianLabels(labels=result, vertices=nearest, far=int(len(means) - found.sum()))
+    result[near] = labels[nearest[near]]
+    return GaussianLabels(labels=result, vertices=nearest, far=int(len(means) - near.sum()))
 
 
 def labels_of_vertices(
@@ -103,10 +93,8 @@ def labels_of_vertices(
         max_distance: Gaussians farther than this do not vote.
 
     Raises:
-        InputError: positions that are not finite, or k below 1.
+        InputError: positions that are not finite, k below 1, or a distance that is not positive.
     """
-    from scipy.spatial import cKDTree
-
     _check(means, "Gaussians")
     _check(vertices, "vertices")
     if k < 1:
@@ -120,19 +108,53 @@ def labels_of_vertices(
     # The last counter is that of neighbors that do not vote.
     codes = np.where(labels == none, len(names), codes).astype(np.int64)
     codes = np.append(codes, len(names))
-    tree, k = cKDTree(means), min(k, len(means))
+    k = min(k, len(means))
     chunk = max(1, min(CHUNK, MAX_VOTES // max(len(names) + 1, k)))
-    for start in range(0, len(vertices), chunk):
-        part = vertices[start : start + chunk]
-        # A neighbor beyond the distance has the row len(means).
-        _, rows = tree.query(part, k=k, distance_upper_bound=np.nextafter(max_distance, np.inf))
-        votes = codes[rows.reshape(len(part), k)] + np.arange(len(part))[:, None] * (len(names) + 1)
-        counts = np.bincount(votes.ravel(), minlength=len(part) * (len(names) + 1))
-        counts = counts.reshape(len(part), len(names) + 1)[:, : len(names)]
+    for part, rows in _neighbors(vertices, means, k, max_distance, chunk):
+        votes = codes[rows] + np.arange(len(rows))[:, None] * (len(names) + 1)
+        counts = np.bincount(votes.ravel(), minlength=len(rows) * (len(names) + 1))
+        counts = counts.reshape(len(rows), len(names) + 1)[:, : len(names)]
         best = counts.argmax(axis=1)
-        elected = counts[np.arange(len(part)), best] > 0
-        result[start : start + len(part)][elected] = names[best[elected]]
+        elected = counts[np.arange(len(rows)), best] > 0
+        result[part][elected] = names[best[elected]]
     return result
+
+
+def nearest_rows(
+    points: Float[np.ndarray, "P 3"], targets: Float[np.ndarray, "T 3"], *, max_distance: float = np.inf
+) -> Int64[np.ndarray, " P"]:
+    """The row of the nearest target of each point; -1 where none is near enough.
+
+    Args:
+        points: finite, in the frame of the targets.
+        targets: finite.
+        max_distance: largest distance, itself included, in the unit of both.
+
+    Raises:
+        InputError: a distance that is not positive.
+    """
+    result = np.full(len(points), -1, np.int64)
+    for part, rows in _neighbors(points, targets, 1, max_distance, CHUNK):
+        result[part] = np.where(rows[:, 0] < len(targets), rows[:, 0], -1)
+    return result
+
+
+def _neighbors(
+    points: Float[np.ndarray, "P 3"], targets: Float[np.ndarray, "T 3"], k: int, max_distance: float, chunk: int
+) -> Iterator[tuple[slice, Int64[np.ndarray, "n {k}"]]]:
+    """The rows of the k nearest targets, of one chunk of points after the other; T beyond the distance."""
+    from scipy.spatial import cKDTree
+
+    if not max_distance > 0:
+        raise InputError(f"max_distance: expected a positive length, got {max_distance}")
+    if not len(targets):
+        return
+    tree = cKDTree(targets)
+    for start in range(0, len(points), chunk):
+        part = slice(start, start + chunk)
+        # The bound excludes itself, and makes queries far from the targets short.
+        _, rows = tree.query(points[part], k=k, distance_upper_bound=np.nextafter(max_distance, np.inf))
+        yield part, rows.reshape(-1, k).astype(np.int64)
 
 
 def _check(points: np.ndarray, what: str) -> None:

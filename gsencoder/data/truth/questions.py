@@ -15,11 +15,14 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.truth.entries import (
     Corner,
+    Entry,
+    entries_of,
     id_value,
     number,
     object_id,
     object_of,
     read_benchmark_json,
+    refuse_repeated,
     scene_name,
     shown,
     text_list,
@@ -27,6 +30,7 @@ from gsencoder.data.truth.entries import (
 )
 from gsencoder.data.truth.expressions import PREDICTED
 
+SCANQA, SQA3D = "scene_id, question_id, question and answers", "scene_id, question_id, situation and question"
 SITUATED = "sqa_annotations"
 """What the name of SQA3D's file of annotations has where that of the questions has `questions`."""
 
@@ -93,14 +97,7 @@ def read_scanqa(path: str | Path, *, answered: bool = True) -> tuple[Question, .
     Raises:
         InputError: not such a file, doubled ids, or questions without answers.
     """
-    file = Path(path)
-    content = read_benchmark_json(file)
-    if not isinstance(content, list):
-        raise InputError(
-            f"{file}: expected ScanQA's list of objects with scene_id, question_id, question and answers, got "
-            f"{shown(content)}"
-        )
-    return _scanqa(content, file, answered)
+    return _scanqa(read_benchmark_json(Path(path)), Path(path), answered)
 
 
 def read_sqa3d(
@@ -129,7 +126,7 @@ def write_scanqa(path: str | Path, questions: Sequence[Question]) -> None:
     Raises:
         InputError: two questions have one id, or the file cannot be written.
     """
-    _check_unique([each.id for each in questions], Path(path))
+    _refuse_repeated(Path(path), [each.id for each in questions])
     rows = [
         {
             "scene_id": each.scene,
@@ -144,11 +141,9 @@ def write_scanqa(path: str | Path, questions: Sequence[Question]) -> None:
     write_json(path, [{k: v for k, v in row.items() if k != "answers" or v} for row in rows])
 
 
-def _scanqa(rows: Sequence[Any], path: Path, answered: bool) -> tuple[Question, ...]:
+def _scanqa(rows: Any, path: Path, answered: bool) -> tuple[Question, ...]:
     questions = []
-    for index, row in enumerate(rows):
-        where = f"{path}: entry {index}"
-        entry = object_of(row, where, "scene_id, question_id, question and answers")
+    for entry, where in entries_of(rows, path, SCANQA):
         swapped = next((key for key in PREDICTED if key in entry), None)
         if swapped:
             raise InputError(f"{where}: expected a question, got {swapped}: these are predictions; were both swapped?")
@@ -163,30 +158,24 @@ def _scanqa(rows: Sequence[Any], path: Path, answered: bool) -> tuple[Question, 
                 object_names=text_list(entry.get("object_names", []), where, "object_names"),
             )
         )
-    _check_unique([each.id for each in questions], path)
+    _refuse_repeated(path, [each.id for each in questions])
     if answered:
         _check_answered(questions, path)
     return tuple(questions)
 
 
 def _sqa3d(content: Mapping[str, Any], path: Path, annotations: Path | None, answered: bool) -> tuple[Question, ...]:
-    rows = content["questions"]
-    if not isinstance(rows, list):
-        raise InputError(f"{path}: questions must be a list, got {shown(rows)}")
-    questions = []
-    for index, row in enumerate(rows):
-        where = f"{path}: questions[{index}]"
-        entry = object_of(row, where, "scene_id, question_id, situation and question")
-        questions.append(
-            Question(
-                dataset="sqa3d",
-                id=id_value(entry.get("question_id"), where, "question_id"),
-                scene=scene_name(entry.get("scene_id"), where),
-                text=text_value(entry.get("question"), where, "question"),
-                situation=text_value(entry.get("situation"), where, "situation"),
-            )
+    questions = [
+        Question(
+            dataset="sqa3d",
+            id=id_value(entry.get("question_id"), where, "question_id"),
+            scene=scene_name(entry.get("scene_id"), where),
+            text=text_value(entry.get("question"), where, "question"),
+            situation=text_value(entry.get("situation"), where, "situation"),
         )
-    _check_unique([each.id for each in questions], path)
+        for entry, where in entries_of(content["questions"], path, SQA3D, key="questions")
+    ]
+    _refuse_repeated(path, [each.id for each in questions])
     if not answered:
         return tuple(questions)
     return _with_annotations(questions, path, annotations or _annotations_beside(path))
@@ -204,16 +193,13 @@ def _annotations_beside(path: Path) -> Path:
 
 def _with_annotations(questions: Sequence[Question], path: Path, annotations: Path) -> tuple[Question, ...]:
     content = read_benchmark_json(annotations)
-    rows = content.get("annotations") if isinstance(content, dict) else None
-    if not isinstance(rows, list):
+    if not isinstance(content, dict) or "annotations" not in content:
         raise InputError(f"{annotations}: expected SQA3D's object with a list of annotations, got {shown(content)}")
-    wheres = [f"{annotations}: annotations[{index}]" for index in range(len(rows))]
-    ids = []
-    for row, where in zip(rows, wheres, strict=True):
-        ids.append(id_value(object_of(row, where, "question_id and answers").get("question_id"), where, "question_id"))
-    _check_unique(ids, annotations)
-    found = dict(zip(ids, zip(rows, wheres, strict=True), strict=True))
-    missing = [each.id for each in questions if each.id not in found]
+    rows = entries_of(content["annotations"], annotations, "question_id and answers", key="annotations")
+    ids = [id_value(entry.get("question_id"), where, "question_id") for entry, where in rows]
+    _refuse_repeated(annotations, ids)
+    row_of = dict(zip(ids, rows, strict=True))
+    missing = [each.id for each in questions if each.id not in row_of]
     extra = set(ids) - {each.id for each in questions}
     if missing or extra:
         name = missing[0] if missing else min(extra)
@@ -221,10 +207,11 @@ def _with_annotations(questions: Sequence[Question], path: Path, annotations: Pa
             f"{annotations}: belongs to other questions than {path}: {len(missing)} of these have no annotation and "
             f"{len(extra)} annotations no question, such as {name[:60]}"
         )
-    return tuple(_annotated(each, *found[each.id]) for each in questions)
+    return tuple(_annotated(each, row_of[each.id]) for each in questions)
 
 
-def _annotated(question: Question, entry: Mapping[str, Any], where: str) -> Question:
+def _annotated(question: Question, row: Entry) -> Question:
+    entry, where = row
     if scene_name(entry.get("scene_id"), where) != question.scene:
         raise InputError(
             f"{where}: question {question.id} is about {question.scene}, and its annotation about "
@@ -258,12 +245,8 @@ def _object_ids(value: Any, where: str) -> tuple[int, ...]:
     return tuple(object_id(each, where, f"object_ids[{index}]") for index, each in enumerate(value))
 
 
-def _check_unique(ids: Sequence[str], path: Path) -> None:
-    first: dict[str, int] = {}
-    for index, each in enumerate(ids):
-        if each in first:
-            raise InputError(f"{path}: entries {first[each]} and {index} have one question_id: {each[:60]}")
-        first[each] = index
+def _refuse_repeated(path: Path, ids: Sequence[str]) -> None:
+    refuse_repeated(path, ids, lambda each: each[:60], what="question_id")
 
 
 def _check_answered(questions: Sequence[Question], path: Path) -> None:

@@ -16,6 +16,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.posed import rigid_pose
+from gsencoder.data.truth.checked_files import read_checked_text
 from gsencoder.data.truth.mesh_file import read_mesh
 from gsencoder.data.truth.segment_files import SegmentVertices, check_counts, read_groups, read_segments
 from gsencoder.types import MeshLabels
@@ -58,20 +59,20 @@ def find_scannet_files(folder: Path) -> ScanNetFiles | None:
     """
     folder = folder.absolute()
     # _vh_clean.aggregation.json belongs to the mesh of full resolution, which no benchmark uses.
-    found = sorted(
+    scans = sorted(
         path.name[: -len(AGGREGATION)]
         for path in folder.glob(f"*{AGGREGATION}")
         if path.is_file() and not path.name.endswith(f"_vh_clean{AGGREGATION}")
     )
-    if folder.name in found:
+    if folder.name in scans:
         return _files(folder, folder.name)
-    if len(found) > 1:
+    if len(scans) > 1:
         raise InputError(
-            f"{folder}: holds annotations of {len(found)} scans ({', '.join(found)[:80]}); expected one, or one named "
+            f"{folder}: holds annotations of {len(scans)} scans ({', '.join(scans)[:80]}); expected one, or one named "
             f"{folder.name}{AGGREGATION}"
         )
-    if found:
-        return _files(folder, found[0])
+    if scans:
+        return _files(folder, scans[0])
     for name in (folder.name, folder.parent.name):
         if name and (folder.parent / f"{name}{AGGREGATION}").is_file():
             return _files(folder.parent, name)
@@ -131,14 +132,7 @@ def read_axis_alignment(path: Path) -> Float64[np.ndarray, "4 4"] | None:
     Raises:
         InputError: unreadable, or a line that is not a rigid transform.
     """
-    try:
-        if path.stat().st_size > MAX_META_BYTES:
-            raise InputError(f"{path}: {path.stat().st_size:,} bytes, expected a short text of a scan's settings")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a readable text file ({' '.join(str(error).split())[:120]})") from error
+    lines = read_checked_text(path, max_bytes=MAX_META_BYTES).splitlines()
     stated = [words for words in (line.partition("=") for line in lines) if words[0].strip() == "axisAlignment"]
     if not stated:
         return None

@@ -4,7 +4,6 @@ One gives each vertex of the mesh the number of its segment (`segIndices`), the 
 segments (`segGroups`: objectId, label, segments).
 """
 
-import json
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,10 @@ import numpy as np
 from jaxtyping import Int64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.first_repeated import first_repeated
+from gsencoder.data.readers.transforms_json import read_json
+from gsencoder.data.truth.checked_files import check_file
+from gsencoder.data.truth.entries import entries_of, shown
 
 MAX_BYTES = 512 << 20
 """Larger JSON files are refused before they are read: they would take tens of times as much memory."""
@@ -62,33 +65,27 @@ def read_groups(path: Path, *, first_id: int) -> tuple[SegmentGroup, ...]:
             objectId that is there twice; the group is named.
     """
     groups: list[SegmentGroup] = []
-    for index, row in enumerate(_read(path, "segGroups", "the objects")):
-        where = f"{path}: segGroups[{index}]"
-        if not isinstance(row, dict):
-            raise InputError(f"{where}: expected an object with objectId, label and segments, got {str(row)[:40]}")
+    rows = _read(path, "segGroups", "the objects")
+    for row, where in entries_of(rows, path, "objectId, label and segments", key="segGroups"):
         number, label = row.get("objectId"), row.get("label")
         if isinstance(number, bool) or not isinstance(number, int) or not first_id <= number <= MAX_ID:
-            raise InputError(f"{where}: objectId must be a whole number from {first_id}, got {str(number)[:40]!r}")
-        where += f" (objectId {number})"
+            raise InputError(f"{where}: objectId must be a whole number from {first_id}, got {shown(number)}")
+        of_object = f"{where} (objectId {number})"
         if not isinstance(label, str):
-            raise InputError(f"{where}: label must be a name, got {str(label)[:40]!r}")
+            raise InputError(f"{of_object}: label must be a name, got {shown(label)}")
         if len(label) > MAX_NAME:
-            raise InputError(f"{where}: label has {len(label):,} characters, expected at most {MAX_NAME:,}")
+            raise InputError(f"{of_object}: label has {len(label):,} characters, expected at most {MAX_NAME:,}")
         segments = row.get("segments")
         if not isinstance(segments, list):
-            raise InputError(f"{where}: segments must be a list of numbers of segments, got {str(segments)[:40]!r}")
+            raise InputError(f"{of_object}: segments must be a list of numbers of segments, got {shown(segments)}")
         if not segments:
-            raise InputError(f"{where}: {label[:40]!r} has no segments; remove it, or get the annotation anew")
+            raise InputError(f"{of_object}: {label[:40]!r} has no segments; remove it, or get the annotation anew")
         groups.append(
-            SegmentGroup(id=number, label=label, segments=np.unique(_integers(segments, f"{where}: segments")))
+            SegmentGroup(id=number, label=label, segments=np.unique(_integers(segments, f"{of_object}: segments")))
         )
-    seen: dict[int, int] = {}
-    for index, group in enumerate(groups):
-        if group.id in seen:
-            raise InputError(
-                f"{path}: segGroups[{index}]: objectId {group.id} is already that of segGroups[{seen[group.id]}]"
-            )
-        seen[group.id] = index
+    if repeated := first_repeated(group.id for group in groups):
+        number, first, second = repeated
+        raise InputError(f"{path}: segGroups[{second}]: objectId {number} is already that of segGroups[{first}]")
     return tuple(groups)
 
 
@@ -140,17 +137,8 @@ def check_counts(segments: Int64[np.ndarray, " V"], vertices: np.ndarray, path: 
 
 def _read(path: Path, key: str, what: str) -> list[Any]:
     """The list at a key of the object that a JSON file holds."""
-    try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(f"{path}: {size:,} bytes, at most {MAX_BYTES:,} are read")
-        data = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except InputError:
-        raise
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a readable JSON file ({' '.join(str(error).split())[:160]})") from error
+    check_file(path, max_bytes=MAX_BYTES)
+    data = read_json(path)
     values = data.get(key) if isinstance(data, dict) else None
     if not isinstance(values, list):
         keys = f"an object with {', '.join(map(str, list(data)[:6]))[:80]}" if isinstance(data, dict) else "no object"
@@ -166,5 +154,5 @@ def _integers(values: list[Any], where: str) -> Int64[np.ndarray, " n"]:
             return np.array(values, np.int64)
     for index, value in enumerate(values):
         if isinstance(value, bool) or not isinstance(value, int) or not -(2**63) <= value < 2**63:
-            raise InputError(f"{where}[{index}]: expected a whole number, got {str(value)[:40]!r}")
+            raise InputError(f"{where}[{index}]: expected a whole number, got {shown(value)}")
     return np.array(values, np.int64)

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.truth.checked_files import read_checked_text
 
 MAX_BYTES = 16 << 20
 
@@ -14,14 +15,7 @@ def read_split(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: unreadable, too large, empty, a line that is no name of a folder, or a name that is there twice.
     """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: {path.stat().st_size:,} bytes; expected one name of a scene a line")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a readable split file ({' '.join(str(error).split())[:120]})") from error
+    lines = read_checked_text(path, max_bytes=MAX_BYTES).splitlines()
     first: dict[str, int] = {}
     for number, line in enumerate(lines, start=1):
         name = line.strip()

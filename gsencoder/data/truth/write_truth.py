@@ -4,36 +4,50 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int, Int64
+from jaxtyping import Int32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import atomic_file
 from gsencoder.data.truth.label_sets import vertex_classes
+from gsencoder.data.truth.number_files import write_whole_numbers
 from gsencoder.types import MeshLabels
 
-INSTANCES_OF_A_CLASS = 1000
-"""A line holds the class times this plus the instance."""
+IDS_PER_CLASS = 1000
+"""A line of the truth of instances holds the class id times this plus the number of the instance."""
 
 
-def instance_truth(labels: MeshLabels, class_of: Mapping[str, int]) -> Int64[np.ndarray, " V"]:
-    """label_id · 1000 + instance of each vertex, and 0 of vertices without an object.
+def instance_truth(
+    instances: Int32[np.ndarray, " V"], names: Mapping[int, str], class_of: Mapping[str, int]
+) -> Int64[np.ndarray, " V"]:
+    """Class id · 1000 + number of the instance, and 0 of vertices without an object.
 
-    An object without a class has its instance alone, which evaluation takes for a region that does not count.
+    The number is the id of the object, as ScanNet's script has it. Where an id is 1000 or more, which would read as
+    another class, objects are numbered from 1 within their class, in the order of their ids: scores are the same. An
+    object without a class has its number alone, which evaluation takes for a region that does not count.
 
     Args:
-        labels: of a mesh.
-        class_of: class of each raw name, as `ids_of_names` gives it.
+        instances: the object of each vertex, 0 = none.
+        names: the name of each object, such as `dict(MeshLabels.objects)`.
+        class_of: class id of each name, as `ids_of_names` gives it.
 
     Raises:
-        InputError: an instance of 1000 or more, which would read as another class.
+        InputError: a class has 1000 objects or more, which the format cannot hold.
     """
-    largest = int(labels.instances.max(initial=0))
-    if largest >= INSTANCES_OF_A_CLASS:
-        name = dict(labels.objects)[largest]
-        raise InputError(
-            f"object {largest} ({name[:40]!r}): ids up to {INSTANCES_OF_A_CLASS - 1} fit into label_id·1000 + instance"
-        )
-    return vertex_classes(labels, class_of).astype(np.int64) * INSTANCES_OF_A_CLASS + labels.instances
+    classes = vertex_classes(instances, names, class_of).astype(np.int64)
+    objects, first, codes = np.unique(instances, return_index=True, return_inverse=True)
+    numbers = objects.astype(np.int64)
+    if int(numbers.max(initial=0)) >= IDS_PER_CLASS:
+        classes_of_objects = classes[first]
+        for number in np.unique(classes_of_objects):
+            rows = np.flatnonzero((classes_of_objects == number) & (objects > 0))
+            if len(rows) >= IDS_PER_CLASS and number:
+                name = names[int(objects[rows[0]])]
+                raise InputError(
+                    f"{name[:40]!r}: {len(rows):,} objects are of its class; up to {IDS_PER_CLASS - 1} fit into class "
+                    "id · 1000 + number"
+                )
+            # The numbers of objects without a class mean nothing.
+            numbers[rows] = np.arange(1, len(rows) + 1) if number else 0
+    return classes * IDS_PER_CLASS + numbers[codes]
 
 
 def write_instance_truth(path: Path, labels: MeshLabels, class_of: Mapping[str, int]) -> None:
@@ -42,7 +56,7 @@ def write_instance_truth(path: Path, labels: MeshLabels, class_of: Mapping[str, 
     Raises:
         InputError: as `instance_truth`, or the file cannot be written.
     """
-    write_numbers(path, instance_truth(labels, class_of))
+    write_whole_numbers(path, instance_truth(labels.instances, dict(labels.objects), class_of))
 
 
 def write_semantic_truth(path: Path, labels: MeshLabels, class_of: Mapping[str, int]) -> None:
@@ -51,15 +65,4 @@ def write_semantic_truth(path: Path, labels: MeshLabels, class_of: Mapping[str, 
     Raises:
         InputError: the file cannot be written.
     """
-    write_numbers(path, vertex_classes(labels, class_of))
-
-
-def write_numbers(path: Path, numbers: Int[np.ndarray, " n"]) -> None:
-    """Writes whole numbers, one a line.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    with atomic_file(path) as stream:
-        for start in range(0, len(numbers), 1 << 20):
-            stream.write(("\n".join(map(str, numbers[start : start + (1 << 20)].tolist())) + "\n").encode("ascii"))
+    write_whole_numbers(path, vertex_classes(labels.instances, dict(labels.objects), class_of))

@@ -2,7 +2,7 @@
 
 ScanQA (scripts/predict.py; its benchmark's submission): a list of {scene_id, question_id, answer_top10, bbox}, the box
 being optional. SQA3D (LLM/eval_sqa3d_llm.py): a list of {scene_id, situation, question, answer, agent_rot, agent_pos},
-which are found again by these five, or by a question_id where there is one. Both scripts write pickles besides; those
+which are recognized by these five, or by a question_id where there is one. Both scripts write pickles besides; those
 are refused.
 """
 
@@ -15,10 +15,12 @@ from gsencoder.core.files.json_values import write_json
 from gsencoder.data.truth.entries import (
     Corner,
     box_corners,
+    entries_of,
     id_value,
     number,
     object_of,
     read_benchmark_json,
+    refuse_repeated,
     scene_name,
     shown,
     text_list,
@@ -46,21 +48,17 @@ def read_answer_predictions(path: str | Path, questions: Sequence[Question]) -> 
     """
     file = Path(path)
     rows = read_benchmark_json(file)
-    if not isinstance(rows, list):
-        truth = isinstance(rows, dict) and ("questions" in rows or "annotations" in rows)
-        hint = "; this is SQA3D's truth: were predictions and truth swapped?" if truth else ""
-        raise InputError(f"{file}: expected a list of objects with {EXPECTED}, got {shown(rows)}{hint}")
+    if isinstance(rows, dict) and ("questions" in rows or "annotations" in rows):
+        raise InputError(
+            f"{file}: expected a list of objects with {EXPECTED}, got SQA3D's truth; were predictions and truth "
+            "swapped?"
+        )
     finder = _Finder(questions)
-    found: dict[str, tuple[str, ...]] = {}
-    first: dict[str, int] = {}
-    for index, row in enumerate(rows):
-        where = f"{file}: entry {index}"
-        entry = object_of(row, where, EXPECTED)
-        question = finder.question(entry, where)
-        if question.id in found:
-            raise InputError(f"{where}: question {question.id[:60]} is answered in entry {first[question.id]} already")
-        found[question.id], first[question.id] = _answers(entry, where), index
-    return found
+    answers = [
+        (finder.question(entry, where).id, _answers(entry, where)) for entry, where in entries_of(rows, file, EXPECTED)
+    ]
+    refuse_repeated(file, [name for name, _ in answers], lambda name: name[:60], what="question_id")
+    return dict(answers)
 
 
 def write_answer_predictions(
@@ -149,15 +147,15 @@ class _Finder:
         situation = text_value(entry["situation"], where, "situation")
         places = _numbers(entry, "agent_pos", ("x", "y", "z"), where)
         turns = _numbers(entry, "agent_rot", ("_w", "_x", "_y", "_z"), where)
-        found = [
+        fitting = [
             each
             for each in self.by_words.get((scene, situation, text), [])
             if None in (places, each.position) or (places == each.position and turns in (None, each.rotation))
         ]
-        if len(found) != 1:
-            fault = "no question of the truth" if not found else f"{len(found)} questions; give its question_id"
+        if len(fitting) != 1:
+            fault = f"{len(fitting)} questions; give its question_id" if fitting else "no question of the truth"
             raise InputError(f"{where}: scene, situation, question and place are those of {fault}: {shown(text)}")
-        return found[0]
+        return fitting[0]
 
 
 def _numbers(entry: Mapping[str, Any], key: str, names: Sequence[str], where: str) -> tuple[float, ...] | None:

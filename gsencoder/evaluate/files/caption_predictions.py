@@ -12,11 +12,12 @@ from typing import Any
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.truth.entries import (
+    Entry,
     box_corners,
     corner_bounds,
+    entries_of,
     number,
     object_id,
-    object_of,
     read_benchmark_json,
     scene_name,
     shown,
@@ -57,9 +58,7 @@ def read_caption_predictions(
         where = f"{file}: {shown(key)}"
         if scene_name(key, where) not in scenes:
             raise InputError(f"{where}: is no scene of the truth")
-        if not isinstance(rows, list):
-            raise InputError(f"{where}: must be a list of objects with caption and box, got {shown(rows)}")
-        boxes += [_box(row, key, f"{file}: {key}[{index}]") for index, row in enumerate(rows)]
+        boxes += [_box(row, key) for row in entries_of(rows, file, "caption and box", key=key)]
     return tuple(boxes)
 
 
@@ -102,8 +101,8 @@ def write_named_captions(
     write_json(path, written)
 
 
-def _box(row: Any, scene: str, where: str) -> CaptionedBox:
-    entry = object_of(row, where, "caption and box")
+def _box(row: Entry, scene: str) -> CaptionedBox:
+    entry, where = row
     return CaptionedBox(
         scene=scene,
         caption=text_value(entry.get("caption"), where, "caption", empty=True),
@@ -123,7 +122,7 @@ def _probabilities(entry: Mapping[str, Any], key: str, where: str) -> tuple[floa
 def _named(content: Mapping[str, Any], path: Path, objects: Sequence[CaptionedObject]) -> tuple[NamedCaption, ...]:
     names = {(each.scene, each.object_id): each.object_name for each in objects}
     scenes = {scene for scene, _ in names}
-    found: dict[tuple[str, int], str] = {}
+    key_of: dict[tuple[str, int], str] = {}
     captions = []
     for key, value in content.items():
         where = f"{path}: {shown(key)}"
@@ -134,11 +133,11 @@ def _named(content: Mapping[str, Any], path: Path, objects: Sequence[CaptionedOb
             raise InputError(f"{where}: is no {'object' if scene in scenes else 'scene'} of the truth")
         if name and name != names[identity]:
             raise InputError(f"{where}: the truth calls this object {shown(names[identity])}")
-        if identity in found:
-            raise InputError(f"{where}: is the same object as {shown(found[identity])}")
+        if identity in key_of:
+            raise InputError(f"{where}: is the same object as {shown(key_of[identity])}")
         sentences = text_list(value, where, "caption", empty=True)
         if len(sentences) != 1:
             raise InputError(f"{where}: has {len(sentences)} captions, expected one")
-        found[identity] = key
+        key_of[identity] = key
         captions.append(NamedCaption(scene=scene, object_id=identity[1], caption=sentences[0]))
     return tuple(captions)

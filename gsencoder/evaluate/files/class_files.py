@@ -4,12 +4,12 @@ import csv
 import io
 from pathlib import Path
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import write_bytes
-from gsencoder.data.truth.label_sets import COLUMNS, LabelSet, scannet_label_set
-from gsencoder.evaluate.files.checked_bytes import read_checked
-from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.data.truth.checked_files import read_checked_text
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.label_sets import COLUMNS, scannet_classes
 
 MAX_CLASS_BYTES = 4 << 20
 
@@ -24,17 +24,17 @@ def load_classes(classes: str) -> ClassTable:
         InputError: no such benchmark or file, or one that is not such a table.
     """
     if classes in COLUMNS:
-        return table_of_set(scannet_label_set(classes))
+        return scannet_classes(classes)
     path = Path(classes)
     if not path.is_file():
         raise InputError(
             f"classes: {classes} is no file; expected {', '.join(COLUMNS)}, or a CSV file with the columns id and name"
         )
+    text = read_checked_text(path, max_bytes=MAX_CLASS_BYTES)
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:
-        text = read_checked(path, max_bytes=MAX_CLASS_BYTES).decode("utf-8-sig")
-        reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
         rows = list(reader)
-    except (UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise InputError(f"{path}: not a readable CSV file ({error})") from error
     if not {"id", "name"} <= set(reader.fieldnames or ()):
         raise InputError(
@@ -53,22 +53,14 @@ def load_classes(classes: str) -> ClassTable:
         names.append(name.strip())
         if row.get("group"):
             groups.setdefault(row["group"], []).append(name.strip())
-    return ClassTable(
-        names=tuple(names), ids=tuple(ids), groups={group: tuple(members) for group, members in groups.items()}
-    )
-
-
-def table_of_set(label_set: LabelSet) -> ClassTable:
-    """A benchmark's classes as a table to score with."""
-    groups = {group: label_set.names_in(group) for group in dict.fromkeys(label_set.groups)}
-    return ClassTable(names=label_set.names, ids=label_set.ids, groups=groups)
+    with about(path):
+        return ClassTable(
+            names=tuple(names), ids=tuple(ids), groups={group: tuple(members) for group, members in groups.items()}
+        )
 
 
 def write_classes(path: Path, classes: ClassTable) -> None:
     """Writes the table as `load_classes` reads it."""
     group_of = {name: group for group, members in classes.groups.items() for name in members}
-    rows = [
-        {"id": number, "name": name, "group": group_of.get(name, "")}
-        for number, name in zip(classes.ids, classes.names, strict=True)
-    ]
+    rows = [{"id": number, "name": name, "group": group_of.get(name, "")} for number, name in classes.name_of.items()]
     write_bytes(path, csv_text(rows).encode())

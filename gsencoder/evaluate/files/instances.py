@@ -7,7 +7,7 @@ pred_scores (floating point), as OpenMask3D and Mask3D name them.
 """
 
 import io
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -16,12 +16,13 @@ import numpy as np
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.core.files.npz import read_npz
-from gsencoder.evaluate.files.checked_bytes import read_checked
-from gsencoder.evaluate.files.label_files import mask_bytes, read_mask, read_whole_numbers, write_whole_numbers
+from gsencoder.data.truth.checked_files import read_checked_text
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.number_files import mask_bytes, read_mask, read_whole_numbers
+from gsencoder.evaluate.files.scan_truth import instances_of_scan
 from gsencoder.evaluate.files.scene_folders import scene_files
-from gsencoder.evaluate.scores.class_table import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
-from gsencoder.evaluate.scores.instances import MIN_REGION, SceneMatches, match_instances
+from gsencoder.evaluate.scores.instance_matches import MIN_REGION, SceneMatches, match_instances
 
 MASK_FOLDER = "predicted_masks"
 MAX_LIST_BYTES = 64 << 20
@@ -35,6 +36,7 @@ def match_instance_files(
     classes: ClassTable,
     *,
     scenes: Collection[str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
     class_agnostic: bool = False,
     min_region: int = MIN_REGION,
 ) -> Iterator[SceneMatches]:
@@ -42,20 +44,25 @@ def match_instance_files(
 
     Args:
         predictions: folder of SCENE.txt or SCENE.npz.
-        truth: folder of SCENE.txt.
+        truth: folder of SCENE.txt, or of ScanNet's scans.
         classes: that are scored.
         scenes: to score; None = all of the truth.
+        raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
         class_agnostic: leave the classes out of account.
         min_region: smallest number of vertices that counts.
 
     Raises:
         InputError: files that cannot be used, or scenes that are in one folder only.
     """
-    for files in scene_files(predictions, truth, scenes=scenes, suffixes=(".txt", ".npz")):
-        true = read_instance_truth(files.truth)
-        found = read_instance_prediction(files.prediction, num_vertices=len(true.ids))
+    suffixes, scans = (".txt", ".npz"), raw_ids is not None
+    for files in scene_files(predictions, truth, scenes=scenes, suffixes=suffixes, scans=scans):
+        if raw_ids is None:
+            instances = read_instance_truth(files.truth)
+        else:
+            instances = instances_of_scan(files.truth, raw_ids, classes)
+        masks = read_instance_prediction(files.prediction, num_vertices=len(instances.ids))
         with about(files.prediction):
-            matches = match_instances(true, found, classes, class_agnostic=class_agnostic, min_region=min_region)
+            matches = match_instances(instances, masks, classes, class_agnostic=class_agnostic, min_region=min_region)
         yield matches
 
 
@@ -84,10 +91,7 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
     """
     if path.suffix == ".npz":
         return _read_npz(path, num_vertices)
-    try:
-        lines = read_checked(path, max_bytes=MAX_LIST_BYTES).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file ({error.reason} at byte {error.start})") from error
+    lines = read_checked_text(path, max_bytes=MAX_LIST_BYTES).splitlines()
     first: dict[Path, int] = {}
     vertices, labels, scores = [], [], []
     for number, line in enumerate(lines, start=1):
@@ -119,11 +123,6 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
         labels=np.array(labels, np.int64),
         scores=np.array(scores, np.float64),
     )
-
-
-def write_instance_truth(path: Path, truth: InstanceTruth) -> None:
-    """Writes the instance of each vertex; `path` should be named as the scene."""
-    write_whole_numbers(path, truth.ids)
 
 
 def write_instance_prediction(

@@ -5,13 +5,29 @@ Prediction: {"scene_id": "scene0011_00", "object_id": 3, "labels": ["chair", "so
 answer.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from gsencoder.core.errors import about
+from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.json_values import write_json
-from gsencoder.evaluate.files.json_entries import Entry, read_entries
-from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames, RecognizedInstance, recognize
+from gsencoder.data.truth.entries import (
+    Entry,
+    entries_of,
+    name_value,
+    object_id,
+    read_benchmark_json,
+    refuse_repeated,
+    scene_name,
+    shown,
+)
+from gsencoder.evaluate.scores.recognition import (
+    NamedInstance,
+    RankedNames,
+    RecognizedInstance,
+    described,
+    recognize,
+)
 
 
 def recognize_files(
@@ -22,9 +38,9 @@ def recognize_files(
     Raises:
         InputError: a file that cannot be used, or what `recognize` refuses.
     """
-    true, found = read_recognition_truth(truth), read_recognition_predictions(predictions)
+    instances, names = read_recognition_truth(truth), read_recognition_predictions(predictions)
     with about(predictions):
-        return recognize(found, true, classes, allow_missing=allow_missing)
+        return recognize(names, instances, classes, allow_missing=allow_missing)
 
 
 def read_recognition_truth(path: Path) -> tuple[NamedInstance, ...]:
@@ -33,14 +49,16 @@ def read_recognition_truth(path: Path) -> tuple[NamedInstance, ...]:
     Raises:
         InputError: not such a file, or an instance that is there twice.
     """
-    entries = read_entries(path)
-    _refuse_swapped(entries, "labels")
-    instances = [
-        NamedInstance(scene=entry.word("scene_id"), object=entry.number_word("object_id"), name=entry.word("label"))
-        for entry in entries
-    ]
-    _refuse_twice(entries, [(item.scene, item.object) for item in instances])
-    return tuple(instances)
+    instances = tuple(
+        NamedInstance(
+            scene=scene_name(entry.get("scene_id"), where),
+            object=str(object_id(entry.get("object_id"), where)),
+            name=name_value(entry.get("label"), where, "label"),
+        )
+        for entry, where in _entries(path, "scene_id, object_id and label", foreign="labels")
+    )
+    refuse_repeated(path, [each.key for each in instances], described)
+    return instances
 
 
 def read_recognition_predictions(path: Path) -> tuple[RankedNames, ...]:
@@ -49,14 +67,16 @@ def read_recognition_predictions(path: Path) -> tuple[RankedNames, ...]:
     Raises:
         InputError: not such a file, or an instance that is there twice.
     """
-    entries = read_entries(path)
-    _refuse_swapped(entries, "label")
-    names = [
-        RankedNames(scene=entry.word("scene_id"), object=entry.number_word("object_id"), names=entry.words("labels"))
-        for entry in entries
-    ]
-    _refuse_twice(entries, [(item.scene, item.object) for item in names])
-    return tuple(names)
+    predictions = tuple(
+        RankedNames(
+            scene=scene_name(entry.get("scene_id"), where),
+            object=str(object_id(entry.get("object_id"), where)),
+            names=_names(entry, where),
+        )
+        for entry, where in _entries(path, "scene_id, object_id and labels", foreign="label")
+    )
+    refuse_repeated(path, [each.key for each in predictions], described)
+    return predictions
 
 
 def write_recognition_truth(path: Path, instances: Sequence[NamedInstance]) -> None:
@@ -69,15 +89,18 @@ def write_recognition_predictions(path: Path, predictions: Sequence[RankedNames]
     write_json(path, [{"scene_id": p.scene, "object_id": p.object, "labels": p.names} for p in predictions])
 
 
-def _refuse_swapped(entries: Sequence[Entry], foreign: str) -> None:
-    for entry in entries:
+def _entries(path: Path, expected: str, *, foreign: str) -> tuple[Entry, ...]:
+    entries = entries_of(read_benchmark_json(path), path, expected)
+    for entry, where in entries:
         if foreign in entry:
-            raise entry.error(f"unexpected key {foreign!r}; predictions and truth may be swapped")
+            raise InputError(f"{where}: unexpected key {foreign!r}; predictions and truth may be swapped")
+    return entries
 
 
-def _refuse_twice(entries: Sequence[Entry], keys: Sequence[tuple[str, str]]) -> None:
-    seen: set[tuple[str, str]] = set()
-    for entry, key in zip(entries, keys, strict=True):
-        if key in seen:
-            raise entry.error(f"object {key[1]} of {key[0]} is there already; expected each once")
-        seen.add(key)
+def _names(entry: Mapping[str, Any], where: str) -> tuple[str, ...]:
+    values = entry.get("labels")
+    if values is None and "labels" in entry:
+        return ()
+    if not isinstance(values, list):
+        raise InputError(f"{where}: labels must be a list of names, got {shown(values)}")
+    return tuple(name_value(value, where, f"labels[{index}]") for index, value in enumerate(values))

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, listed
-from gsencoder.evaluate.files.checked_bytes import PICKLE_SUFFIXES
+from gsencoder.data.truth.checked_files import PICKLE_SUFFIXES
+from gsencoder.data.truth.scannet_labels import AGGREGATION
 
 RESULT_FILES = ("semantic_instance_evaluation.txt", "semantic_label_evaluation.txt")
 """What ScanNet's scripts write into the folder of the predictions."""
@@ -18,7 +19,7 @@ class SceneFiles:
     Attributes:
         scene: its name, that of both files without the suffix.
         prediction: what is scored.
-        truth: what it is held against.
+        truth: what it is held against: a file, or the folder of a scan.
     """
 
     scene: str
@@ -27,7 +28,12 @@ class SceneFiles:
 
 
 def scene_files(
-    predictions: Path, truth: Path, *, scenes: Collection[str] | None = None, suffixes: Collection[str] = (".txt",)
+    predictions: Path,
+    truth: Path,
+    *,
+    scenes: Collection[str] | None = None,
+    suffixes: Collection[str] = (".txt",),
+    scans: bool = False,
 ) -> tuple[SceneFiles, ...]:
     """Finds the files of every scene to score, in the order of the names.
 
@@ -36,9 +42,10 @@ def scene_files(
 
     Args:
         predictions: folder with SCENE.txt, or what `suffixes` allows.
-        truth: folder with SCENE.txt.
+        truth: folder with SCENE.txt, or of scans.
         scenes: those to score, such as the ones of a split; None = all of the truth.
         suffixes: of prediction files.
+        scans: whether `truth` has the folders of ScanNet's scans, each with the label files of its scene.
 
     Raises:
         InputError: no such folder, both are the same, a scene without prediction or truth, or with two predictions.
@@ -48,30 +55,51 @@ def scene_files(
             raise InputError(f"{folder}: expected a folder with a file for each scene")
     if predictions.resolve() == truth.resolve():
         raise InputError(f"{predictions}: predictions and truth are the same folder")
-    true_files = {path.stem: path for path in _files(truth, (".txt",))}
-    found: dict[str, Path] = {}
+    predicted: dict[str, Path] = {}
     for path in _files(predictions, suffixes):
-        if path.stem in found:
-            raise InputError(f"{predictions}: the scene {path.stem} has both {found[path.stem].name} and {path.name}")
-        found[path.stem] = path
-    if not found:
+        if path.stem in predicted:
+            raise InputError(
+                f"{predictions}: the scene {path.stem} has both {predicted[path.stem].name} and {path.name}"
+            )
+        predicted[path.stem] = path
+    if not predicted:
         pickled = [path.name for path in sorted(predictions.iterdir()) if path.suffix.lower() in PICKLE_SUFFIXES]
-        because = f"; {pickled[0]} is a pickle, which is refused since reading it executes code" if pickled else ""
+        because = f"; {pickled[0]} is a pickle, which is refused since reading it can run code" if pickled else ""
         expected = " or ".join(f"SCENE{suffix}" for suffix in suffixes)
         raise InputError(f"{predictions}: no predictions; expected {expected} for each scene{because}")
-    if not true_files:
-        raise InputError(f"{truth}: no truth; expected SCENE.txt for each scene")
-    foreign = [scene for scene in found if scene not in true_files]
+    true_files = _true_files(truth, scans)
+    foreign = [scene for scene in predicted if scene not in true_files]
     if foreign:
-        raise InputError(f"{found[foreign[0]]}: there is no truth of this scene in {truth}; it has {_some(true_files)}")
+        some = listed(sorted(true_files), 3)
+        raise InputError(f"{predicted[foreign[0]]}: there is no truth of this scene in {truth}; it has {some}")
     chosen = sorted(true_files if scenes is None else set(scenes))
     unknown = [scene for scene in chosen if scene not in true_files]
     if unknown:
         raise InputError(f"{truth}: no truth of {len(unknown)} scenes to score: {listed(unknown)}")
-    missing = [scene for scene in chosen if scene not in found]
+    missing = [scene for scene in chosen if scene not in predicted]
     if missing:
         raise InputError(f"{predictions}: no prediction of {len(missing)} scenes: {listed(missing)}")
-    return tuple(SceneFiles(scene=s, prediction=found[s], truth=true_files[s]) for s in chosen)
+    return tuple(SceneFiles(scene=s, prediction=predicted[s], truth=true_files[s]) for s in chosen)
+
+
+def _true_files(truth: Path, scans: bool) -> dict[str, Path]:
+    """The file or the scan's folder of each scene with truth, by its name."""
+    files = {path.stem: path for path in _files(truth, (".txt",))}
+    folders = {path.name: path for path in sorted(truth.iterdir()) if (path / f"{path.name}{AGGREGATION}").is_file()}
+    if scans:
+        if not folders:
+            instead = "; SCENE.txt has ids of classes and needs no label map" if files else ""
+            raise InputError(f"{truth}: no scans; expected SCENE/SCENE{AGGREGATION} and the files beside it{instead}")
+        return folders
+    if not files:
+        instead = (
+            f"; the labels of {len(folders)} ScanNet scans that it holds become truth by scannetv2-labels.combined.tsv "
+            "(label_map=)"
+            if folders
+            else ""
+        )
+        raise InputError(f"{truth}: no truth; expected SCENE.txt for each scene{instead}")
+    return files
 
 
 def _files(folder: Path, suffixes: Collection[str]) -> list[Path]:
@@ -80,7 +108,3 @@ def _files(folder: Path, suffixes: Collection[str]) -> list[Path]:
         for path in folder.iterdir()
         if path.suffix in suffixes and path.name not in RESULT_FILES and path.is_file()
     )
-
-
-def _some(scenes: Collection[str]) -> str:
-    return listed(sorted(scenes), 3)

@@ -20,6 +20,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.truth.scene_labels import with_counted_views
 from gsencoder.evaluate.boxes import is_seen
+from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.text.encoder import TextEncoder
@@ -267,8 +268,8 @@ def probabilities_by_word(scenes: Sequence[SceneWords]) -> dict[str, dict[str, A
         word: {
             "present": len(present),
             "absent": len(absent),
-            "probability_present": float(np.mean(present)) if present else math.nan,
-            "probability_absent": float(np.mean(absent)) if absent else math.nan,
+            "probability_present": mean_of(present),
+            "probability_absent": mean_of(absent),
         }
         for word, (present, absent) in words.items()
     }

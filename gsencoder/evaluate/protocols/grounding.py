@@ -5,7 +5,6 @@ rendered at its pixels. The ground truth is the union of all instances of a name
 (`gsencoder.evaluate.grounding`).
 """
 
-import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -18,6 +17,7 @@ from jaxtyping import Bool, Int32
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.grounding import GroundedPair, ground, grounding_scores
+from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.pixel_relevancy import pixel_features
@@ -229,4 +229,4 @@ def scores_by_phrase(pairs: Sequence[GroundedPair]) -> dict[str, dict[str, Any]]
 
 def phrase_mean(table: dict[str, dict[str, Any]]) -> float:
     """Mean over phrases of their mean IoU: each name counts the same, in however many views it is; NaN without any."""
-    return float(np.mean([row["miou"] for row in table.values()])) if table else math.nan
+    return mean_of([row["miou"] for row in table.values()])

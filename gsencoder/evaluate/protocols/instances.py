@@ -10,12 +10,13 @@ from typing import Literal
 
 import numpy as np
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, about
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.write_truth import instance_truth
 from gsencoder.evaluate.class_scores import class_cosines
 from gsencoder.evaluate.labeled_points import LabeledPoints
-from gsencoder.evaluate.scores.class_table import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
-from gsencoder.evaluate.scores.instances import IDS_PER_LABEL, MIN_REGION
+from gsencoder.evaluate.scores.instance_matches import MIN_REGION
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.text.encoder import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene
@@ -46,22 +47,14 @@ class InstancesProtocol:
             raise InputError(f"min_region: expected 1 or more, got {self.min_region}")
 
 
-def instance_truth(points: LabeledPoints, classes: ClassTable) -> InstanceTruth:
-    """The true instances of a scene, numbered within their class by ascending id.
+def true_instances(points: LabeledPoints, classes: ClassTable) -> InstanceTruth:
+    """The true instances of a scene.
 
     Raises:
         InputError: a class has a thousand objects or more, whose ids the benchmark's format cannot hold.
     """
-    ids = dict(zip(classes.names, classes.ids, strict=True))
-    counts: dict[str, int] = {}
-    truth = np.zeros(len(points), np.int64)
-    for number, name in points.named_ids().items():
-        if name in ids:
-            counts[name] = counts.get(name, 0) + 1
-            if counts[name] >= IDS_PER_LABEL:
-                raise InputError(f"scene {points.scene}: {name} has {IDS_PER_LABEL} objects or more")
-            truth[points.objects == number] = ids[name] * IDS_PER_LABEL + counts[name]
-    return InstanceTruth(scene=points.scene, ids=truth)
+    with about(f"scene {points.scene}"):
+        return InstanceTruth(scene=points.scene, ids=instance_truth(points.objects, points.names, classes.id_of))
 
 
 def predict_instances(
@@ -84,7 +77,7 @@ def predict_instances(
         protocol: where masks come from.
         localization: settings of `localize`, for clusters.
     """
-    ids = dict(zip(classes.names, classes.ids, strict=True))
+    ids = classes.id_of
     if protocol.proposals == "clusters":
         asked = replace(scene, features={features.space.name: features})
         boxes = localize(asked, classes.names, text, localization).boxes

@@ -5,19 +5,17 @@ of all small objects that are seen well enough, with the same settings for all s
 compared with the object of that name that it overlaps most.
 """
 
-import math
 import time
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-import numpy as np
-
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.truth.scene_labels import with_counted_views
 from gsencoder.evaluate.boxes import Hit, accuracy, queryable_objects, score_boxes
+from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.text.build import Words
@@ -188,7 +186,7 @@ def scores(hits: Sequence[Hit]) -> dict[str, Any]:
             for threshold in IOU_THRESHOLDS
         }
         ious = [hit.oracle_iou if oracle else hit.iou for hit in hits]
-        row[f"{prefix}mean_iou"] = float(np.mean(ious)) if ious else math.nan
+        row[f"{prefix}mean_iou"] = mean_of(ious)
     return row
 
 

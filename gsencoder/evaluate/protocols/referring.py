@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.truth.expressions import Expression, read_nr3d, read_scanrefer
-from gsencoder.evaluate.scores.referring import PredictedBoxes, ReferredObject, several_of_their_class
+from gsencoder.evaluate.scores.referring import PredictedBoxes
 from gsencoder.infer.ask.question_words import words_in
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.text.build import Words, closed_table
@@ -71,21 +71,6 @@ def expressions_of_objects(scene: Scene) -> tuple[Expression, ...]:
     )
 
 
-def referring_truth(expressions: Sequence[Expression]) -> list[ReferredObject]:
-    """The objects that sentences mean, with whether several of their class are in the scene."""
-    keys = [(each.scene, str(each.object_id), each.object_name) for each in expressions]
-    return [
-        ReferredObject(
-            scene=each.scene,
-            object=str(each.object_id),
-            annotation=each.annotation,
-            box=None if each.aabb is None else np.array(each.aabb, np.float64),
-            multiple=multiple,
-        )
-        for each, multiple in zip(expressions, several_of_their_class(keys), strict=True)
-    ]
-
-
 def predict_referring(
     scene: Scene,
     features: GaussianFeatures,
@@ -118,16 +103,14 @@ def predict_referring(
             warnings.simplefilter("ignore", SceneWarning)
             localized = localize(with_features, words, text, localization)
         corners = corners_of_words(scene, localized, aligned_from_world)
-    nothing = np.zeros((0, 2, 3))
+    boxes = {each: corners.get(asked[each][0], [])[:CANDIDATES] if asked[each] else [] for each in expressions}
     return [
         PredictedBoxes(
             scene=each.scene,
             object=str(each.object_id),
             annotation=each.annotation,
-            boxes=np.stack(found) if (found := corners.get(asked[each][0], [])[:CANDIDATES]) else nothing,
+            boxes=np.array(boxes[each], np.float64).reshape(-1, 2, 3),
         )
-        if asked[each]
-        else PredictedBoxes(scene=each.scene, object=str(each.object_id), annotation=each.annotation, boxes=nothing)
         for each in expressions
     ]
 

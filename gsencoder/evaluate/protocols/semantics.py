@@ -1,7 +1,9 @@
 """The semantics protocol: the class of each point by the nearest word to its feature (mIoU, mAcc, f-mIoU).
 
 Each Gaussian is given the class whose name is nearest to its feature, among the classes of all scenes or of a
-benchmark, and points take the class of their Gaussian. Points without a named object are ignored.
+benchmark. A vertex of a labeled mesh has the class that is most frequent among the nearest Gaussians with a feature,
+however far they are, as SceneSplat's benchmark counts (Li et al. 2025; pointcept/utils/misc.py, neighbor_voting).
+Points without a named object are ignored.
 """
 
 from collections.abc import Sequence
@@ -9,14 +11,17 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Int32
 
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.label_sets import vertex_classes
+from gsencoder.data.truth.nearest_vertices import VOTERS, labels_of_vertices
 from gsencoder.evaluate.class_scores import nearest_class
 from gsencoder.evaluate.labeled_points import LabeledPoints
-from gsencoder.evaluate.scores.class_table import ClassTable
 from gsencoder.evaluate.scores.semantics import BACKGROUND
 from gsencoder.text.encoder import TextEncoder
-from gsencoder.types import GaussianFeatures
+from gsencoder.types import GaussianFeatures, Gaussians
 
 NO_CLASS = 0
 """Id of points of no class, in truth and predictions."""
@@ -24,31 +29,58 @@ NO_CLASS = 0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SemanticsProtocol:
-    """Which classes are of the foreground."""
+    """How vertices get the class of Gaussians, and which classes are of the foreground."""
 
     name: Literal["semantics"] = "semantics"
+    voters: int = field(
+        default=VOTERS,
+        metadata={
+            "help": "on meshes: nearest Gaussians with a feature whose most frequent class a vertex has; 1 = the "
+            "nearest one"
+        },
+    )
     excluded: tuple[str, ...] = field(
         default=tuple(sorted(BACKGROUND)), metadata={"help": "classes that f-mIoU leaves out"}
     )
 
+    def __post_init__(self) -> None:
+        if self.voters < 1:
+            raise InputError(f"voters: expected 1 or more, got {self.voters}")
 
-def semantic_truth(points: LabeledPoints, classes: ClassTable) -> Int64[np.ndarray, " P"]:
+
+def semantic_truth(points: LabeledPoints, classes: ClassTable) -> Int32[np.ndarray, " P"]:
     """The class id of each point's object; `NO_CLASS` for points without a named object."""
-    ids = dict(zip(classes.names, classes.ids, strict=True))
-    truth = np.full(len(points), NO_CLASS, np.int64)
-    for number, name in points.named_ids().items():
-        if name in ids:
-            truth[points.objects == number] = ids[name]
-    return truth
+    return vertex_classes(points.objects, points.names, classes.id_of, none=NO_CLASS)
 
 
 def predict_semantics(
-    points: LabeledPoints, features: GaussianFeatures, classes: ClassTable, text: TextEncoder
-) -> Int64[np.ndarray, " P"]:
-    """The predicted class id of each point; `NO_CLASS` where no Gaussian with a feature is near."""
+    points: LabeledPoints,
+    gaussians: Gaussians,
+    features: GaussianFeatures,
+    classes: ClassTable,
+    text: TextEncoder,
+    protocol: SemanticsProtocol = SemanticsProtocol(),
+) -> Int32[np.ndarray, " P"]:
+    """The predicted class id of each point; `NO_CLASS` where no Gaussian has a feature.
+
+    Args:
+        points: of a scene.
+        gaussians: of the scene.
+        features: of the Gaussians.
+        classes: that can be predicted.
+        text: turns their names into vectors.
+        protocol: how many Gaussians vote for a vertex.
+
+    Raises:
+        InputError: words of another space, or a name that `text` does not know.
+    """
     nearest = nearest_class(features, classes.names, text)
-    ids = np.array([*classes.ids, NO_CLASS], np.int64)
-    return np.asarray(points.from_gaussians(ids[nearest], NO_CLASS))
+    labels = np.array([*classes.ids, NO_CLASS], np.int32)[nearest]
+    if points.positions is None:
+        return labels
+    return labels_of_vertices(
+        points.positions, gaussians.means, labels, k=protocol.voters, none=NO_CLASS, voters=nearest >= 0
+    )
 
 
 def classes_of(names: Sequence[str]) -> ClassTable:

@@ -17,16 +17,16 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.truth.entries import Corner
 from gsencoder.data.truth.expressions import Expression
+from gsencoder.evaluate.scores.box_overlap import box_ious
 from gsencoder.evaluate.scores.java_metrics import JavaTools
 from gsencoder.evaluate.scores.sentences import SentenceScores, score_sentences
 
 MAX_TOKENS = 30
 """Tokens of a reference that Scan2Cap keeps (lib/config.py, MAX_DES_LEN)."""
 EMPTY = "sos eos"
-EPSILON = 1e-8
-"""Added to the union, as the official scripts of ScanRefer and Scan2Cap do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,19 +141,6 @@ def wrapped_caption(text: str) -> str:
     return text if words[0] == "sos" and words[-1] == "eos" else f"sos {text} eos".replace(". ", " . ")
 
 
-def box_ious(
-    lower: Float64[np.ndarray, "*a 3"],
-    upper: Float64[np.ndarray, "*a 3"],
-    lowers: Float64[np.ndarray, "*b 3"],
-    uppers: Float64[np.ndarray, "*b 3"],
-) -> Float64[np.ndarray, "*c"]:
-    """IoU of axis-aligned boxes whose shapes broadcast, with 1e-8 added to the union."""
-    sides = np.minimum(upper, uppers) - np.maximum(lower, lowers)
-    overlap = np.prod(np.maximum(sides, 0), axis=-1)
-    volumes = np.prod(upper - lower, axis=-1) + np.prod(uppers - lowers, axis=-1)
-    return np.asarray(overlap / (volumes - overlap + EPSILON))
-
-
 def score_box_captions(
     objects: Sequence[CaptionedObject],
     boxes: Sequence[CaptionedBox],
@@ -200,15 +187,15 @@ def score_named_captions(
         InputError: captions of other objects, or two of one.
     """
     _check(objects, {each.scene for each in captions})
-    found: dict[tuple[str, int], str] = {}
+    caption_of: dict[tuple[str, int], str] = {}
     known = {(each.scene, each.object_id) for each in objects}
     for each in captions:
         key = each.scene, each.object_id
-        if key in found or key not in known:
-            wrong = "has two captions" if key in found else "is no object of the truth"
+        if key in caption_of or key not in known:
+            wrong = "has two captions" if key in caption_of else "is no object of the truth"
             raise InputError(f"object {each.object_id} of {each.scene} {wrong}")
-        found[key] = each.caption
-    spoken = [found.get((each.scene, each.object_id)) for each in objects]
+        caption_of[key] = each.caption
+    spoken = [caption_of.get((each.scene, each.object_id)) for each in objects]
     return _scores(objects, spoken, len(captions), None, None, tools)
 
 
@@ -241,16 +228,15 @@ def _best_boxes(objects: Sequence[CaptionedObject], boxes: Sequence[CaptionedBox
     for index, each in enumerate(objects):
         if each.scene in rows:
             there = np.array(rows[each.scene])
-            lower, upper = np.array(each.aabb, np.float64)
-            values = box_ious(lower, upper, corners[there, 0], corners[there, 1])
+            values = box_ious(corners[there], np.array(each.aabb, np.float64))
             best[index], ious[index] = there[values.argmax()], values.max()
     return ious, best
 
 
 def _check(objects: Sequence[CaptionedObject], scenes: set[str]) -> None:
-    keys = [(each.scene, each.object_id) for each in objects]
-    if len(set(keys)) < len(keys):
-        raise InputError(f"{len(keys) - len(set(keys))} objects have the scene and id of another one")
+    if repeated := first_repeated((each.scene, each.object_id) for each in objects):
+        scene, number = repeated[0]
+        raise InputError(f"object {number} of {scene} is there twice; expected each once")
     other = min(scenes - {each.scene for each in objects}, default=None)
     if other is not None:
         raise InputError(f"captions are predicted for {other}, which is no scene of the truth")

@@ -86,10 +86,10 @@ def ptb_tokens(texts: Sequence[str], tools: JavaTools) -> list[str]:
         command = [tools.java, *ENCODING, "-cp", str(tools.folder / TOKENIZER)]
         command += ["edu.stanford.nlp.process.PTBTokenizer", "-preserveLines", "-lowerCase", str(file)]
         output = _run(command, "the PTB tokenizer")
-    found = output.removesuffix("\n").split("\n")
-    if len(found) != len(sent):
-        raise InputError(f"the PTB tokenizer gave {len(found):,} lines for {len(sent):,} texts; expected as many")
-    for row, line in zip(sent, found, strict=True):
+    cut = output.removesuffix("\n").split("\n")
+    if len(cut) != len(sent):
+        raise InputError(f"the PTB tokenizer gave {len(cut):,} lines for {len(sent):,} texts; expected as many")
+    for row, line in zip(sent, cut, strict=True):
         tokens[row] = " ".join(token for token in line.rstrip().split(" ") if token not in PUNCTUATION)
     return tokens
 

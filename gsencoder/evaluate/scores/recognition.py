@@ -6,13 +6,12 @@ and their unweighted mean; there are 17 of them, without "otherfurniture". The m
 classes count more, stands beside it.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from gsencoder.core.errors import InputError
+from gsencoder.core.first_repeated import first_repeated
+from gsencoder.evaluate.scores.means import mean_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +28,10 @@ class NamedInstance:
     object: str
     name: str
 
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.scene, self.object
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankedNames:
@@ -43,6 +46,10 @@ class RankedNames:
     scene: str
     object: str
     names: tuple[str, ...]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.scene, self.object
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +69,10 @@ class RecognizedInstance:
     name: str
     place: int
     first: str | None
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.scene, self.object
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,31 +117,26 @@ def recognize(
     Raises:
         InputError: an instance that is there twice, is not in the truth, or has no prediction; a name that is no class.
     """
-    known, names = {(item.scene, item.object) for item in truth}, set(classes)
-    if len(known) < len(truth):
-        raise InputError(_twice([(item.scene, item.object) for item in truth], "truth"))
-    answers: dict[tuple[str, str], RankedNames] = {}
+    _refuse_repeated([item.key for item in truth], "truth")
+    _refuse_repeated([item.key for item in predictions], "predictions")
+    known, names = {item.key for item in truth}, set(classes)
     for item in predictions:
-        key = item.scene, item.object
-        if key in answers:
-            raise InputError(_twice([key, key], "predictions"))
-        if key not in known:
-            raise InputError(f"object {item.object} of {item.scene} is predicted, and not in the truth")
+        if item.key not in known:
+            raise InputError(f"{described(item.key)} is predicted, and not in the truth")
         wrong = next((name for name in item.names if name not in names), None)
         if wrong is not None:
-            raise InputError(f"object {item.object} of {item.scene} is predicted as {wrong[:40]!r}, which is no class")
-        if len(set(item.names)) < len(item.names):
-            raise InputError(f"object {item.object} of {item.scene} has a name twice; expected each once")
-        answers[key] = item
-    found = []
-    for instance in truth:
-        if instance.name not in names:
-            continue
-        answer = answers.get((instance.scene, instance.object))
-        if answer is None and not allow_missing:
-            raise InputError(f"object {instance.object} of {instance.scene} has no prediction")
-        ranked = answer.names if answer else ()
-        found.append(
+            raise InputError(f"{described(item.key)} is predicted as {wrong[:40]!r}, which is no class")
+        if first_repeated(item.names):
+            raise InputError(f"{described(item.key)} has a name twice; expected each once")
+    answers = {item.key: item.names for item in predictions}
+    scored = [instance for instance in truth if instance.name in names]
+    missing = next((instance for instance in scored if instance.key not in answers), None)
+    if missing is not None and not allow_missing:
+        raise InputError(f"{described(missing.key)} has no prediction")
+    results = []
+    for instance in scored:
+        ranked = answers.get(instance.key, ())
+        results.append(
             RecognizedInstance(
                 scene=instance.scene,
                 object=instance.object,
@@ -139,7 +145,7 @@ def recognize(
                 first=ranked[0] if ranked else None,
             )
         )
-    return tuple(found), len(truth) - len(found)
+    return tuple(results), len(truth) - len(results)
 
 
 def recognition_scores(
@@ -155,40 +161,35 @@ def recognition_scores(
     Raises:
         InputError: an instance that is there twice, one of another class, or a k below 1.
     """
-    keys = [(item.scene, item.object) for item in instances]
-    if len(set(keys)) < len(keys):
-        raise InputError(_twice(keys, "instances"))
+    _refuse_repeated([item.key for item in instances], "instances")
     if min(ks, default=1) < 1:
         raise InputError(f"recognition: expected k of 1 or more, got {min(ks)}")
     places: dict[str, list[int]] = {name: [] for name in classes}
     for item in instances:
         if item.name not in places:
-            raise InputError(f"object {item.object} of {item.scene} is {item.name[:40]!r}, which is no class")
+            raise InputError(f"{described(item.key)} is {item.name[:40]!r}, which is no class")
         places[item.name].append(item.place)
-    table = {k: {name: _share(found, k) for name, found in places.items()} for k in ks}
+    table = {k: {name: _share(ranks, k) for name, ranks in places.items()} for k in ks}
     everything = [item.place for item in instances]
     return RecognitionScores(
         instances=len(instances),
         unanswered=sum(item.first is None for item in instances),
         classes=table,
-        mean={k: _mean([value for value in row.values() if not math.isnan(value)]) for k, row in table.items()},
+        mean={k: mean_of(list(row.values())) for k, row in table.items()},
         overall={k: _share(everything, k) for k in ks},
-        counts={name: len(found) for name, found in places.items()},
+        counts={name: len(ranks) for name, ranks in places.items()},
     )
 
 
+def described(key: tuple[str, str]) -> str:
+    """An instance's name in messages."""
+    return f"object {key[1]} of {key[0]}"
+
+
 def _share(places: list[int], k: int) -> float:
-    return _mean([float(1 <= place <= k) for place in places])
+    return mean_of([float(1 <= place <= k) for place in places])
 
 
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else math.nan
-
-
-def _twice(keys: Sequence[tuple[str, str]], where: str) -> str:
-    seen: set[tuple[str, str]] = set()
-    for key in keys:
-        if key in seen:
-            return f"object {key[1]} of {key[0]} is twice among the {where}; expected each once"
-        seen.add(key)
-    raise AssertionError("no key is there twice")
+def _refuse_repeated(keys: Sequence[tuple[str, str]], where: str) -> None:
+    if repeated := first_repeated(keys):
+        raise InputError(f"{described(repeated[0])} is twice among the {where}; expected each once")

@@ -1,19 +1,14 @@
 """Objects that a sentence refers to: the share of the sentences whose box has an IoU of 0.25, or 0.5, or more.
 
-ScanRefer's metric (Chen et al. 2020; `benchmark/eval.py` and `scripts/eval.py`). Boxes are axis-aligned, and
-
-    IoU = common volume / (volume + volume - common volume + 1e-8)
-
-so that a box of one quarter of the other's volume, inside of it, is below 0.25. A sentence is *unique* if its object is
-the only one of its class among the objects that the sentences of its scene describe, else *multiple*. *Others* are the
-sentences about objects of none of the 17 named classes. A sentence for which nothing was found has the IoU 0.
+ScanRefer's metric (Chen et al. 2020; `benchmark/eval.py` and `scripts/eval.py`), with the IoU of axis-aligned boxes
+that `gsencoder.evaluate.scores.box_overlap` defines, also for the unique, the multiple and the other sentences of
+`gsencoder.evaluate.scores.referring_kinds` alone. A sentence without a predicted box has the IoU 0.
 
 A method that finds several boxes is also scored by the best of the first k, or of all of them, as the paper does for
 its table 5 (sec. 4.5). A user cannot know which box that is.
 """
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -21,13 +16,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.first_repeated import first_repeated
+from gsencoder.data.truth.expressions import Expression, described
+from gsencoder.evaluate.scores.box_overlap import box_ious
 
 IOUS = (0.25, 0.5)
 """IoUs from which on a box counts."""
-VOLUME_EPSILON = 1e-8
-"""Volume that ScanRefer adds to a union, in cubic world units (metres, in ScanNet)."""
-OTHERS = "others"
-"""Class of the objects that are of none of ScanRefer's 17 named ones."""
 NO_TRUE_BOX = "the object has no box in the truth"
 """Reason for which a sentence is not scored."""
 
@@ -65,7 +59,7 @@ class PredictedBoxes:
         scene: name of its scene.
         object: id of the object that it is about.
         annotation: number of the sentence about it.
-        boxes: lower and upper corners, the likeliest box first; none if nothing was found.
+        boxes: lower and upper corners, the likeliest box first; none where there is none.
         multiple: what the prediction's file says of the truth's `multiple`, as ScanRefer's own files do.
         others: the same of `others`.
     """
@@ -102,6 +96,10 @@ class ReferringResult:
     multiple: bool | None
     others: bool | None
 
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return self.scene, self.object, self.annotation
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReferringCell:
@@ -122,7 +120,7 @@ class ReferringScores:
 
     Attributes:
         sentences: that are scored.
-        without_box: of them, those for which nothing was found.
+        without_box: of them, those without a predicted box.
         top1: of the first box.
         best_of: of the best among the first k boxes, by k.
         best: of the best among all boxes.
@@ -135,31 +133,19 @@ class ReferringScores:
     best: ReferringTable
 
 
-def box_ious(boxes: Float64[np.ndarray, "K 2 3"], box: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, " K"]:
-    """IoU of axis-aligned boxes with one, as ScanRefer's `box3d_iou` computes it: with 1e-8 added to the union."""
-    common = np.maximum(np.minimum(boxes[:, 1], box[1]) - np.maximum(boxes[:, 0], box[0]), 0)
-    sizes, size = boxes[:, 1] - boxes[:, 0], box[1] - box[0]
-    volume = common[:, 0] * common[:, 1] * common[:, 2]
-    # The order of the operations decides ties at a threshold.
-    union = sizes[:, 0] * sizes[:, 1] * sizes[:, 2] + size[0] * size[1] * size[2] - volume + VOLUME_EPSILON
-    return volume / union
-
-
-def several_of_their_class(objects: Sequence[tuple[str, str, str]]) -> tuple[bool, ...]:
-    """Whether the scene of each sentence has several objects of its class, as ScanRefer counts them.
-
-    Args:
-        objects: scene, id of the object, and its class for each sentence of the benchmark's split; `OTHERS` is one
-            class. An object counts once, with the class of its first sentence; objects without sentences do not count.
-
-    Returns:
-        For each sentence, whether the objects of its scene that are of its class are not exactly one.
-    """
-    first: dict[tuple[str, str], str] = {}
-    for scene, item, name in objects:
-        first.setdefault((scene, item), name)
-    counts = Counter((scene, name) for (scene, _), name in first.items())
-    return tuple(counts[scene, name] != 1 for scene, _, name in objects)
+def referred_objects(expressions: Sequence[Expression]) -> tuple[ReferredObject, ...]:
+    """The truth of expressions, in order."""
+    return tuple(
+        ReferredObject(
+            scene=each.scene,
+            object=str(each.object_id),
+            annotation=each.annotation,
+            box=None if each.aabb is None else np.array(each.aabb, np.float64),
+            multiple=each.multiple,
+            others=each.others,
+        )
+        for each in expressions
+    )
 
 
 def compare_boxes(
@@ -170,7 +156,7 @@ def compare_boxes(
     Args:
         predictions: in any order. What they say of `multiple` and `others` is taken where the truth does not say it.
         truth: in any order.
-        allow_missing: count sentences without a prediction as ones for which nothing was found; else they are refused.
+        allow_missing: count sentences without a prediction as ones without a box; else they are refused.
 
     Returns:
         The sentences that are scored, in the order of the truth; and how many are not, by the reason.
@@ -179,26 +165,21 @@ def compare_boxes(
         InputError: a sentence that is there twice, is not in the truth, or has no prediction; truth and prediction
             that contradict each other about `multiple` or `others`.
     """
-    known: set[tuple[str, str, str]] = set()
-    for item in truth:
-        if item.key in known:
-            raise InputError(f"{described(item.key)} is there twice in the truth; expected each once")
-        known.add(item.key)
-    found: dict[tuple[str, str, str], PredictedBoxes] = {}
-    for prediction in predictions:
-        if prediction.key in found:
-            raise InputError(f"{described(prediction.key)} is predicted twice; expected each once")
-        if prediction.key not in known:
-            raise InputError(f"{described(prediction.key)} is predicted, and not in the truth")
-        found[prediction.key] = prediction
+    _refuse_repeated([item.key for item in truth], "is there twice in the truth; expected each once")
+    _refuse_repeated([item.key for item in predictions], "is predicted twice; expected each once")
+    prediction_of = {prediction.key: prediction for prediction in predictions}
+    known = {item.key for item in truth}
+    unknown = next((key for key in prediction_of if key not in known), None)
+    if unknown is not None:
+        raise InputError(f"{described(unknown)} is predicted, and not in the truth")
     results, skipped = [], 0
     for item in truth:
         if item.box is None:
             skipped += 1
             continue
-        if item.key not in found and not allow_missing:
+        if item.key not in prediction_of and not allow_missing:
             raise InputError(f"{described(item.key)} has no prediction")
-        prediction = found.get(item.key) or PredictedBoxes(
+        prediction = prediction_of.get(item.key) or PredictedBoxes(
             scene=item.scene, object=item.object, annotation=item.annotation, boxes=np.zeros((0, 2, 3))
         )
         results.append(
@@ -224,9 +205,7 @@ def referring_scores(results: Sequence[ReferringResult], *, ks: Sequence[int] = 
     Raises:
         InputError: a sentence that is there twice, or a k below 1.
     """
-    keys = Counter((item.scene, item.object, item.annotation) for item in results)
-    if len(keys) < len(results):
-        raise InputError(f"{described(keys.most_common(1)[0][0])} is there twice; each is scored once")
+    _refuse_repeated([item.key for item in results], "is there twice; each is scored once")
     if min(ks, default=1) < 1:
         raise InputError(f"referring: expected k of 1 or more, got {min(ks)}")
 
@@ -243,9 +222,9 @@ def referring_scores(results: Sequence[ReferringResult], *, ks: Sequence[int] = 
     )
 
 
-def described(key: tuple[str, str, str]) -> str:
-    """A sentence's name in messages."""
-    return f"sentence {key[2]} about object {key[1]} of {key[0]}"
+def _refuse_repeated(keys: Sequence[tuple[str, str, str]], problem: str) -> None:
+    if repeated := first_repeated(keys):
+        raise InputError(f"{described(repeated[0])} {problem}")
 
 
 def _agreed(true: bool | None, said: bool | None, what: str, key: tuple[str, str, str]) -> bool | None:

@@ -22,7 +22,9 @@ import numpy as np
 from jaxtyping import Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.core.first_repeated import first_repeated
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.evaluate.scores.means import mean_of
 
 BACKGROUND = ("wall", "floor", "ceiling")
 """Names that SceneSplat excludes from the foreground. ScanNet's 20 classes have no ceiling."""
@@ -147,10 +149,8 @@ def semantic_scores(
     """
     if not counts:
         raise InputError("semantics: no scene to score")
-    scenes = [scene.scene for scene in counts]
-    if len(set(scenes)) < len(scenes):
-        twice = next(name for name in scenes if scenes.count(name) > 1)
-        raise InputError(f"semantics: the scene {twice} is there twice; each is scored once")
+    if repeated := first_repeated(scene.scene for scene in counts):
+        raise InputError(f"semantics: the scene {repeated[0]} is there twice; each is scored once")
     number = len(classes.names)
     if any(scene.confusion.shape != (number, number + 1) for scene in counts):
         raise InputError("semantics: the scenes were counted with different classes")
@@ -168,9 +168,9 @@ def semantic_scores(
     def averages(rows: list[int]) -> SemanticAverages:
         total = int(truths[rows].sum())
         return SemanticAverages(
-            miou=_mean(iou[rows]),
-            miou_present=_mean(iou[rows][truths[rows] > 0]),
-            macc=_mean(accuracy[rows]),
+            miou=mean_of(iou[rows]),
+            miou_present=mean_of(iou[rows][truths[rows] > 0]),
+            macc=mean_of(accuracy[rows]),
             accuracy=int(right[rows].sum()) / total if total else math.nan,
         )
 
@@ -192,9 +192,3 @@ def semantic_scores(
         ignored=sum(scene.ignored for scene in counts),
         unlabeled=int(confusion[:, number].sum()),
     )
-
-
-def _mean(values: np.ndarray) -> float:
-    """The mean of the values that are numbers; NaN if none is."""
-    numbers = values[~np.isnan(values)]
-    return float(numbers.mean()) if len(numbers) else math.nan

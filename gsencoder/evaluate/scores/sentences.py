@@ -9,6 +9,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.scores.java_metrics import PTB_TOKENS, JavaTools, find_java_tools, meteor, ptb_tokens
+from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.scores.ngrams import ORDER, PYTHON_TOKENS, bleu, cider, python_tokens, rouge_l
 
 Tokens = Literal["auto", "ptb", "python", "given"]
@@ -89,8 +90,8 @@ def score_sentences(
         official=ptb or tokens == "given",
         bleu=(b1, b2, b3, b4),
         meteor=whole,
-        rouge_l=_mean(each_rouge),
-        cider=_mean(each_cider),
+        rouge_l=mean_of(each_rouge),
+        cider=mean_of(each_cider),
         bleu_each=each_bleu[1],
         meteor_each=each,
         rouge_l_each=each_rouge,
@@ -107,7 +108,3 @@ def _tokenized(
     cut = ptb_tokens(texts, tools) if isinstance(tools, JavaTools) else [python_tokens(text) for text in texts]
     rest = iter(cut[len(hypotheses) :])
     return cut[: len(hypotheses)], [[next(rest) for _ in sentences] for sentences in references]
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if values.size else float("nan")

@@ -76,7 +76,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     )
     write_scanrefer(tmp_path / "a.json", expressions)
     assert read_scanrefer(tmp_path / "a.json") == expressions
-    with pytest.raises(InputError, match="entries 0 and 2 have one id"):
+    with pytest.raises(InputError, match="entries 0 and 2 have one id: sentence 0 about object 0 of s;"):
         write_scanrefer(tmp_path / "a.json", [*expressions, expressions[0]])
 
 
@@ -120,7 +120,10 @@ def test_nr3d_is_read_as_it_is_published(tmp_path: Path) -> None:
         ([entry(bbox=[[0, 0, 0]])], "entry 0: bbox must be a list of 8 corners"),
         ([entry(bbox=[[0, 0, 0]] * 7 + [[0, "1", 0]])], r"entry 0: bbox\[7\] must be a number, got '1'"),
         ([entry(bbox=[[0, 0, 0]] * 7 + [[0, float("nan"), 0]])], r"bbox\[7\] must be a finite number"),
-        ([entry(), entry()], "entries 0 and 1 have one id: scene scene0011_00, object 34, annotation 1"),
+        (
+            [entry(), entry()],
+            "entries 0 and 1 have one id: sentence 1 about object 34 of scene0011_00",
+        ),
         ([entry(), entry(ann_id="2", object_name="lamp")], "give object 34 of scene0011_00 different names"),
     ],
 )
@@ -152,7 +155,7 @@ def test_a_wrong_row_of_nr3d_is_named(tmp_path: Path, changes: dict[str, str], m
 def test_a_table_with_other_columns_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="its first line lacks tokens"):
         read_nr3d(nr3d(tmp_path, {name: value for name, value in NR3D.items() if name != "tokens"}))
-    with pytest.raises(InputError, match="have one id"):
+    with pytest.raises(InputError, match="entries 0 and 1 have one id: sentence 14 about object 8 of scene0525_00"):
         read_nr3d(nr3d(tmp_path, NR3D, NR3D))
     (tmp_path / "nr3d.csv").write_text("a,b\n1\n")
     with pytest.raises(InputError, match="lacks assignmentid"):

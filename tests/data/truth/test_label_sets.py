@@ -1,19 +1,18 @@
 """Classes of ScanNet's benchmarks, the map of raw names, splits, and the truth files that are made of them."""
 
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.label_sets import (
     COLUMNS,
-    LabelSet,
     ids_of_names,
     read_class_list,
     read_label_map,
-    scannet_label_set,
+    scannet_classes,
     vertex_classes,
 )
 from gsencoder.data.truth.split_files import folders_of_split, read_split
@@ -22,11 +21,11 @@ from gsencoder.types import MeshLabels
 
 
 def test_the_sets_have_twenty_and_two_hundred_classes_in_three_groups() -> None:
-    twenty, many = scannet_label_set("scannet20"), scannet_label_set("scannet200")
+    twenty, many = scannet_classes("scannet20"), scannet_classes("scannet200")
     assert (len(twenty), len(many)) == (20, 200)
-    assert twenty.groups == ()
-    assert Counter(many.groups) == {"head": 66, "common": 68, "tail": 66}
-    assert [len(many.names_in(group)) for group in ("head", "common", "tail")] == [66, 68, 66]
+    assert twenty.groups == {}
+    assert {group: len(names) for group, names in many.groups.items()} == {"head": 66, "common": 68, "tail": 66}
+    assert sum(len(set(names)) for names in many.groups.values()) == 200
     # nyu40 has no 13 and no 15 among the twenty; ids of the 200 have gaps up to the one added last.
     assert (twenty.ids[:3], twenty.ids[-1], 13 in twenty.ids) == ((1, 2, 3), 39, False)
     assert (many.ids[0], many.ids[-1]) == (1, 1191)
@@ -35,19 +34,10 @@ def test_the_sets_have_twenty_and_two_hundred_classes_in_three_groups() -> None:
     # One thing has other names and ids in the two sets.
     assert (twenty.id_of["sofa"], many.id_of["couch"], many.id_of["chair"], twenty.id_of["chair"]) == (6, 6, 2, 5)
     assert (many.id_of["mattress"], many.name_of[1163], many.id_of["potted plant"]) == (1191, "object", 1189)
-    assert "wall" in many.names_in("head")
-    assert "luggage" in many.names_in("tail")
+    assert "wall" in many.groups["head"]
+    assert "luggage" in many.groups["tail"]
     with pytest.raises(InputError, match="expected scannet20 or scannet200"):
-        scannet_label_set("scannet40")
-
-
-def test_sets_that_contradict_themselves_are_refused() -> None:
-    with pytest.raises(InputError, match="a name is there twice"):
-        LabelSet(name="x", ids=(1, 2), names=("a", "a"))
-    with pytest.raises(InputError, match="an? id is there twice"):
-        LabelSet(name="x", ids=(1, 1), names=("a", "b"))
-    with pytest.raises(InputError, match="as many ids as names"):
-        LabelSet(name="x", ids=(1,), names=("a", "b"))
+        scannet_classes("scannet40")
 
 
 def write_map(path: Path, *rows: str, header: str = "id\traw_category\tcategory\tcount\tnyu40id\tnyuClass") -> Path:
@@ -72,7 +62,7 @@ def test_raw_names_have_the_ids_of_each_benchmark(tmp_path: Path) -> None:
     names = ["paper", "office chair", "door frame", "paper"]
     # Ids that are not among the twenty stay, as in ScanNet's script; those of the 200 become 0, as in theirs.
     assert ids_of_names(names, nyu40) == {"paper": 40, "office chair": 5, "door frame": 8}
-    assert ids_of_names(names, own, scannet_label_set("scannet200")) == {
+    assert ids_of_names(names, own, scannet_classes("scannet200")) == {
         "paper": 0,
         "office chair": 10,
         "door frame": 0,
@@ -104,21 +94,21 @@ def test_a_wrong_label_map_is_refused_with_its_line(
 
 
 def test_files_that_are_no_label_maps_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="not a readable label map"):
+    with pytest.raises(InputError, match="missing.tsv: no such file"):
         read_label_map(tmp_path / "missing.tsv", "id")
     (tmp_path / "map.tsv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="not a readable label map"):
+    with pytest.raises(InputError, match="map.tsv: not a text file"):
         read_label_map(tmp_path / "map.tsv", "id")
     with (tmp_path / "large.tsv").open("wb") as stream:
         stream.truncate((16 << 20) + 1)
-    with pytest.raises(InputError, match="at most 16,777,216 in a label map"):
+    with pytest.raises(InputError, match="large.tsv: 16,777,217 bytes; at most 16,777,216 are read"):
         read_label_map(tmp_path / "large.tsv", "id")
 
 
 def test_a_list_of_classes_counts_from_zero(tmp_path: Path) -> None:
     path = tmp_path / "top100.txt"
     path.write_text("wall\nceiling\n\noffice chair\n")
-    assert read_class_list(path) == LabelSet(name="top100", ids=(0, 1, 2), names=("wall", "ceiling", "office chair"))
+    assert read_class_list(path) == ClassTable(ids=(0, 1, 2), names=("wall", "ceiling", "office chair"))
     path.write_text("wall\nwall\n")
     with pytest.raises(InputError, match="'wall' is there twice"):
         read_class_list(path)
@@ -163,27 +153,42 @@ LABELS = MeshLabels(
 )
 
 
+NAMES = dict(LABELS.objects)
+
+
 def test_a_vertex_has_the_class_of_its_objects_name() -> None:
-    assert vertex_classes(LABELS, {"couch": 6, "wall": 1}).tolist() == [1, 0, 6, 1, 0, 0]
-    assert vertex_classes(LABELS, {"couch": 6, "wall": 0}, none=-1).tolist() == [0, -1, 6, 0, -1, -1]
-    empty = MeshLabels(vertices=LABELS.vertices, instances=np.zeros(6, np.int32), objects=())
-    assert vertex_classes(empty, {}).tolist() == [0] * 6
+    assert vertex_classes(LABELS.instances, NAMES, {"couch": 6, "wall": 1}).tolist() == [1, 0, 6, 1, 0, 0]
+    classes = vertex_classes(LABELS.instances, NAMES, {"couch": 6, "wall": 0}, none=-1)
+    assert classes.tolist() == [0, -1, 6, 0, -1, -1]
+    assert vertex_classes(np.zeros(6, np.int32), {}, {}).tolist() == [0] * 6
+    assert vertex_classes(np.zeros(0, np.int32), {}, {}).tolist() == []
+    # An object without a name has no class, even where some class has an empty one.
+    assert vertex_classes(np.array([7], np.int32), {}, {"wall": 1}).tolist() == [0]
 
 
 def test_truth_files_hold_one_number_a_vertex(tmp_path: Path) -> None:
     classes = {"couch": 6, "wall": 1}
     # The bean bag has no class: 0 · 1000 + 5.
-    assert instance_truth(LABELS, classes).tolist() == [1003, 0, 6012, 1003, 5, 5]
+    truth = instance_truth(LABELS.instances, NAMES, classes)
+    assert truth.tolist() == [1003, 0, 6012, 1003, 5, 5]
     write_instance_truth(tmp_path / "a.txt", LABELS, classes)
     write_semantic_truth(tmp_path / "b.txt", LABELS, classes)
     assert (tmp_path / "a.txt").read_text() == "1003\n0\n6012\n1003\n5\n5\n"
     assert (tmp_path / "b.txt").read_text() == "1\n0\n6\n1\n0\n0\n"
-    assert np.loadtxt(tmp_path / "a.txt", np.int64).tolist() == instance_truth(LABELS, classes).tolist()
+    assert np.loadtxt(tmp_path / "a.txt", np.int64).tolist() == truth.tolist()
 
 
-def test_an_instance_that_would_read_as_another_class_is_refused() -> None:
-    labels = MeshLabels(
-        vertices=np.zeros((1, 3), np.float32), instances=np.array([1000], np.int32), objects=((1000, "couch"),)
-    )
-    with pytest.raises(InputError, match=r"object 1000 \('couch'\): ids up to 999 fit"):
-        instance_truth(labels, {"couch": 6})
+def test_instances_whose_ids_would_read_as_another_class_are_numbered_within_their_class() -> None:
+    instances = np.array([1000, 7, 0, 2500, 999, 1000], np.int32)
+    names = {7: "couch", 999: "lamp", 1000: "couch", 2500: "wall"}
+    # Of the couches 7 is the first and 1000 the second; the lamp has no class.
+    assert instance_truth(instances, names, {"couch": 6, "wall": 1}).tolist() == [6002, 6001, 0, 1001, 0, 6002]
+
+
+def test_more_instances_of_a_class_than_the_format_can_hold_are_refused() -> None:
+    many = np.arange(1, 1001, dtype=np.int32)
+    with pytest.raises(InputError, match="'couch': 1,000 objects are of its class; up to 999 fit"):
+        instance_truth(many, dict.fromkeys(many.tolist(), "couch"), {"couch": 6})
+    assert instance_truth(many[:999], dict.fromkeys(many.tolist(), "couch"), {"couch": 6}).max() == 6999
+    # Objects without a class are not counted.
+    assert instance_truth(many, {}, {"couch": 6}).tolist() == [0] * 1000

@@ -129,18 +129,18 @@ def error_of(folder: Path) -> str:
         ({"groups": [group(0, "a", [7]), group(1, "b", [8])]}, "anno", "objectId 1 ('b') names segment 8, which no"),
         ({"groups": [group(0, "a", [7]), group(0, "b", [9])]}, "anno", "segGroups[1]: objectId 0 is already that of"),
         ({"groups": [group(5, "a", [])]}, "anno", "segGroups[0] (objectId 5): 'a' has no segments"),
-        ({"groups": [group(-1, "a", [7])]}, "anno", "segGroups[0]: objectId must be a whole number from 0, got '-1'"),
+        ({"groups": [group(-1, "a", [7])]}, "anno", "segGroups[0]: objectId must be a whole number from 0, got -1"),
         ({"groups": [{"label": "a", "segments": [7]}]}, "anno", "segGroups[0]: objectId must be a whole number"),
-        ({"groups": [group(0, "a", [7.5])]}, "anno", "segments[0]: expected a whole number, got '7.5'"),
-        ({"groups": [group(0, "a", [7, True])]}, "anno", "segments[1]: expected a whole number, got 'True'"),
-        ({"groups": [{**group(0, "a", [7]), "label": None}]}, "anno", "label must be a name, got 'None'"),
+        ({"groups": [group(0, "a", [7.5])]}, "anno", "segments[0]: expected a whole number, got 7.5"),
+        ({"groups": [group(0, "a", [7, True])]}, "anno", "segments[1]: expected a whole number, got True"),
+        ({"groups": [{**group(0, "a", [7]), "label": None}]}, "anno", "label must be a name, got nothing"),
         ({"groups": [{**group(0, "a", [7]), "segments": "7"}]}, "anno", "segments must be a list"),
         ({"groups": ["couch"]}, "anno", "segGroups[0]: expected an object with objectId"),
         ({"groups": [group(0, "x" * 1001, [7])]}, "anno", "label has 1,001 characters"),
         ({"segments": SEGMENTS[:5]}, "segs", "segIndices has 5 entries, but"),
         ({"segments": [7, 7, 2, 9, 9, "4"]}, "segs", "segIndices[5]: expected a whole number, got '4'"),
-        ({"segments": [7, 7, 2, 9, 9, None]}, "segs", "segIndices[5]: expected a whole number, got 'None'"),
-        ({"segments": [7, 7, 2, 9, [9], 4]}, "segs", "segIndices[4]: expected a whole number, got '[9]'"),
+        ({"segments": [7, 7, 2, 9, 9, None]}, "segs", "segIndices[5]: expected a whole number, got nothing"),
+        ({"segments": [7, 7, 2, 9, [9], 4]}, "segs", "segIndices[4]: expected a whole number, got a list"),
         ({"segments": [7, 7, 2, 9, 9, 2**70]}, "segs", "segIndices[5]: expected a whole number"),
         ({"segments": []}, "segs", "segIndices is empty"),
         (
@@ -193,7 +193,7 @@ def test_deeply_nested_and_gigantic_files_are_refused(tmp_path: Path, monkeypatc
     assert "not a readable JSON file" in error_of(folder)
     with path.open("wb") as stream:
         stream.truncate(segment_files.MAX_BYTES + 1)
-    assert "536,870,913 bytes, at most 536,870,912 are read" in error_of(folder)
+    assert "536,870,913 bytes; at most 536,870,912 are read" in error_of(folder)
 
 
 @pytest.mark.parametrize("file", SUFFIXES)
@@ -286,7 +286,7 @@ def test_objects_after_the_third_of_a_vertex_are_not_looked_at(tmp_path: Path) -
 
 def test_objects_of_scannetpp_count_from_one(tmp_path: Path) -> None:
     folder = write_scannetpp_labels(tmp_path / "s", VERTICES, SEGMENTS, [group(0, "a", [7])])
-    with pytest.raises(InputError, match="objectId must be a whole number from 1, got '0'"):
+    with pytest.raises(InputError, match="objectId must be a whole number from 1, got 0"):
         read_scannetpp_labels(folder)
     (folder / "scans" / "segments.json").unlink()
     with pytest.raises(InputError, match=r"segments.json: no such file"):

@@ -6,7 +6,7 @@ from sklearn.neighbors import KNeighborsClassifier
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.truth import nearest_vertices
-from gsencoder.data.truth.nearest_vertices import labels_of_gaussians, labels_of_vertices
+from gsencoder.data.truth.nearest_vertices import labels_of_gaussians, labels_of_vertices, nearest_rows
 
 
 def points(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -32,6 +32,19 @@ def test_the_distance_itself_is_near_enough() -> None:
     assert found.labels.tolist() == [4, 0]
 
 
+def test_the_nearest_row_is_that_of_brute_force_and_minus_one_where_none_is_near(rng: np.random.Generator) -> None:
+    some, targets = points(rng, 300), points(rng, 50)
+    distances = np.linalg.norm(some[:, None].astype(float) - targets[None], axis=2)
+    assert np.array_equal(nearest_rows(some, targets), distances.argmin(axis=1))
+    near = distances.min(axis=1) <= 0.1
+    assert 0 < near.sum() < 300
+    assert np.array_equal(nearest_rows(some, targets, max_distance=0.1), np.where(near, distances.argmin(axis=1), -1))
+    assert nearest_rows(some, targets[:0]).tolist() == [-1] * 300
+    assert nearest_rows(some[:0], targets).tolist() == []
+    with pytest.raises(InputError, match="max_distance: expected a positive length"):
+        nearest_rows(some, targets, max_distance=float("nan"))
+
+
 @pytest.mark.parametrize("k", [1, 4, 25])
 def test_the_majority_of_the_nearest_gaussians_is_that_of_scikit_learn(rng: np.random.Generator, k: int) -> None:
     """Its classifier also takes the smallest of equally frequent labels."""
@@ -46,11 +59,13 @@ def test_chunks_change_nothing(rng: np.random.Generator, monkeypatch: pytest.Mon
     labels = rng.integers(0, 40, 300)
     whole = labels_of_vertices(vertices, means, labels)
     found = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
+    rows = nearest_rows(vertices, means)
     monkeypatch.setattr(nearest_vertices, "CHUNK", 16)
     monkeypatch.setattr(nearest_vertices, "MAX_VOTES", 300)
     assert np.array_equal(labels_of_vertices(vertices, means, labels), whole)
     again = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
     assert np.array_equal(again.labels, found.labels)
+    assert np.array_equal(nearest_rows(vertices, means), rows)
 
 
 def test_gaussians_without_a_label_are_among_the_nearest_but_do_not_count() -> None:

@@ -108,7 +108,7 @@ def test_sqa3d_finds_the_answers_beside_the_questions(tmp_path: Path) -> None:
         ([entry(), entry(question_id="b", answers=[])], "1 of 2 questions have no answers, such as b"),
         ([entry(object_ids=["seven"])], r"entry 0: object_ids\[0\] must be a whole number"),
         ([entry(object_ids=7)], "entry 0: object_ids must be a list"),
-        ([entry(question=None)], "entry 0: question must be a text, got None"),
+        ([entry(question=None)], "entry 0: question must be a text, got nothing"),
         ([entry(question_id="a\nb")], "entry 0: question_id must be a whole number or a text of one line"),
         ([entry(question_id=1.5)], "entry 0: question_id must be a whole number"),
         ([entry(answer_top10=["4"])], "entry 0: expected a question, got answer_top10: these are predictions"),
@@ -134,7 +134,7 @@ def test_a_wrong_entry_of_scanqa_is_named(tmp_path: Path, content: Any, message:
         ([question(1)], [annotation(1, scene_id="scene1")], "about scene0050_00, and its annotation about scene1"),
         ([question(1)], [annotation(1, answers=[])], r"annotations\[0\]: answers must be a list of objects"),
         ([question(1)], [annotation(1, answers=["x"])], r"annotations\[0\]: expected an object with an answer"),
-        ([question(1)], [annotation(1, position={"x": 1})], r"position.y must be a number, got None"),
+        ([question(1)], [annotation(1, position={"x": 1})], r"position.y must be a number, got nothing"),
         ([question(1)], [annotation(1, rotation={})], r"rotation._w must be a number"),
         ([question(1)], None, "no answers beside it; expected a file called like it"),
         ([question(1, situation="")], [annotation(1)], r"questions\[0\]: situation is empty"),
@@ -150,6 +150,6 @@ def test_files_of_sqa3d_must_belong_together(
 def test_the_other_data_set_is_told_apart(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected SQA3D's object with questions"):
         read_sqa3d(scanqa(tmp_path, [entry()]))
-    with pytest.raises(InputError, match="expected ScanQA's list"):
+    with pytest.raises(InputError, match="expected a list of objects with scene_id, question_id, question and"):
         read_scanqa(sqa3d(tmp_path, [question()], []))
     assert read_questions(scanqa(tmp_path, [])) == ()

@@ -86,7 +86,7 @@ def test_scanqas_boxes_are_written_as_corners(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ([entry(), entry()], "entry 1: question q0 is answered in entry 0 already"),
+        ([entry(), entry()], "entries 0 and 1 have one question_id: q0; expected each once"),
         ([entry(question_id="q9")], "entry 0: question_id q9 is not in the truth"),
         ([entry(scene_id="s9")], "entry 0: is about s9, of which the truth has no questions"),
         ([entry(scene_id="s1")], "entry 0: question q0 is about s0, got s1"),
@@ -99,7 +99,7 @@ def test_scanqas_boxes_are_written_as_corners(tmp_path: Path) -> None:
         ([entry(answer_top10=["x" * 10_000_000])], r"entry 0: answer_top10\[0\] has 10,000,000 characters"),
         ([{"question_id": "q0", "answer": 3}], "entry 0: answer must be a text, got 3"),
         ([{"question_id": "q0", "answers": ["x"]}], "got answers, which truth has; were predictions and truth swapped"),
-        ({"questions": []}, "this is SQA3D's truth: were predictions and truth swapped"),
+        ({"questions": []}, "got SQA3D's truth; were predictions and truth swapped"),
         ({"q0": "chair"}, "expected a list of objects with question_id"),
         ([["q0", "chair"]], "entry 0: expected an object with question_id"),
     ],

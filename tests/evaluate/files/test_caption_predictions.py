@@ -75,7 +75,7 @@ def test_what_is_written_is_read_again_with_its_wrapping(tmp_path: Path) -> None
     ("content", "message"),
     [
         ({"s9": [row()]}, "'s9': is no scene of the truth"),
-        ({"s0": row()}, "'s0': must be a list of objects"),
+        ({"s0": row()}, "pred.json: s0 must be a list of objects with caption and box, got an object"),
         ({"s0": ["x"]}, r"s0\[0\]: expected an object with caption and box"),
         ({"s0": [row(), row(box=None)]}, r"s0\[1\]: box must be a list of 8 corners"),
         ({"s0": [row(box=[[0, 0]] * 8)]}, r"s0\[0\]: box\[0\] must be a corner"),

@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.number_files import read_mask, read_whole_numbers, write_whole_numbers
 from gsencoder.evaluate.files.instances import (
     match_instance_files,
     read_instance_prediction,
     read_instance_truth,
     write_instance_prediction,
-    write_instance_truth,
 )
-from gsencoder.evaluate.files.label_files import read_mask, read_whole_numbers, write_whole_numbers
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.evaluate.files.semantics import count_label_files
-from gsencoder.evaluate.scores.class_table import ClassTable
-from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
+from gsencoder.evaluate.scores.instance_masks import InstancePrediction, prediction_of_masks
 from gsencoder.evaluate.scores.instances import instance_scores
 from gsencoder.evaluate.scores.semantics import semantic_scores
 
@@ -38,7 +37,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     for folder in (predictions, truth):
         folder.mkdir()
     write_instance_prediction(predictions, prediction())
-    write_instance_truth(truth / "scene0011_00.txt", InstanceTruth(scene="scene0011_00", ids=IDS))
+    write_whole_numbers(truth / "scene0011_00.txt", IDS)
     return predictions, truth
 
 
@@ -240,7 +239,7 @@ def test_numbers_and_masks_are_read_back(tmp_path: Path) -> None:
 def test_files_that_are_missing_folders_or_too_large_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="none.txt: no such file"):
         read_whole_numbers(tmp_path / "none.txt")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is a folder; expected a file"):
         read_whole_numbers(tmp_path)
     (tmp_path / "a.pkl").write_text("1\n")
     with pytest.raises(InputError, match="a.pkl: is a pickle"):

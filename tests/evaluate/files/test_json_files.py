@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labeled_scans import group, write_scannet_labels
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.truth.expressions import read_scanrefer, write_scanrefer
 from gsencoder.evaluate.files.recognition import (
     read_recognition_predictions,
     read_recognition_truth,
@@ -21,15 +23,15 @@ from gsencoder.evaluate.files.referring import (
     read_referring_predictions,
     read_referring_truth,
     write_referring_predictions,
-    write_referring_truth,
 )
 from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames
-from gsencoder.evaluate.scores.referring import PredictedBoxes, ReferredObject, referring_scores
+from gsencoder.evaluate.scores.referring import NO_TRUE_BOX, PredictedBoxes, referring_scores
 
 CORNERS = [[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (-1.0, 3.0)]
 BOX = np.array([[0.0, 0, -1], [1, 2, 3]])
 KEY = {"scene_id": "scene0011_00", "object_id": "3", "ann_id": "0"}
-SENTENCE = KEY | {"bbox": CORNERS, "unique_multiple": 1, "others": 0}
+PREDICTED = KEY | {"bbox": CORNERS, "unique_multiple": 1, "others": 0}
+TRUTH = PREDICTED | {"object_name": "office_chair", "description": "The chair.", "token": ["the", "chair", "."]}
 INSTANCE = {"scene_id": "scene0011_00", "object_id": 3, "label": "chair"}
 NAMES = {"scene_id": "scene0011_00", "object_id": 3, "labels": ["chair", "bed"]}
 
@@ -50,17 +52,25 @@ def test_boxes_are_read_back(tmp_path: Path) -> None:
         assert before.key == after.key
         assert np.array_equal(before.boxes, after.boxes)
         assert (before.multiple, before.others) == (after.multiple, after.others)
-    truth = [
-        ReferredObject(scene="a", object="1", annotation="2", box=BOX / 3, multiple=True, others=False),
-        ReferredObject(scene="a", object="1", annotation="3", box=None),
-    ]
-    write_referring_truth(tmp_path / "t.json", truth)
-    again = read_referring_truth(tmp_path / "t.json")
-    assert [item.key for item in again] == [item.key for item in truth]
-    assert np.array_equal(again[0].box, BOX / 3)  # type: ignore[arg-type]
-    assert again[1].box is again[1].multiple is None
-    results, skipped = compare_box_files(tmp_path / "p.json", tmp_path / "t.json")
-    assert (len(results), sum(skipped.values())) == (1, 1)
+
+
+def test_what_is_known_of_the_truth_is_read_back(tmp_path: Path) -> None:
+    path = written(tmp_path / "t.json", [TRUTH, TRUTH | {"ann_id": "1", "others": None}])
+    write_scanrefer(tmp_path / "again.json", read_scanrefer(path))
+    for file in (path, tmp_path / "again.json"):
+        first, second = read_referring_truth(file)
+        assert first.key == ("scene0011_00", "3", "0")
+        assert np.array_equal(first.box, BOX)  # type: ignore[arg-type]
+        assert (first.multiple, first.others, second.multiple, second.others) == (True, False, True, None)
+
+
+def test_sentences_whose_object_has_no_box_are_counted_and_not_scored(tmp_path: Path) -> None:
+    bare = TRUTH | {"object_id": "4", "bbox": None}
+    truth = written(tmp_path / "t.json", [TRUTH, bare])
+    results, skipped = compare_box_files(written(tmp_path / "p.json", [PREDICTED]), truth)
+    assert (len(results), skipped) == (1, {NO_TRUE_BOX: 1})
+    with pytest.raises(InputError, match=r"t.json: no sentence has a box \(bbox\).*scans="):
+        read_referring_truth(written(tmp_path / "t.json", [bare]))
 
 
 @pytest.mark.parametrize(
@@ -77,58 +87,79 @@ def test_boxes_are_read_back(tmp_path: Path) -> None:
     ],
 )
 def test_boxes_are_read_as_corners_or_as_two_of_them(tmp_path: Path, boxes: dict[str, Any], count: int) -> None:
-    (found,) = read_referring_predictions(written(tmp_path / "p.json", [KEY | boxes]))
-    assert len(found.boxes) == count
-    assert all(np.array_equal(box, BOX) for box in found.boxes)
+    (prediction,) = read_referring_predictions(written(tmp_path / "p.json", [KEY | boxes]))
+    assert len(prediction.boxes) == count
+    assert all(np.array_equal(box, BOX) for box in prediction.boxes)
 
 
 def test_ids_are_the_same_as_numbers_and_as_text(tmp_path: Path) -> None:
-    truth = written(tmp_path / "t.json", [SENTENCE])
-    results, _ = compare_box_files(written(tmp_path / "p.json", [SENTENCE | {"object_id": 3, "ann_id": "00"}]), truth)
+    truth = written(tmp_path / "t.json", [TRUTH])
+    results, _ = compare_box_files(written(tmp_path / "p.json", [PREDICTED | {"object_id": 3, "ann_id": "00"}]), truth)
     assert referring_scores(results).top1["multiple"]["not_in_others"].acc50 == 1
 
 
 @pytest.mark.parametrize(
-    ("rows", "message"),
+    ("changes", "message"),
     [
-        ({"a": 1}, "expected a list of entries, got an object"),
-        ([3], "entry 0: expected an object, got 3"),
-        ([SENTENCE, SENTENCE], "entry 1: sentence 0 about object 3 of scene0011_00 is there already"),
-        ([KEY], "entry 0: bbox is missing"),
-        ([SENTENCE | {"bbox": CORNERS[:7]}], "entry 0: bbox must be eight corners, or a lower and an upper one"),
-        ([SENTENCE | {"bbox": [1, 2, 3, 4, 5, 6]}], "bbox must be eight corners"),
-        ([SENTENCE | {"bbox": "box"}], "bbox must be eight corners"),
-        ([SENTENCE | {"bbox": BOX[::-1].tolist()}], "entry 0: bbox: the lower corner .* is not below the upper"),
-        ([SENTENCE | {"bbox": [[0, 0, float("nan")], [1, 1, 1]]}], "entry 0: bbox has nan where a finite number"),
-        ([SENTENCE | {"bbox": [[0, 0, 0], [1, 1, float("inf")]]}], "bbox has inf where"),
-        ([SENTENCE | {"bbox": [[0, 0, 0], [1, 1, 10**400]]}], "where a finite number is expected"),
-        ([SENTENCE | {"bbox": [[0, 0, "0"], [1, 1, 1]]}], "bbox has '0' where"),
-        ([SENTENCE | {"bbox": [[0, 0, True], [1, 1, 1]]}], "bbox has True where"),
-        ([SENTENCE | {"scene_id": 7}], "entry 0: scene_id must be a word, got 7"),
-        ([SENTENCE | {"scene_id": ""}], "scene_id must be printable text"),
-        ([SENTENCE | {"scene_id": "x" * 10_000_000}], "scene_id must be printable text .* got 10,000,000 characters"),
-        ([SENTENCE | {"object_id": "chair"}], "entry 0: object_id must be a whole number of 0 or more, got 'chair'"),
-        ([SENTENCE | {"object_id": 1.0}], "object_id must be a whole number"),
-        ([SENTENCE | {"object_id": -1}], "object_id must be a whole number"),
-        ([SENTENCE | {"object_id": None}], "object_id must be a whole number of 0 or more, got nothing"),
-        ([SENTENCE | {"ann_id": True}], "ann_id must be a whole number"),
-        ([SENTENCE | {"others": 2}], "entry 0: others must be 0 or 1, got 2"),
-        ([SENTENCE | {"unique_multiple": "unique"}], "unique_multiple must be 0 or 1, got 'unique'"),
+        (
+            {"bbox": CORNERS[:7]},
+            "entry 0: bbox must be a list of 8 corners .*, or of a lower and an upper one, got a list",
+        ),
+        ({"bbox": [1, 2, 3, 4, 5, 6]}, "entry 0: bbox must be a list of 8 corners"),
+        ({"bbox": [1, 2]}, r"entry 0: bbox\[0\] must be a corner \[x, y, z\], got 1"),
+        ({"bbox": "box"}, "entry 0: bbox must be a list of 8 corners .* got 'box'"),
+        ({"bbox": BOX[::-1].tolist()}, "entry 0: bbox: the lower corner .* is not below the upper"),
+        ({"bbox": [[0, 0, float("nan")], [1, 1, 1]]}, r"entry 0: bbox\[0\] must be a finite number .* got nan"),
+        ({"bbox": [[0, 0, 0], [1, 1, float("inf")]]}, r"bbox\[1\] must be a finite number .* got inf"),
+        ({"bbox": [[0, 0, 0], [1, 1, 10**400]]}, r"bbox\[1\] must be a finite number"),
+        ({"bbox": [[0, 0, 0], [1, 1, 2e9]]}, "must be a finite number of at most 1e.09, got 2000000000.0"),
+        ({"bbox": [[0, 0, "0"], [1, 1, 1]]}, r"bbox\[0\] must be a number, got '0'"),
+        ({"bbox": [[0, 0, True], [1, 1, 1]]}, r"bbox\[0\] must be a number, got True"),
+        ({"scene_id": 7}, "entry 0: the scene must be a text, got 7"),
+        ({"scene_id": ""}, "entry 0: the scene is empty"),
+        ({"scene_id": "x" * 10_000_000}, "the scene has 10,000,000 characters"),
+        ({"object_id": "chair"}, "entry 0: object_id must be a whole number from 0, got 'chair'"),
+        ({"object_id": 1.0}, "object_id must be a whole number"),
+        ({"object_id": -1}, "object_id must be a whole number"),
+        ({"object_id": None}, "object_id must be a whole number from 0, got nothing"),
+        ({"ann_id": True}, "ann_id must be a whole number"),
+        ({"ann_id": "x" * 10_000_000}, "ann_id must be a whole number .* got 10,000,000 characters"),
+        ({"others": 2}, "entry 0: others must be 0 or 1, got 2"),
+        ({"unique_multiple": "unique"}, "unique_multiple must be 0 or 1, got 'unique'"),
     ],
 )
-def test_a_bad_entry_of_sentences_is_named(tmp_path: Path, rows: Any, message: str) -> None:
-    path = written(tmp_path / "boxes.json", rows)
-    for read in (read_referring_truth, read_referring_predictions):
+def test_a_bad_entry_of_sentences_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    for read, row in ((read_referring_truth, TRUTH), (read_referring_predictions, PREDICTED)):
+        path = written(tmp_path / "boxes.json", [row | changes])
         with pytest.raises(InputError, match=message) as error:
             read(path)
         assert str(path) in str(error.value)
         assert len(str(error.value)) < len(str(path)) + 250
 
 
+@pytest.mark.parametrize("rows", [{"a": 1}, [3], None])
+def test_what_is_no_list_of_entries_is_refused(tmp_path: Path, rows: Any) -> None:
+    path = written(tmp_path / "boxes.json", rows)
+    for read in (read_referring_truth, read_referring_predictions):
+        with pytest.raises(InputError, match=r"boxes.json: (entry 0: )?expected an? (list|object)"):
+            read(path)
+
+
+def test_a_sentence_that_is_there_twice_or_has_no_box_is_named(tmp_path: Path) -> None:
+    for read, row in ((read_referring_truth, TRUTH), (read_referring_predictions, PREDICTED)):
+        path = written(tmp_path / "boxes.json", [row, row | {"ann_id": "1"}, row | {"ann_id": "00"}])
+        with pytest.raises(
+            InputError, match="entries 0 and 2 have one id: sentence 0 about object 3 of scene0011_00; expected each"
+        ):
+            read(path)
+    with pytest.raises(InputError, match="entry 0: bbox is missing"):
+        read_referring_predictions(written(tmp_path / "boxes.json", [KEY]))
+
+
 @pytest.mark.parametrize(
     ("boxes", "message"),
     [
-        ({"bboxes": CORNERS}, r"bboxes\[0\] must be eight corners"),
+        ({"bboxes": CORNERS}, r"bboxes\[0\] must be a list of 8 corners"),
         ({"bboxes": "all"}, "bboxes must be a list of at most 10,000 boxes, got 'all'"),
         ({"bboxes": [None] * 10_001}, "bboxes must be a list of at most 10,000 boxes, got 10,001"),
         ({"bbox": (BOX + 1).tolist(), "bboxes": [CORNERS]}, "bbox is not the first of bboxes"),
@@ -141,17 +172,18 @@ def test_bad_lists_of_boxes_are_named(tmp_path: Path, boxes: dict[str, Any], mes
 
 
 def test_swapped_files_of_sentences_are_told(tmp_path: Path) -> None:
-    truth = written(tmp_path / "t.json", [SENTENCE | {"description": "the chair"}])
+    truth = written(tmp_path / "t.json", [TRUTH])
     with pytest.raises(InputError, match="t.json: entry 0: unexpected key 'description'.*swapped"):
         read_referring_predictions(truth)
-    with pytest.raises(
-        InputError, match="p.json: entry 0: unexpected key 'bboxes'; predictions and truth may be swapped"
-    ):
-        compare_box_files(truth, written(tmp_path / "p.json", [KEY | {"bboxes": []}]))
+    for boxes, said in (({"bboxes": []}, ", got bboxes: these are predictions"), ({"bbox": CORNERS}, "")):
+        with pytest.raises(
+            InputError, match=f"p.json: entry 0: expected an expression with a description{said}; predictions and truth"
+        ):
+            read_referring_truth(written(tmp_path / "p.json", [KEY | boxes]))
 
 
 def test_what_predictions_and_truth_do_not_share_is_told_with_the_file(tmp_path: Path) -> None:
-    truth, other = written(tmp_path / "t.json", [SENTENCE]), written(tmp_path / "p.json", [SENTENCE | {"ann_id": 4}])
+    truth, other = written(tmp_path / "t.json", [TRUTH]), written(tmp_path / "p.json", [PREDICTED | {"ann_id": 4}])
     with pytest.raises(InputError, match="p.json: sentence 4 about object 3 of scene0011_00 is predicted, and not in"):
         compare_box_files(other, truth)
     with pytest.raises(InputError, match="p.json: sentence 0 about object 3 of scene0011_00 has no prediction"):
@@ -159,14 +191,66 @@ def test_what_predictions_and_truth_do_not_share_is_told_with_the_file(tmp_path:
     assert len(compare_box_files(written(tmp_path / "p.json", []), truth, allow_missing=True)[0]) == 1
 
 
+# ScanRefer's own files, which have neither boxes nor kinds
+
+
+def scan_refer(folder: Path) -> tuple[Path, Path, Path]:
+    """Sentences about a scan, its folder, and a label map: two chairs and a monitor, an object without vertices."""
+    vertices = np.array([[0, 0, 0], [1, 2, 3], [5, 5, 5], [6, 6, 6], [9, 9, 9], [9, 9, 8]], np.float32)
+    # A quarter turn about z: (x, y) becomes (-y, x).
+    turn = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
+    groups = [group(0, "office chair", [7]), group(1, "armchair", [8]), group(2, "monitor", [9]), group(3, "bed", [9])]
+    name = "scene0011_00"
+    write_scannet_labels(folder / "scans" / name, name, vertices, np.repeat([7, 8, 9], 2), groups, alignment=turn)
+    names = ("office_chair", "armchair", "monitor", "bed")
+    bare = {key: value for key, value in TRUTH.items() if key not in ("bbox", "unique_multiple", "others")}
+    rows = [bare | {"object_id": str(number), "object_name": each} for number, each in enumerate(names)]
+    lines = ["raw_category\tnyu40id", "office chair\t5", "armchair\t5", "monitor\t40", "bed\t4"]
+    (folder / "map.tsv").write_text("\n".join(lines) + "\n")
+    return written(folder / "ScanRefer_filtered_val.json", rows), folder / "scans", folder / "map.tsv"
+
+
+def test_scanrefers_own_file_has_boxes_from_the_scans_and_kinds_from_the_label_map(tmp_path: Path) -> None:
+    path, scans, label_map = scan_refer(tmp_path)
+    with pytest.raises(InputError, match="no sentence has a box"):
+        read_referring_truth(path, label_map=label_map)
+    truth = read_referring_truth(path, label_map=label_map, scans=scans)
+    # The first chair's vertices (0, 0, 0) and (1, 2, 3) are (0, 0, 0) and (-2, 1, 3) in the aligned frame.
+    assert np.allclose(truth[0].box, [[-2, 0, 0], [0, 1, 3]])  # type: ignore[arg-type]
+    # Of the monitor all vertices belong to the bed, which was annotated later.
+    assert [each.box is None for each in truth] == [False, False, True, False]
+    assert [each.multiple for each in truth] == [True, True, False, False]
+    assert [each.others for each in truth] == [False, False, True, False]
+    # Without the map nothing says what the objects are.
+    assert {(each.multiple, each.others) for each in read_referring_truth(path, scans=scans)} == {(None, None)}
+
+
+def test_names_that_the_label_map_lacks_are_counted_and_are_others(tmp_path: Path) -> None:
+    path, scans, label_map = scan_refer(tmp_path)
+    label_map.write_text("raw_category\tnyu40id\narmchair\t5\nmonitor\t40\nbed\t4\n")
+    with pytest.warns(SceneWarning, match="1 of 4 names are not in the label map"):
+        truth = read_referring_truth(path, label_map=label_map, scans=scans)
+    assert [each.others for each in truth] == [True, False, True, False]
+    assert [each.multiple for each in truth] == [True, False, True, False]
+
+
+def test_scans_that_do_not_belong_to_the_sentences_are_refused(tmp_path: Path) -> None:
+    path, scans, _ = scan_refer(tmp_path)
+    rows = json.loads(path.read_text())
+    with pytest.raises(InputError, match="scene0022_00: no annotation of ScanNet"):
+        read_referring_truth(written(path, [rows[0] | {"scene_id": "scene0022_00"}]), scans=scans)
+    with pytest.raises(InputError, match="scene0011_00: its labels have no object with the objectId 4"):
+        read_referring_truth(written(path, [rows[0] | {"object_id": "4"}]), scans=scans)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (b"", "not a readable JSON file"),
-        (b'[{"a": 1, "a": 2}]', "the key 'a' is twice in one entry"),
+        (b'[{"a": 1, "a": 2}]', "the key 'a' is there twice"),
         (b"[" * 100_000, "not a readable JSON file"),
         (b'["\xff"]', "not a readable JSON file"),
-        (pickle.dumps([SENTENCE]), "is a pickle, which is refused"),
+        (pickle.dumps([TRUTH]), "is a pickle, which is refused"),
     ],
 )
 def test_a_file_that_is_no_list_is_named(tmp_path: Path, content: bytes, message: str) -> None:
@@ -186,21 +270,21 @@ def test_names_are_read_back_and_scored(tmp_path: Path) -> None:
     write_recognition_predictions(tmp_path / "p.json", answers)
     assert read_recognition_truth(tmp_path / "t.json") == tuple(truth)
     assert read_recognition_predictions(tmp_path / "p.json") == tuple(answers)
-    found, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ("bed", "chair"))
-    assert ([item.place for item in found], others) == ([2], 1)
+    results, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ("bed", "chair"))
+    assert ([item.place for item in results], others) == ([2], 1)
 
 
 def test_null_is_no_answer(tmp_path: Path) -> None:
-    (found,) = read_recognition_predictions(written(tmp_path / "p.json", [NAMES | {"labels": None}]))
-    assert found.names == ()
+    (prediction,) = read_recognition_predictions(written(tmp_path / "p.json", [NAMES | {"labels": None}]))
+    assert prediction.names == ()
 
 
 @pytest.mark.parametrize(
     ("row", "message"),
     [
         ({"labels": "chair"}, "labels must be a list of names, got 'chair'"),
-        ({"labels": ["chair", 5]}, r"labels\[1\] must be a word, got 5"),
-        ({"labels": ["chair\n"]}, r"labels\[0\] must be printable text"),
+        ({"labels": ["chair", 5]}, r"labels\[1\] must be a text of one line with 1 to 200 characters, got 5"),
+        ({"labels": ["chair\n"]}, r"labels\[0\] must be a text of one line"),
         ({"labels": ["x" * 10_000_000]}, r"labels\[0\] must be .* got 10,000,000 characters"),
         ({"object_id": 0.5}, "object_id must be a whole number"),
         ({"label": "chair"}, "unexpected key 'label'; predictions and truth may be swapped"),
@@ -218,7 +302,7 @@ def test_a_prediction_without_names_is_refused(tmp_path: Path) -> None:
 
 def test_entries_that_are_there_twice_swapped_or_of_no_class_are_named(tmp_path: Path) -> None:
     truth = written(tmp_path / "t.json", [INSTANCE])
-    with pytest.raises(InputError, match="p.json: entry 1: object 3 of scene0011_00 is there already"):
+    with pytest.raises(InputError, match="p.json: entries 0 and 1 have one id: object 3 of scene0011_00"):
         read_recognition_predictions(written(tmp_path / "p.json", [NAMES, NAMES]))
     with pytest.raises(
         InputError, match="p.json: entry 0: unexpected key 'labels'; predictions and truth may be swapped"

@@ -11,15 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
-from gsencoder.evaluate.scores.instances import (
-    OVERLAPS,
-    InstanceScores,
-    average_precision,
-    instance_scores,
-    match_instances,
-)
+from gsencoder.evaluate.scores.instance_matches import OVERLAPS, match_instances
+from gsencoder.evaluate.scores.instances import InstanceScores, average_precision, instance_scores
 
 CLASSES = ClassTable(
     names=("bed", "chair", "sofa"), ids=(4, 5, 6), groups={"head": ("bed",), "common": ("chair", "sofa"), "tail": ()}

@@ -8,18 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.truth.expressions import Expression
 from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.evaluate.scores.box_overlap import box_ious
 from gsencoder.evaluate.scores.referring import (
     NO_TRUE_BOX,
-    OTHERS,
     PredictedBoxes,
     ReferredObject,
     ReferringResult,
-    box_ious,
     compare_boxes,
+    referred_objects,
     referring_scores,
-    several_of_their_class,
 )
+from gsencoder.evaluate.scores.referring_kinds import OTHERS, named_classes, several_of_their_class, with_kinds
 
 CUBE = np.array([[0.0, 0, 0], [1, 1, 1]])
 FAR = CUBE + 5
@@ -45,6 +46,13 @@ def test_the_iou_has_scanrefers_epsilon() -> None:
     # A quarter of the cube: 0.25 / (1 + 0.25 - 0.25 + 1e-8).
     assert box_ious(np.array([part(0.25)]), CUBE)[0] == 0.25 / (1 + 1e-8)
     assert box_ious(np.array([CUBE, FAR, part(0)]), CUBE).tolist() == [1 / (1 + 1e-8), 0, 0]
+
+
+def test_boxes_without_volume_overlap_nothing() -> None:
+    flat = np.zeros((2, 3))
+    assert box_ious(np.array([flat, CUBE]), flat).tolist() == [0, 0]
+    # Boxes that touch have no common volume.
+    assert box_ious(np.array([CUBE + 1]), CUBE).tolist() == [0]
 
 
 def test_a_tie_at_a_threshold_is_below_it_for_the_epsilon() -> None:
@@ -124,6 +132,40 @@ def test_an_object_is_alone_among_the_described_objects_of_its_scene() -> None:
 def test_an_object_counts_with_the_class_of_its_first_sentence() -> None:
     # Its second sentence calls the object a sofa, of which no object is one: none is not exactly one.
     assert several_of_their_class([("a", "1", "chair"), ("a", "1", "sofa")]) == (False, True)
+
+
+def test_the_class_of_a_name_is_one_of_seventeen_or_others() -> None:
+    ids = {"office chair": 5, "wall": 1, "floor": 2, "lamp": 35, "shelf": 15, "cart": 40, "desk": 14, "trash can": 39}
+    classes = named_classes(["office_chair", "desk", *(name.replace(" ", "_") for name in ids)], ids)
+    assert (classes.pop("office_chair"), classes.pop("desk")) == ("chair", "desk")
+    assert set(classes.values()) == {OTHERS}
+    named = named_classes([str(number) for number in range(1, 41)], {str(number): number for number in range(1, 41)})
+    assert len(set(named.values()) - {OTHERS}) == 17
+
+
+def expression(number: int, name: str, scene: str = "a", **stated: bool) -> Expression:
+    return Expression(
+        scene=scene, object_id=number, object_name=name, annotation="0", text=name, tokens=(name,), **stated
+    )
+
+
+def test_what_a_file_says_of_a_sentence_is_kept_and_the_rest_is_counted() -> None:
+    sentences = (
+        expression(1, "office_chair"),
+        expression(2, "armchair"),
+        expression(3, "cart", multiple=True, others=False),
+        expression(1, "armchair", scene="b"),
+    )
+    kinds = with_kinds(sentences, {"office_chair": "chair", "armchair": "chair", "cart": OTHERS})
+    assert [each.multiple for each in kinds] == [True, True, True, False]
+    assert [each.others for each in kinds] == [False, False, False, False]
+    assert [each.key for each in referred_objects(kinds)] == [
+        ("a", "1", "0"),
+        ("a", "2", "0"),
+        ("a", "3", "0"),
+        ("b", "1", "0"),
+    ]
+    assert with_kinds((), {}) == ()
 
 
 BOXES = st.lists(st.lists(st.floats(-2, 2, width=32), min_size=6, max_size=6), min_size=1, max_size=5).map(

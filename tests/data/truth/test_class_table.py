@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores.class_table import ClassTable
+from gsencoder.data.truth.class_table import ClassTable
 
 TABLE = ClassTable(names=("bed", "chair", "wall"), ids=(4, 5, 1), groups={"head": ("chair", "wall"), "tail": ("bed",)})
 
@@ -12,6 +12,12 @@ TABLE = ClassTable(names=("bed", "chair", "wall"), ids=(4, 5, 1), groups={"head"
 def test_ids_lead_to_rows_of_the_table_and_unknown_ones_to_none() -> None:
     rows = TABLE.rows(np.array([1, 5, 4, 0, 6, -1, 2]))
     assert rows.tolist() == [2, 1, 0, -1, -1, -1, -1]
+
+
+def test_names_and_ids_lead_to_each_other() -> None:
+    assert TABLE.id_of == {"bed": 4, "chair": 5, "wall": 1}
+    assert {name: number for number, name in TABLE.name_of.items()} == TABLE.id_of
+    assert len(TABLE) == 3
 
 
 def test_no_ids_lead_to_no_rows() -> None:

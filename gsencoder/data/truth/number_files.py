@@ -5,14 +5,16 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Int, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_bytes
-from gsencoder.evaluate.files.checked_bytes import read_checked
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.data.truth.checked_files import read_checked
 
 LARGEST = 2**31 - 1
 """Largest number, and negative of the smallest."""
+CHUNK = 1 << 20
+"""Numbers that become text at once."""
 
 
 def read_whole_numbers(path: Path, *, hint: str = "") -> Int64[np.ndarray, " n"]:
@@ -43,9 +45,15 @@ def read_mask(path: Path) -> Bool[np.ndarray, " n"]:
     return _parsed(path, data, "") != 0
 
 
-def write_whole_numbers(path: Path, values: Int64[np.ndarray, " n"]) -> None:
-    """Writes one number a line, atomically."""
-    write_bytes(path, "".join(f"{value}\n" for value in values.tolist()).encode())
+def write_whole_numbers(path: Path, values: Int[np.ndarray, " n"]) -> None:
+    """Writes one number a line, atomically.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with atomic_file(path) as stream:
+        for start in range(0, len(values), CHUNK):
+            stream.write("".join(f"{value}\n" for value in values[start : start + CHUNK].tolist()).encode())
 
 
 def mask_bytes(mask: Bool[np.ndarray, " n"]) -> bytes:
@@ -67,8 +75,8 @@ def _parsed(path: Path, data: bytes, hint: str) -> Int64[np.ndarray, " n"]:
         word = line.strip()
         digits = word[1:] if word[:1] in (b"-", b"+") else word
         if not digits.isdigit() or int(digits) > LARGEST:
-            shown = word[:40].decode("utf-8", "replace")
-            raise InputError(f"{path}: line {number}: expected one whole number, got {shown!r}{hint}")
+            start = word[:40].decode("utf-8", "replace")
+            raise InputError(f"{path}: line {number}: expected one whole number, got {start!r}{hint}")
     raise InputError(f"{path}: expected one whole number a line")
 
 

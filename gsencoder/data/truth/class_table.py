@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.first_repeated import first_repeated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,17 +31,27 @@ class ClassTable:
                 f"{len(self.ids)} ids"
             )
         for what, values in (("name", self.names), ("id", self.ids)):
-            seen: set[object] = set()
-            for value in values:
-                if value in seen:
-                    raise InputError(f"classes: the {what} {value!r} is there twice")
-                seen.add(value)
+            if repeated := first_repeated(values):
+                raise InputError(f"classes: the {what} {repeated[0]!r} is there twice")
         if min(self.ids) < 0:
             raise InputError(f"classes: expected ids of 0 or more, got {min(self.ids)}")
         for group, names in self.groups.items():
             unknown = [name for name in names if name not in self.names]
             if unknown:
                 raise InputError(f"classes: {unknown[0]!r} of the group {group!r} is no class")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def name_of(self) -> dict[int, str]:
+        """The name of each id."""
+        return dict(zip(self.ids, self.names, strict=True))
+
+    @property
+    def id_of(self) -> dict[str, int]:
+        """The id of each name."""
+        return dict(zip(self.names, self.ids, strict=True))
 
     def without(self, names: Collection[str]) -> "ClassTable":
         """The table without some names, of which those that it does not have are passed over."""
@@ -57,5 +68,5 @@ class ClassTable:
         """The row of each id in the table; -1 for ids that it does not have."""
         order = np.argsort(self.ids)
         ascending = np.array(self.ids, np.int64)[order]
-        found = np.minimum(np.searchsorted(ascending, ids), len(ascending) - 1)
-        return np.where(ascending[found] == ids, order[found], -1)
+        places = np.minimum(np.searchsorted(ascending, ids), len(ascending) - 1)
+        return np.where(ascending[places] == ids, order[places], -1)

@@ -1,0 +1,41 @@
+"""Truth of instances and of semantic labels from the labels of ScanNet's scans, without files in between.
+
+It is what `gsencoder.data.truth.write_truth` writes, and what ScanNet's own export writes: class id · 1000 + objectId
++ 1, and class ids.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64
+
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.label_sets import ids_of_names, vertex_classes
+from gsencoder.data.truth.scannet_labels import read_scannet_labels
+from gsencoder.data.truth.write_truth import instance_truth
+from gsencoder.evaluate.scores.instance_masks import InstanceTruth
+
+
+def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> InstanceTruth:
+    """The instance of each vertex of a scan's mesh; the scene is named as its folder.
+
+    Args:
+        folder: of the scan.
+        raw_ids: class id of each raw name, of `read_label_map`.
+        classes: that are scored; objects of others do not count.
+
+    Raises:
+        InputError: label files that are missing or wrong.
+    """
+    labels = read_scannet_labels(folder)
+    names = dict(labels.objects)
+    class_of = ids_of_names(names.values(), raw_ids, classes)
+    return InstanceTruth(scene=folder.name, ids=instance_truth(labels.instances, names, class_of))
+
+
+def classes_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> Int64[np.ndarray, " V"]:
+    """The class id of each vertex of a scan's mesh, 0 = none; arguments and errors as of `instances_of_scan`."""
+    labels = read_scannet_labels(folder)
+    names = dict(labels.objects)
+    return vertex_classes(labels.instances, names, ids_of_names(names.values(), raw_ids, classes)).astype(np.int64)

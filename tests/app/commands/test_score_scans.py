@@ -1,0 +1,210 @@
+"""`gsencoder score` with the labels of ScanNet's scans and ScanRefer's own files as truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_runs import refusal, results_of
+from labeled_scans import ROOM_NAMES, group, names_of_room, write_scannet_labels, write_scannet_scan
+
+from gsencoder.app import cli
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.truth.label_sets import ids_of_names, read_label_map
+from gsencoder.data.truth.number_files import read_whole_numbers, write_whole_numbers
+from gsencoder.data.truth.scannet_labels import read_scannet_labels
+from gsencoder.data.truth.write_truth import write_instance_truth, write_semantic_truth
+from gsencoder.evaluate.files.instances import write_instance_prediction
+from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
+from gsencoder.text.table import make_text_table, save_text_table
+
+ROWS = ("1\twall\t1", "2\tchair\t5", "10\toffice chair\t5", "6\tcouch\t6", "43\tpaper\t40")
+"""Of each raw name the id of ScanNet200, and nyu40id, which ScanNet's 20 classes have."""
+SIZES = (150, 120, 110, 40)
+"""Vertices of a chair, a sofa, a wall, and of a sheet of paper, which is of none of the 20 classes."""
+
+
+@pytest.fixture
+def scans(tmp_path: Path) -> Path:
+    """Two scans and a label map beside their folder."""
+    names = ("office chair", "couch", "wall", "paper")
+    rng = np.random.default_rng(0)
+    for scene in ("scene0000_00", "scene0001_00"):
+        segments = np.repeat(np.arange(len(names)), SIZES)
+        vertices = rng.normal(size=(len(segments), 3)).astype(np.float32)
+        groups = [group(number, name, [number]) for number, name in enumerate(names)]
+        write_scannet_labels(tmp_path / "scans" / scene, scene, vertices, segments, groups)
+    (tmp_path / "map.tsv").write_text("\n".join(["id\traw_category\tnyu40id", *ROWS]) + "\n")
+    return tmp_path / "scans"
+
+
+def words_of(protocol: str, scans: Path, *options: str, classes: str = "scannet20") -> list[str]:
+    files = [f"predictions={scans.parent / 'predictions'}", f"label_map={scans.parent / 'map.tsv'}"]
+    return ["score", protocol, *files, f"truth={scans}", f"classes={classes}", *options]
+
+
+def write_masks(scans: Path, *, vertices: int = sum(SIZES)) -> Path:
+    """The chair's and the sofa's mask, of which that of the sofa has half of the wall."""
+    folder = scans.parent / "predictions"
+    folder.mkdir(exist_ok=True)
+    rows = np.arange(vertices)
+    masks = [rows < 150, (rows >= 150) & (rows < 325)]
+    for scene in ("scene0000_00", "scene0001_00"):
+        made = prediction_of_masks(scene, masks, [5, 6], [0.9, 0.8], num_vertices=vertices)
+        write_instance_prediction(folder, made)
+    return folder
+
+
+def write_truth_files(scans: Path, column: str, write: object) -> Path:
+    """What `write` writes of the scans."""
+    folder = scans.parent / "truth"
+    folder.mkdir()
+    for scan in scans.iterdir():
+        labels = read_scannet_labels(scan)
+        ids = ids_of_names((name for _, name in labels.objects), read_label_map(scans.parent / "map.tsv", column))
+        write(folder / f"{scan.name}.txt", labels, ids)  # type: ignore[operator]
+    return folder
+
+
+def test_instances_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(scans: Path, tmp_path: Path) -> None:
+    write_masks(scans)
+    truth = write_truth_files(scans, "nyu40id", write_instance_truth)
+    assert read_whole_numbers(truth / "scene0000_00.txt")[[0, 150, 270, 380]].tolist() == [5001, 6002, 1003, 40004]
+    outs = tmp_path / "scans_out", tmp_path / "files_out"
+    assert cli.main([*words_of("instances", scans), f"out={outs[0]}", "quiet=true"]) == 0
+    words = ["score", "instances", f"predictions={tmp_path / 'predictions'}", f"truth={truth}", "classes=scannet20"]
+    assert cli.main([*words, f"out={outs[1]}", "quiet=true"]) == 0
+    results = results_of(outs[0])
+    assert results == results_of(outs[1])
+    # Chairs: 1. Sofas: an IoU of 120/175, above the thresholds to 0.65. Walls have no prediction.
+    assert (results["truths"], results["ap_50"]) == (6, pytest.approx(2 / 3))
+    assert results["ap"] == pytest.approx((1 + 4 / 9 + 0) / 3)
+
+
+def test_labels_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(scans: Path, tmp_path: Path) -> None:
+    predictions = tmp_path / "predictions"
+    predictions.mkdir()
+    for scene in ("scene0000_00", "scene0001_00"):
+        write_whole_numbers(predictions / f"{scene}.txt", np.repeat([5, 6, 5, 1], SIZES))
+    truth = write_truth_files(scans, "nyu40id", write_semantic_truth)
+    outs = tmp_path / "scans_out", tmp_path / "files_out"
+    assert cli.main([*words_of("semantics", scans), f"out={outs[0]}", "quiet=true"]) == 0
+    words = ["score", "semantics", f"predictions={predictions}", f"truth={truth}", "classes=scannet20"]
+    assert cli.main([*words, f"out={outs[1]}", "quiet=true"]) == 0
+    results = results_of(outs[0])
+    assert results == results_of(outs[1])
+    # Paper is ignored. Chairs: 150 of 150 + 110; sofas: all; walls: none.
+    assert (results["ignored"], results["vertices"]) == (2 * 40, 2 * 380)
+    assert results["miou"] == pytest.approx((150 / 260 + 1 + 0) / 3)
+
+
+def test_the_200_classes_take_another_column_of_the_label_map(scans: Path, tmp_path: Path) -> None:
+    predictions = tmp_path / "predictions"
+    predictions.mkdir()
+    for scene in ("scene0000_00", "scene0001_00"):
+        # Office chair 10, couch 6, wall 1, paper 43 of ScanNet200.
+        write_whole_numbers(predictions / f"{scene}.txt", np.repeat([10, 6, 1, 79], SIZES))
+    words = words_of("semantics", scans, f"out={tmp_path / 'out'}", "quiet=true", classes="scannet200")
+    assert cli.main(words) == 0
+    results = results_of(tmp_path / "out")
+    assert (results["miou"], results["ignored"]) == (1, 2 * 40)
+
+
+def test_folders_that_do_not_fit_are_refused(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    predictions = write_masks(scans)
+    without_map = [word for word in words_of("instances", scans) if not word.startswith("label_map")]
+    assert "no truth; expected SCENE.txt for each scene; the labels of 2 ScanNet scans" in refusal(capsys, *without_map)
+    truth = write_truth_files(scans, "nyu40id", write_instance_truth)
+    words = [word for word in words_of("instances", scans) if not word.startswith("truth")]
+    message = refusal(capsys, *words, f"truth={truth}")
+    assert "no scans; expected SCENE/SCENE.aggregation.json" in message
+    assert "SCENE.txt has ids of classes and needs no label map" in message
+    assert "missing.tsv: no such file" in refusal(capsys, *without_map, f"label_map={tmp_path / 'missing.tsv'}")
+    (predictions / "scene0001_00.txt").rename(predictions / "scene0009_00.txt")
+    message = refusal(capsys, *words_of("instances", scans))
+    assert "scene0009_00.txt: there is no truth of this scene" in message
+    (predictions / "scene0009_00.txt").unlink()
+    assert "no prediction of 1 scenes: scene0001_00" in refusal(capsys, *words_of("instances", scans))
+    write_masks(scans, vertices=7)
+    assert "has 7 lines, and the scene 420 vertices" in refusal(capsys, *words_of("instances", scans))
+    write_masks(scans)
+    (scans / "scene0001_00" / "scene0001_00_vh_clean_2.ply").unlink()
+    assert "scene0001_00_vh_clean_2.ply: no such file" in refusal(capsys, *words_of("instances", scans))
+
+
+SENTENCES = [
+    {"scene_id": "scene0000_00", "object_id": str(number), "object_name": name, "ann_id": "0"}
+    for number, name in enumerate(("office_chair", "couch", "wall"))
+]
+
+
+def test_scanrefers_own_file_is_truth(scans: Path, tmp_path: Path) -> None:
+    truth, predictions = tmp_path / "ScanRefer_filtered_val.json", tmp_path / "pred.json"
+    truth.write_text(json.dumps([each | {"description": "It.", "token": ["it"]} for each in SENTENCES]))
+    boxes = read_scannet_labels(scans / "scene0000_00").boxes(aligned=True)
+    rows = [
+        {key: each[key] for key in ("scene_id", "object_id", "ann_id")} | {"bbox": np.array(boxes[row + 1]).tolist()}
+        for row, each in enumerate(SENTENCES)
+    ]
+    predictions.write_text(json.dumps([*rows[:2], rows[2] | {"bbox": None}]))
+    words = ["score", "referring", f"predictions={predictions}", f"truth={truth}", f"scans={scans}", "quiet=true"]
+    assert cli.main([*words, f"label_map={tmp_path / 'map.tsv'}", f"out={tmp_path / 'out'}"]) == 0
+    results = results_of(tmp_path / "out")
+    # The wall is of the class others; each is the only one of its class, and the wall alone has no box.
+    assert (results["acc_50"], results["unique_50"]) == (pytest.approx(2 / 3), pytest.approx(2 / 3))
+    assert results["tables"]["top_1"]["unique"]["not_in_others"] == {"sentences": 2, "acc25": 1, "acc50": 1}
+    assert cli.main([*words, f"out={tmp_path / 'unknown'}"]) == 0
+    results = results_of(tmp_path / "unknown")
+    assert (results["acc_50"], results["unique_50"]) == (pytest.approx(2 / 3), None)
+    assert "3 sentences count in the overall columns alone" in (tmp_path / "unknown" / "table.md").read_text()
+
+
+def test_sentences_without_boxes_need_scans(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth, predictions = tmp_path / "truth.json", tmp_path / "pred.json"
+    truth.write_text(json.dumps([each | {"description": "It.", "token": ["it"]} for each in SENTENCES]))
+    predictions.write_text("[]")
+    words = ["score", "referring", f"predictions={predictions}", f"truth={truth}", f"out={tmp_path / 'out'}"]
+    message = refusal(capsys, *words)
+    assert "no sentence has a box (bbox), as in ScanRefer's own files" in message
+    assert "scans=" in message
+
+
+@pytest.mark.slow
+def test_evaluate_scores_a_scan_on_its_vertices_and_takes_boxes_and_kinds_of_sentences_from_it(tmp_path: Path) -> None:
+    room = make_room(0, objects=3, views=4, width=96, height=72)
+    scan = write_scannet_scan(room, tmp_path / "scene0000_00")
+    names = sorted(set(names_of_room(room).values()) | set(ROOM_NAMES.values()))
+    table = make_text_table(names, np.eye(len(names), dtype=np.float32), "room-words")
+    save_text_table(tmp_path / "words.safetensors", table)
+    words = f"teacher.words={tmp_path / 'words.safetensors'}"
+    placed = [thing for thing in room.objects if thing.placed and thing.name]
+    sentences = [
+        {
+            "scene_id": "scene0000_00",
+            "object_id": str(thing.id - 1),
+            "object_name": str(thing.name),
+            "ann_id": "0",
+            "description": f"the {thing.name}",
+            "token": ["the", str(thing.name)],
+        }
+        for thing in placed
+    ]
+    (tmp_path / "ScanRefer.json").write_text(json.dumps(sentences))
+    rows = [f"{thing.name}\t5" for thing in {thing.name: thing for thing in placed}.values()]
+    (tmp_path / "map.tsv").write_text("\n".join(["raw_category\tnyu40id", *rows]) + "\n")
+    options = [f"protocol.expressions={tmp_path / 'ScanRefer.json'}", f"label_map={tmp_path / 'map.tsv'}"]
+    base = ["evaluate", str(scan), words, "quiet=true"]
+    assert cli.main([*base, "protocol=referring", *options, f"out={tmp_path / 'referring'}"]) == 0
+    results = results_of(tmp_path / "referring")
+    # All things are chairs by this map, so that none is unique.
+    assert (results["sentences"], results["unique_25"]) == (len(placed), None)
+    assert results["acc_25"] >= 0.5
+    scores = {}
+    for voters in (1, 25):
+        out = tmp_path / f"semantics_{voters}"
+        assert cli.main([*base, "protocol=semantics", f"protocol.voters={voters}", f"out={out}"]) == 0
+        scores[voters] = results_of(out)
+    assert scores[1]["vertices"] == scores[25]["vertices"] > 1000
+    assert scores[25]["unlabeled"] == 0
+    assert min(scores[1]["miou"], scores[25]["miou"]) > 0.6
+    assert scores[1]["miou"] != scores[25]["miou"]
