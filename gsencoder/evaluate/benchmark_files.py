@@ -186,8 +186,11 @@ def score_written(folder: Path, protocol: BenchmarkProtocol, classes: ClassTable
 def _expressions(
     scene: Scene, mesh: MeshLabels | None, given: Sequence[Expression], raw_ids: Mapping[str, int] | None
 ) -> tuple[Expression, ...]:
-    """The sentences about a scene, with the boxes of a ScanNet scan's labels where they have none, and with what is known
-    of their kinds: by ScanNet's label map, or by the names themselves where the names are what is asked."""
+    """The sentences about a scene, with boxes and with what is known of their kinds.
+
+    Boxes that a file does not have are those of a ScanNet scan's labels. Kinds are known by ScanNet's label map, or by
+    the names themselves where the names are what is asked.
+    """
     if not given:
         asked = expressions_of_objects(scene)
         return with_kinds(asked, {each.object_name: each.object_name for each in asked})
