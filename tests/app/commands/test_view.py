@@ -128,7 +128,8 @@ sys.exit(cli.main(["view", sys.argv[2], "open=false"]))
 def test_the_server_answers_until_it_is_stopped_and_then_says_how_it_ended(
     folder: Path, built: Path, number: signal.Signals, code: int
 ) -> None:
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    # The address comes at once even where Python collects what is printed into a pipe.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     command = [sys.executable, "-c", SERVE, str(built), str(folder / "features")]
     with subprocess.Popen(
         command,

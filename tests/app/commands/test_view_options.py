@@ -124,9 +124,15 @@ def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(
     assert "none of 'names'" in refusal(capsys, "view", str(tmp_path / "dense"), "space=names")
 
 
-@pytest.mark.parametrize("option", ["host=::", "host=", "megabytes=2000", "photographs=-1", "port=-1", "error=0"])
-def test_values_out_of_range_are_refused(folder: Path, option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert f"{option.partition('=')[0]}: expected" in refusal(capsys, "view", str(folder / "features"), option)
+@pytest.mark.parametrize(
+    "option", ["host=::", "host=", "megabytes=0", "megabytes=2000", "photographs=-1", "port=-1", "error=0", "error=1"]
+)
+def test_values_out_of_range_are_refused(
+    folder: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Where a value is taken by mistake, a file ends and a server would not.
+    arguments = ["view", str(folder / "features"), f"out={tmp_path / 'a.html'}", option]
+    assert f"{option.partition('=')[0]}: expected" in refusal(capsys, *arguments)
 
 
 @pytest.fixture
