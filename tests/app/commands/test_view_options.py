@@ -17,7 +17,7 @@ from viewed_rooms import STUB, name_features, room_scene, save_viewed_room
 
 from gsencoder.app import cli
 from gsencoder.app.commands import view
-from gsencoder.fusion.store.folder import save_features
+from gsencoder.fusion.store.folder import WORDS_FILE, save_features
 from gsencoder.infer.viewer.container import Container, read_container
 from gsencoder.infer.viewer.page_scene import jpeg_of
 
@@ -118,9 +118,13 @@ def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(
     # Nobody said what is up; the cameras tell.
     np.testing.assert_allclose(scene.meta["up"], [0, 0, 1], atol=0.1)
     refused = refusal(
-        capsys, "view", str(tmp_path / "dense"), f"words={folder / 'features' / 'words'}", f"out={tmp_path / 'b.html'}"
+        capsys,
+        "view",
+        str(tmp_path / "dense"),
+        f"words={folder / 'features' / WORDS_FILE}",
+        f"out={tmp_path / 'b.html'}",
     )
-    assert "no text encoder" in refused or "words" in refused
+    assert "has no text encoder" in refused
     assert "none of 'names'" in refusal(capsys, "view", str(tmp_path / "dense"), "space=names")
 
 
