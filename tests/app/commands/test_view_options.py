@@ -17,9 +17,11 @@ from viewed_rooms import STUB, name_features, room_scene, save_viewed_room
 
 from gsencoder.app import cli
 from gsencoder.app.commands import view
-from gsencoder.fusion.store.folder import save_features
+from gsencoder.data.scenes import SceneConfig
+from gsencoder.fusion.store.folder import WORDS_FILE, save_features
 from gsencoder.infer.viewer.container import Container, read_container
 from gsencoder.infer.viewer.page_scene import jpeg_of
+from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow
 ROOM = room_scene()
@@ -118,9 +120,13 @@ def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(
     # Nobody said what is up; the cameras tell.
     np.testing.assert_allclose(scene.meta["up"], [0, 0, 1], atol=0.1)
     refused = refusal(
-        capsys, "view", str(tmp_path / "dense"), f"words={folder / 'features' / 'words'}", f"out={tmp_path / 'b.html'}"
+        capsys,
+        "view",
+        str(tmp_path / "dense"),
+        f"words={folder / 'features' / WORDS_FILE}",
+        f"out={tmp_path / 'b.html'}",
     )
-    assert "no text encoder" in refused or "words" in refused
+    assert "has no text encoder" in refused
     assert "none of 'names'" in refusal(capsys, "view", str(tmp_path / "dense"), "space=names")
 
 
@@ -175,6 +181,21 @@ def test_the_server_gets_the_scene_as_it_is_to_be_searched(
     assert served.closed
     first = capsys.readouterr().out.splitlines()[0]
     assert first.startswith("http://127.0.0.1:1/token/ shows ")
+
+
+def test_options_of_the_photographs_reach_their_scene(
+    folder: Path, served: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    load = view.load_scene
+
+    def loading(path: str, *, options: SceneConfig = SceneConfig()) -> Scene:
+        asked.append(options.max_views)
+        return load(path, options=replace(options, max_views=0))
+
+    monkeypatch.setattr(view, "load_scene", loading)
+    assert cli.main(["view", str(folder / "features"), f"photos={folder / 'room'}", "data.max_views=3"]) == 0
+    assert asked == [3]
 
 
 @pytest.mark.parametrize(
