@@ -115,7 +115,7 @@ def test_a_page_holds_all_up_to_its_last_byte_and_says_what_it_knows(search: Sce
     assert fitted(search, len(whole.page), 1).page == whole.page
     less = fitted(search, len(whole.page) - 1, 1)
     assert less.sh_degree == (0,)
-    assert f"megabytes= larger than {(len(whole.page) - 1) / 1e6:g} keeps them" in less.notes[0]
+    assert f"larger than {(len(whole.page) - 1) / 1e6:g} MB (megabytes=) keeps them" in less.notes[0]
     (scene,) = scenes_of(whole)
     assert scene.meta["objects"] == [each.name or "" for each in room_scene().objects]
     assert scene.meta["title"] == "t1"
@@ -140,7 +140,7 @@ def test_a_thinned_page_uses_most_of_its_size_whatever_was_asked_for(search: Sce
         assert any("megabytes= or max_gaussians= takes more" in note for note in made.notes)
     tight = fitted(search, len(whole.page), 0, max_gaussians=1500)
     assert tight.gaussians == (1500,)
-    with pytest.raises(InputError, match="not even 1,000 Gaussians fit beside the page itself, which takes 0.0;"):
+    with pytest.raises(InputError, match="not even 1,000 Gaussians fit beside the page itself, which takes 0.0 MB;"):
         fitted(search, len(whole.page) // 8, 0)
 
 
