@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from gsencoder.core.errors import InputError
 from gsencoder.evaluate.files.referring import compare_box_files
 from gsencoder.evaluate.result_table import table_of
 from gsencoder.evaluate.score_report import ScoreReport, spread
@@ -39,6 +40,8 @@ def score_referring(
     sentences, unscored = compare_box_files(
         predictions, truth, label_map=label_map, scans=scans, allow_missing=allow_missing
     )
+    if not sentences:
+        raise InputError(f"{truth}: nothing to score: it holds no sentence about an object with a box")
     scores = referring_scores(sentences, ks=ks)
     by_scene_name = defaultdict(list)
     for each in sentences:

@@ -5,6 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from gsencoder.core.errors import InputError
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.files.instances import match_instance_files
 from gsencoder.evaluate.files.recognition import read_recognition_truth, recognize_files
@@ -59,6 +60,11 @@ def score_instances(
         )
     )
     scores = instance_scores(matches, classes)
+    if not scores.truths.any():
+        raise InputError(
+            f"{truth}: nothing to score: no object of the {len(classes.names)} classes has {min_region} vertices or "
+            f"more in {len(matches)} scenes; compare its ids with those of classes="
+        )
     overall = _precisions(scores.overall)
     by_scene = [
         {"scene": each.scene, **_precisions(alone.overall), "truths": int(alone.truths.sum())}
@@ -71,6 +77,9 @@ def score_instances(
     ]
     groups = {f"ap_{group}": values.ap for group, values in scores.groups.items()}
     notes = [EQUAL_SCORES] if scores.equal_scores else []
+    others = sum(each.other_classes for each in matches)
+    if others:
+        notes.append(f"{others} masks have a class id that is none of the {len(classes.names)} that are scored.")
     if scores.shared:
         notes.append(
             f"{scores.shared} masks overlap several true objects by more than 0.25; AP at 0.25 depends on the order in "
@@ -84,6 +93,7 @@ def score_instances(
             "thresholds": [round(float(value), 2) for value in OVERLAPS],
             "truths": int(scores.truths.sum()),
             "predictions": int(scores.predictions.sum()),
+            "other_classes": others,
             "equal_scores": scores.equal_scores,
             **overall,
             **groups,
@@ -122,6 +132,11 @@ def score_semantics(
     """
     counts = list(count_label_files(predictions, truth, classes, scenes=scenes, raw_ids=raw_ids))
     scores = semantic_scores(counts, classes, excluded=excluded)
+    if not scores.vertices:
+        raise InputError(
+            f"{truth}: nothing to score: no vertex of {len(counts)} scenes has one of the {len(classes.names)} "
+            "classes; compare its ids with those of classes="
+        )
     overall = asdict(scores.overall) | _foreground(scores.foreground)
     by_scene = [
         {"scene": each.scene, **asdict(alone.overall), **_foreground(alone.foreground), "vertices": alone.vertices}
@@ -129,7 +144,11 @@ def score_semantics(
         for alone in (semantic_scores([each], classes, excluded=excluded),)
     ]
     by_class = [{"class": name, **asdict(values)} for name, values in scores.classes.items()]
-    notes = [f"f-: without {', '.join(scores.excluded)}."] if scores.excluded else []
+    notes = [f"Columns f_ leave out {', '.join(scores.excluded)}."] if scores.excluded else []
+    if scores.unlabeled:
+        notes.append(
+            f"{scores.unlabeled:,} of {scores.vertices:,} vertices that count are predicted as none of the classes."
+        )
     return ScoreReport(
         results={
             "protocol": "semantics",
@@ -172,6 +191,8 @@ def score_recognition(
     names = list(classes) or sorted({each.name for each in read_recognition_truth(truth)})
     instances, skipped = recognize_files(predictions, truth, names, allow_missing=allow_missing)
     scores = recognition_scores(instances, names, ks=ks)
+    if not instances:
+        raise InputError(f"{truth}: nothing to score: it holds no object of the {len(names)} classes")
     by_scene_name = defaultdict(list)
     for each in instances:
         by_scene_name[each.scene].append(each)

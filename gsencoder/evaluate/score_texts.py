@@ -43,12 +43,17 @@ def score_answer_files(
         InputError: files that cannot be used or that do not belong together.
     """
     questions = read_questions(truth)
+    if not questions:
+        raise InputError(f"{truth}: nothing to score: it holds no questions")
     answers = read_answer_predictions(predictions, questions)
     _refuse_missing([each.id for each in questions if each.id not in answers], "question", predictions, allow_missing)
     tools = None if java else "Java was not asked for (java=false)"
     scores = score_answers(questions, answers, tokens="auto" if java else "python", tools=tools)
     assert scores.sentences is not None
-    overall = _means(scores.overall) | _sentences(scores.sentences)
+    means = _means(scores.overall)
+    if "EM@10" in scores.absent:
+        means["em_10"] = math.nan
+    overall = means | _sentences(scores.sentences)
     by_scene = [{"scene": scene, "questions": means.count, **_means(means)} for scene, means in scores.by_scene.items()]
     by_kind = [{"kind": kind, "questions": means.count, **_means(means)} for kind, means in scores.by_kind.items()]
     notes = [f"{column} is absent: {reason}." for column, reason in scores.absent.items()]
@@ -95,16 +100,21 @@ def score_caption_files(
         method: name of the predictions' row in the table.
         min_iou: k of m@kIoU; captions of given objects have no boxes, and no k.
         java: whether METEOR is computed where Java is there.
-        allow_missing: count given objects without a caption as empty, instead of refusing the file.
+        allow_missing: count given objects without a caption, and the objects of scenes without any, as empty, instead
+            of refusing the file.
 
     Raises:
         InputError: files that cannot be used or that do not belong together.
     """
     objects = captioned_objects(read_scanrefer(truth))
+    if not objects:
+        raise InputError(f"{truth}: nothing to score: it holds no descriptions")
     captions = read_caption_predictions(predictions, objects)
     tools = None if java else "Java was not asked for (java=false)"
     boxes = [each for each in captions if isinstance(each, CaptionedBox)]
     if boxes:
+        silent = sorted({each.scene for each in objects} - {each.scene for each in boxes})
+        _refuse_missing(silent, "scene", predictions, allow_missing)
         scores = score_box_captions(objects, boxes, min_iou=min_iou, tools=tools)
     else:
         named = [each for each in captions if isinstance(each, NamedCaption)]

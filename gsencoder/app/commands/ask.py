@@ -213,6 +213,11 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
     out = config.out or Path("outputs") / asked.benchmark
     wanted = asked.scenes()
     folders = scene_folders(config.paths, wanted)
+    if not folders:
+        raise InputError(
+            f"questions: {config.questions} asks about {len(wanted)} scenes ({listed(sorted(wanted), 3)}), and none of "
+            f"them has features in {', '.join(config.paths)}"
+        )
     target, clock, screen = Path(os.path.realpath(out)), Clock(), console(config.quiet)
     answered: list[tuple[SetQuestion, dict[str, Any]]] = []
     silent: list[SetQuestion] = []
@@ -285,4 +290,4 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
             f"{sum(others.values())} questions about {len(others)} scenes without features were not asked: "
             f"{listed(sorted(others), 3)}"
         )
-    screen.print(f"{out}: {len(answered)} answers" + (f", {PREDICTIONS}" if server else ""))
+    screen.print(f"{out}: {len(answered)} " + (f"answers, {PREDICTIONS}" if server else f"requests, {REQUEST}"))

@@ -3,6 +3,8 @@
 Several processes (torchrun, SLURM) share the scenes: each writes the files of its own, and the first one scores all.
 """
 
+import warnings
+from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from gsencoder.app.commands.evaluate_sources import scenes_of
 from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.evaluate.benchmark_files import (
@@ -25,7 +27,8 @@ from gsencoder.evaluate.benchmark_files import (
 )
 from gsencoder.evaluate.files.class_files import load_classes, write_classes
 from gsencoder.evaluate.protocols.absent import names_of
-from gsencoder.evaluate.protocols.referring import ReferringProtocol
+from gsencoder.evaluate.protocols.instances import InstancesProtocol
+from gsencoder.evaluate.protocols.referring import ReferringProtocol, read_expressions
 from gsencoder.evaluate.protocols.semantics import classes_of
 from gsencoder.evaluate.sources import FeatureSource
 from gsencoder.text.build import Words
@@ -71,14 +74,52 @@ def run_benchmark(
         every = _from_all(done, process)
         if folder is None:
             return
+        others = _other_sentences(protocol, {scene.scene for scene in every})
         merge_lists(folder, protocol, parts=process.world_size)
         write_classes(folder / CLASS_IDS, classes)
         for scene in every:
             summary.add_seconds(scene.seconds)
-        report = score_written(folder, protocol, classes, "encoded" if config.weights else "fused")
+        report = score_written(folder, protocol, classes, _method(config))
         write_report(folder, report, summary)
+        if others:
+            summary.results["other_scenes"] = others
         summary.results["gaussians"] = {scene.scene: scene.gaussians for scene in every}
     print_report(out, report, quiet=config.quiet)
+
+
+def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str]) -> int:
+    """The number of sentences of a given file that are about scenes which are not evaluated.
+
+    Raises:
+        InputError: all of them are.
+
+    Warns:
+        SceneWarning: some are.
+    """
+    if not isinstance(protocol, ReferringProtocol) or not protocol.expressions:
+        return 0
+    asked = read_expressions(Path(protocol.expressions))
+    others = [each.scene for each in asked if each.scene not in scenes]
+    if len(others) == len(asked):
+        raise InputError(
+            f"protocol.expressions: none of the {len(asked)} sentences of {protocol.expressions} is about a scene that "
+            f"is evaluated ({listed(sorted(scenes), 3)}); first {listed(others, 1)}"
+        )
+    if others:
+        warnings.warn(
+            f"{len(others)} of {len(asked)} sentences do not count: they are about {len(set(others))} scenes that are "
+            f"not evaluated (first: {others[0]})",
+            SceneWarning,
+            stacklevel=2,
+        )
+    return len(others)
+
+
+def _method(config: EvaluateConfig) -> str:
+    """What the row of the table is called."""
+    if config.features:
+        return Path(config.features).resolve().name
+    return "encoded" if config.weights else "fused"
 
 
 def _from_first(folder: Path | None, process: ProcessRank) -> Path:
@@ -104,7 +145,7 @@ def _classes(config: EvaluateConfig) -> tuple[ClassTable, dict[str, str] | None]
         if config.label_map and not isinstance(config.protocol, ReferringProtocol):
             raise InputError("label_map: leads to the ids of a benchmark; give classes=scannet20 or classes=scannet200")
         return classes_of(names_of(scene for scene, _ in scenes_of(config))), None
-    classes = load_classes(config.classes)
+    classes = load_classes(config.classes, instances=isinstance(config.protocol, InstancesProtocol))
     if not config.label_map:
         return classes, None
     name_of = classes.name_of

@@ -159,7 +159,7 @@ def _instances(config: ScoreConfig) -> ScoreReport:
     return score_instances(
         Path(config.predictions),
         Path(config.truth),
-        load_classes(_given_classes(config)),
+        load_classes(_given_classes(config), instances=True),
         method=config.method,
         scenes=_split(config),
         raw_ids=_raw_ids(config),

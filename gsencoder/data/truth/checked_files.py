@@ -22,6 +22,8 @@ def check_file(path: Path, *, max_bytes: int = SCENE_BYTES) -> None:
         size = path.stat().st_size
         if path.is_dir():
             raise InputError(f"{path}: is a folder; expected a file")
+        if not path.is_file():
+            raise InputError(f"{path}: is no ordinary file")
         with path.open("rb") as stream:
             start = stream.read(4)
     except FileNotFoundError:

@@ -1,6 +1,7 @@
 """Text files with one whole number a line: labels of vertices, instances of truth, and masks, in ScanNet's formats."""
 
 import warnings
+from codecs import BOM_UTF8
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def read_whole_numbers(path: Path, *, hint: str = "") -> Int64[np.ndarray, " n"]
     Raises:
         InputError: unreadable, or a line that is no whole number.
     """
-    return _parsed(path, read_checked(path), hint)
+    return _parsed(path, read_checked(path).removeprefix(BOM_UTF8), hint)
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, " n"]:
@@ -36,7 +37,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, " n"]:
     Raises:
         InputError: as `read_whole_numbers`.
     """
-    data = read_checked(path)
+    data = read_checked(path).removeprefix(BOM_UTF8)
     # Lines of one digit, as nearly all masks have them, need no parser.
     codes = np.frombuffer(data if data.endswith(b"\n") else data + b"\n", np.uint8)
     digits, ends = codes[::2], codes[1::2]

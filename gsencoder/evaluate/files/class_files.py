@@ -14,17 +14,24 @@ from gsencoder.data.truth.label_sets import COLUMNS, scannet_classes
 MAX_CLASS_BYTES = 4 << 20
 
 
-def load_classes(classes: str) -> ClassTable:
+STUFF = ("wall", "floor")
+"""Classes of ScanNet's benchmarks that have labels and no instances."""
+
+
+def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
     """The classes of a benchmark, or of a file.
 
     Args:
         classes: scannet20, scannet200, or a CSV file with the columns id and name, and group where classes have groups.
+        instances: whether instances are scored: the benchmarks then leave out wall and floor, so that 18 and 198
+            classes remain. Those of a file are all scored.
 
     Raises:
         InputError: no such benchmark or file, or one that is not such a table.
     """
     if classes in COLUMNS:
-        return scannet_classes(classes)
+        every = scannet_classes(classes)
+        return every.without(STUFF) if instances else every
     path = Path(classes)
     if not path.is_file():
         raise InputError(

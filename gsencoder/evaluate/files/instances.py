@@ -100,7 +100,10 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
             hint = "; predictions and truth may be swapped" if len(words) == 1 else ""
             raise InputError(f"{where}: expected a mask file, a class id and a score, got {line[:60]!r}{hint}")
         file = PurePosixPath(words[0])
-        mask_path = (path.parent / file).resolve()
+        try:
+            mask_path = (path.parent / file).resolve()
+        except (OSError, RuntimeError) as error:
+            raise InputError(f"{where}: the mask {words[0][:80]!r} cannot be read: {error}") from error
         if file.is_absolute() or not mask_path.is_relative_to(path.parent.resolve()):
             raise InputError(f"{where}: the mask {words[0][:80]!r} is not below {path.parent}")
         if mask_path in first:

@@ -47,6 +47,7 @@ class SceneMatches:
         predictions: numbers of predictions that count, by class.
         scores: of these predictions.
         shared: number of these predictions that are above the lowest threshold with several truths.
+        other_classes: number of predictions whose class is not scored.
         rows: class of each outcome; those of ignored predictions are left out.
         thresholds: index in `OVERLAPS` of each outcome.
         hits: whether it is a match, or a false positive.
@@ -59,6 +60,7 @@ class SceneMatches:
     predictions: Int64[np.ndarray, " C"]
     scores: Float64[np.ndarray, " n"]
     shared: int
+    other_classes: int
     rows: Int64[np.ndarray, " K"]
     thresholds: Int64[np.ndarray, " K"]
     hits: Bool[np.ndarray, " K"]
@@ -109,6 +111,7 @@ def match_instances(
     void = instance_rows < 0
     instance_rows = np.where(ids == 0, -1, instance_rows)
     counted = (instance_rows >= 0) & (ids >= IDS_PER_CLASS) & (sizes >= min_region)
+    other_classes = int((rows < 0).sum())
     kept = np.flatnonzero((rows >= 0) & (np.diff(prediction.offsets) >= min_region))
     rows, scores, areas = rows[kept], prediction.scores[kept], np.diff(prediction.offsets)[kept]
     common = np.zeros((len(kept), len(ids)), np.int64)
@@ -135,6 +138,7 @@ def match_instances(
         predictions=np.bincount(rows, minlength=number),
         scores=scores,
         shared=int((multiple > 1).sum()),
+        other_classes=other_classes,
         rows=rows[of_instance],
         thresholds=np.repeat(np.arange(len(OVERLAPS)), [len(owners) for owners, _, _ in outcomes]),
         hits=hits,

@@ -62,6 +62,14 @@ def test_answers_are_scored_by_question_kind_and_scene(tmp_path: Path) -> None:
         assert [row["question_id"] for row in csv.DictReader(stream)] == ["q0", "q1", "q2"]
 
 
+def test_the_best_of_ten_is_absent_where_no_question_has_several_answers(tmp_path: Path) -> None:
+    first = {name: given[:1] for name, given in ANSWERS.items()}
+    assert cli.main([*answer_files(tmp_path, first), f"out={tmp_path / 'out'}", "quiet=true"]) == 0
+    results = results_of(tmp_path / "out")
+    assert "EM@10" in results["absent"]
+    assert results["em_10"] is None
+
+
 def test_columns_of_other_tokens_do_not_stand_under_those_of_papers(tmp_path: Path) -> None:
     assert cli.main([*answer_files(tmp_path, ANSWERS), f"out={tmp_path / 'out'}", "quiet=true"]) == 0
     with (tmp_path / "out" / "table.csv").open(newline="") as stream:
