@@ -23,7 +23,7 @@ def add_questions(sheet: AnswerSheet, questions: Iterable[Question]) -> None:
     Of questions that `gsencoder questions` made, "Is there …" needs any one of the objects, the others all.
     """
     for each in questions:
-        text = f"{each.situation} {each.text}" if each.situation else each.text
+        text = each.situated_text
         sheet.facts[each.scene, text.strip()] = Fact(
             answer=each.answers[0], needed=each.object_ids, any_of=kind_of(each) == "is_there"
         )

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.commands.query_words import asked_scene, load_words
+from gsencoder.app.commands.asker import load_asker
 from gsencoder.app.commands.question_scenes import localized_captions, photos_of, scene_folders
-from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import printable
 from gsencoder.app.runs.progress import Progress, console
@@ -20,7 +19,6 @@ from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question
 from gsencoder.infer.ask.batch import ANSWER, ANSWERS, PROMPT, REQUEST, ask_question, ask_questions, write_answers
 from gsencoder.infer.ask.predictions import predictions
@@ -28,9 +26,9 @@ from gsencoder.infer.ask.prompts import Task, check_question
 from gsencoder.infer.ask.question_sets import QuestionSet, SetQuestion, is_question_set, read_question_set
 from gsencoder.infer.ask.questions import BatchQuestion, read_questions
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
-from gsencoder.infer.localize.localize import LocalizeConfig, select_features
+from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.text.build import TableTextConfig, TextConfig
 
 PREDICTIONS = "predictions.json"
 
@@ -146,33 +144,6 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
     if server is not None:
         screen.print(printable(row["answer"]), soft_wrap=True)
     screen.print(f"{out}: {len(row['views'])} pictures, {PROMPT}, {REQUEST}" + (f", {ANSWER}" if server else ""))
-
-
-def load_asker(config: AskCommandConfig, folder: Path, photos: str) -> Asker:
-    """The scene of a folder of features, and what is asked about it is looked up with.
-
-    A box can be asked about without words.
-    """
-    scene = shown_scene(folder, photos, config.data)
-    words: Words | None
-    if config.head:
-        scene, words = asked_scene(
-            scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
-        )
-    else:
-        space = select_features(scene, config.space or None)[1].space
-        stated = config.words or not isinstance(config.text, TableTextConfig)
-        known = stated or table_path(folder, space.text_encoder) is not None
-        words = load_words(folder, space, config.words, config.text) if known else None
-    return Asker(
-        scene,
-        words,
-        space=None if config.head else config.space or None,
-        config=config.ask,
-        localization=config.localize,
-        views=config.choose,
-        vlm=config.vlm,
-    )
 
 
 def made_from(config: AskCommandConfig) -> dict[str, Any]:

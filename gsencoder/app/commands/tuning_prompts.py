@@ -10,7 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.commands.query_words import asked_scene, load_words
+from gsencoder.app.commands.asker import asker_of
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, about, listed
 from gsencoder.core.files.atomic import lock_folder
@@ -20,13 +20,12 @@ from gsencoder.data.prompt_store import PROMPTS_FILE, PromptStore
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.truth.questions import Question as TruthQuestion
 from gsencoder.data.truth.questions import read_questions
-from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.ask.stored_prompts import store_prompt
 from gsencoder.infer.localize.localize import LocalizeConfig, select_features
 from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.text.build import TextConfig
 from gsencoder.train.tuning.samples import TuningPair
 from gsencoder.train.tuning.towers import TowerLayout
 from gsencoder.types import GaussianFeatures
@@ -205,18 +204,13 @@ def prompt_keys(questions: Sequence[TruthQuestion], features: Path, photos: str,
     for name in {each.scene for each in questions}:
         folders = [features / name, *([Path(photos) / name] if photos else [])]
         scenes[name] = [_state(folder) for folder in folders]
-    return [
-        sha256(json.dumps([_text(each), scenes[each.scene], of_recipe]).encode()).hexdigest()[:32] for each in questions
-    ]
+    made_from = ([each.situated_text, scenes[each.scene], of_recipe] for each in questions)
+    return [sha256(json.dumps(values).encode()).hexdigest()[:32] for values in made_from]
 
 
 def _state(folder: Path) -> list[list[Any]]:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return [[str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns] for path in files]
-
-
-def _text(question: TruthQuestion) -> str:
-    return f"{question.situation} {question.text}" if question.situation else question.text
 
 
 def _asker(folder: Path, photos: str, recipe: PromptRecipe) -> tuple[Asker, GaussianFeatures | None]:
@@ -226,26 +220,7 @@ def _asker(folder: Path, photos: str, recipe: PromptRecipe) -> tuple[Asker, Gaus
     if recipe.tokens:
         with about(f"tokens={recipe.tokens}"):
             given = select_features(scene, recipe.tokens)[1]
-    words: Words | None
-    if recipe.head:
-        scene, words = asked_scene(
-            scene, folder, head=recipe.head, space=recipe.space, given=recipe.words, text=recipe.text
-        )
-    else:
-        space = select_features(scene, recipe.space or None)[1].space
-        stated = recipe.words or not isinstance(recipe.text, TableTextConfig)
-        known = stated or table_path(folder, space.text_encoder) is not None
-        words = load_words(folder, space, recipe.words, recipe.text) if known else None
-    asker = Asker(
-        scene,
-        words,
-        space=None if recipe.head else recipe.space or None,
-        config=recipe.ask,
-        localization=recipe.localize,
-        views=recipe.choose,
-        vlm=recipe.vlm,
-    )
-    return asker, given
+    return asker_of(recipe, scene, folder), given
 
 
 def _store(
@@ -264,7 +239,7 @@ def _store(
             store,
             key,
             asker,
-            Question(text=_text(question)),
+            Question(text=question.situated_text),
             features=features,
             grid=(1, 1) if layout is None else layout.grid,
             fit="stretch" if layout is None else layout.fit,

@@ -63,6 +63,11 @@ class Question:
     position: Corner | None = None
     rotation: tuple[float, float, float, float] | None = None
 
+    @property
+    def situated_text(self) -> str:
+        """What is asked of a model: the situation, where there is one, and then the question."""
+        return f"{self.situation} {self.text}" if self.situation else self.text
+
 
 def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question, ...]:
     """Reads ScanQA's file or SQA3D's file of questions, by what is in it.

@@ -27,78 +27,67 @@ NO_TRUE_BOX = "the object has no box in the truth"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReferredObject:
-    """The truth of one sentence.
+class Sentence:
+    """Which sentence something is about.
 
     Attributes:
         scene: name of its scene.
-        object: id of the object.
-        annotation: number of the sentence about it.
+        object: id of the object that it means.
+        annotation: number of the sentence about this object.
+    """
+
+    scene: str
+    object: str
+    annotation: str
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return self.scene, self.object, self.annotation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferredObject(Sentence):
+    """The truth of one sentence.
+
+    Attributes:
         box: lower and upper corner; None if the object has none, and the sentence is not scored.
         multiple: whether its scene has several objects of its class; None if that is not known.
         others: whether its class is none of the named ones; None if that is not known.
     """
 
-    scene: str
-    object: str
-    annotation: str
     box: Float64[np.ndarray, "2 3"] | None
     multiple: bool | None = None
     others: bool | None = None
 
-    @property
-    def key(self) -> tuple[str, str, str]:
-        return self.scene, self.object, self.annotation
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PredictedBoxes:
+class PredictedBoxes(Sentence):
     """The boxes predicted for one sentence.
 
     Attributes:
-        scene: name of its scene.
-        object: id of the object that it is about.
-        annotation: number of the sentence about it.
         boxes: lower and upper corners, the likeliest box first; none where there is none.
         multiple: what the prediction's file says of the truth's `multiple`, as ScanRefer's own files do.
         others: the same of `others`.
     """
 
-    scene: str
-    object: str
-    annotation: str
     boxes: Float64[np.ndarray, "K 2 3"]
     multiple: bool | None = None
     others: bool | None = None
 
-    @property
-    def key(self) -> tuple[str, str, str]:
-        return self.scene, self.object, self.annotation
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReferringResult:
+class ReferringResult(Sentence):
     """One sentence, scored.
 
     Attributes:
-        scene: name of its scene.
-        object: id of the object.
-        annotation: number of the sentence about it.
         ious: of the predicted boxes with that of the object, in the order of the predictions.
         multiple: whether its scene has several objects of its class; None if that is not known.
         others: whether its class is none of the named ones; None if that is not known.
     """
 
-    scene: str
-    object: str
-    annotation: str
     ious: tuple[float, ...]
     multiple: bool | None
     others: bool | None
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        return self.scene, self.object, self.annotation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -130,13 +130,12 @@ def _check_task(path: Path, what: str, task: Task, allowed: Sequence[str]) -> No
 
 
 def _answered(question: TruthQuestion) -> SetQuestion:
-    text, keys = question.text, {"scene_id": question.scene, "question_id": question.id}
+    keys = {"scene_id": question.scene, "question_id": question.id}
     if question.situation:
-        text = f"{question.situation} {text}"
         keys |= {"situation": question.situation, "question": question.text}
     return SetQuestion(
         scene=question.scene,
-        asked=BatchQuestion(id=question.id, question=Question(text=text)),
+        asked=BatchQuestion(id=question.id, question=Question(text=question.situated_text)),
         keys=keys,
     )
 
