@@ -23,6 +23,7 @@ from gsencoder.app.commands import COMMANDS, Command
 from gsencoder.app.runs.printable import clipped, one_line, printable
 from gsencoder.app.settings.options import near, without_value
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.runtime.process_rank import refuse_several
 from gsencoder.core.runtime.signals import Stopped, stop_of
 
 FLAGS = {
@@ -181,6 +182,9 @@ def _run(command: Command, config: Any, debug: bool) -> None:
     from gsencoder.app.runs.summary import Summary
     from gsencoder.app.settings.config import check_required, settings
 
+    if not command.several:
+        together = ", ".join(each.name for each in COMMANDS.values() if each.several)
+        refuse_several(command.name, f"start it once; {together} are the commands that processes run together")
     cls, run = command.load()
     check_required(cls, config)
     given = settings(config)

@@ -15,7 +15,7 @@ from gsencoder.evaluate.score_report import ScoreReport, spread
 from gsencoder.evaluate.scores.instance_matches import MIN_REGION, OVERLAPS
 from gsencoder.evaluate.scores.instances import InstanceAverages, instance_scores
 from gsencoder.evaluate.scores.recognition import recognition_scores
-from gsencoder.evaluate.scores.semantics import BACKGROUND, SemanticAverages, semantic_scores
+from gsencoder.evaluate.scores.semantics import BACKGROUND, SemanticAverages, check_excluded, semantic_scores
 
 EQUAL_SCORES = (
     "All predictions have one score, so that their ranking is undefined, and average precision is that of one step."
@@ -130,6 +130,7 @@ def score_semantics(
     Raises:
         InputError: files that cannot be used or that do not belong together.
     """
+    check_excluded(excluded, classes)
     counts = list(count_label_files(predictions, truth, classes, scenes=scenes, raw_ids=raw_ids))
     scores = semantic_scores(counts, classes, excluded=excluded)
     if not scores.vertices:

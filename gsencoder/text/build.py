@@ -33,6 +33,16 @@ def closed_table(words: Words) -> TextTable:
     return words.table if isinstance(words, OpenVocabulary) else words
 
 
+def check_known(words: Words, names: Sequence[str]) -> None:
+    """Checks that words know names, before there is work with them; with a tower they know all.
+
+    Raises:
+        InputError: names that are not in a table without a tower.
+    """
+    if not isinstance(words, OpenVocabulary):
+        words.encode(names)
+
+
 def load_tower(config: TowerConfig) -> TextTower:
     """The tower of a folder.
 

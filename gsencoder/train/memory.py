@@ -13,12 +13,12 @@ from torch import nn
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import plain
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.memory.attention import MemoryAttention, random_projection
 from gsencoder.memory.decoders import Decoder, make_decoder
 from gsencoder.memory.queries import principal_queries
 from gsencoder.train.checkpoint import TrainingState
-from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.memory_network import MemoryConfig, MemoryNetwork, MemoryObjective, ViewSamples, join_views
 from gsencoder.train.memory_scene import MemoryScene
 from gsencoder.train.render_rows import sample_rows

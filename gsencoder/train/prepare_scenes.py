@@ -13,6 +13,7 @@ from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files.json_values import plain
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -27,7 +28,7 @@ from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.models.output_space import check_distinct
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
-from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together
+from gsencoder.train.distributed import check_agreement, fail_together
 from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PrepareConfig, PreparedDataset
 from gsencoder.types import Scene
 

@@ -13,6 +13,7 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.heads.store import heads_digest
 from gsencoder.fusion.teachers.build import words_by_teacher
@@ -25,7 +26,7 @@ from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, check_same_teachers
 from gsencoder.train.crops import SamplingConfig
 from gsencoder.train.distill import encoder_trainer
-from gsencoder.train.distributed import ProcessRank, check_agreement, fail_together, join_processes
+from gsencoder.train.distributed import check_agreement, fail_together, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes

@@ -21,10 +21,11 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import Log
 from gsencoder.core.runtime.device import autocast_dtype
 from gsencoder.core.runtime.device_names import Precision
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.signals import defer_signals, stop_of
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.distributed import STOPPED_ELSEWHERE, ProcessRank, fail_together, sum_over_processes
+from gsencoder.train.distributed import STOPPED_ELSEWHERE, fail_together, sum_over_processes
 from gsencoder.train.samples import StepSampler
 
 CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")

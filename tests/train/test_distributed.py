@@ -1,4 +1,4 @@
-"""Who a process is, as its environment tells."""
+"""Processes of one launcher: their devices, and what they do together."""
 
 import os
 import subprocess
@@ -9,24 +9,10 @@ import pytest
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.train.distributed import (
-    ProcessRank,
-    check_agreement,
-    fail_together,
-    first_host,
-    gpu_index,
-    join_processes,
-    rank_from_environment,
-)
+from gsencoder.core.runtime.process_rank import ProcessRank, rank_from_environment
+from gsencoder.train.distributed import check_agreement, fail_together, gpu_index, join_processes
 
-SLURM = {
-    "SLURM_STEP_ID": "0",
-    "SLURM_PROCID": "5",
-    "SLURM_NTASKS": "8",
-    "SLURM_LOCALID": "1",
-    "SLURM_STEP_NODELIST": "gpu[03-04]",
-    "SLURM_JOB_ID": "123456",
-}
+SLURM_TASK = {"SLURM_STEP_ID": "0", "SLURM_NTASKS": "8", "SLURM_LOCALID": "1", "SLURM_STEP_NODELIST": "gpu[03-04]"}
 
 
 def test_without_a_launcher_there_is_one_process() -> None:
@@ -36,57 +22,15 @@ def test_without_a_launcher_there_is_one_process() -> None:
         assert device.type == "cpu"
 
 
-def test_torchrun_tells_rank_and_size() -> None:
-    process, meeting = rank_from_environment({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"})
-    assert (process.rank, process.world_size, process.local_rank, process.is_first) == (3, 4, 1, False)
-    assert meeting == "env://"
-
-
-def test_slurm_tells_rank_and_size_and_where_to_meet() -> None:
-    process, meeting = rank_from_environment(SLURM)
-    assert (process.rank, process.world_size, process.local_rank) == (5, 8, 1)
-    assert meeting == "tcp://gpu03:23456"
-
-
 @pytest.mark.parametrize(
     ("environment", "visible", "gpu"),
-    [(SLURM, 1, 0), (SLURM, 8, 1), ({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"}, 1, 1)],
+    [(SLURM_TASK, 1, 0), (SLURM_TASK, 8, 1), ({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"}, 1, 1)],
 )
 def test_a_task_of_slurm_that_sees_one_gpu_takes_it(
     environment: dict[str, str], visible: int, gpu: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: visible)
     assert gpu_index(*rank_from_environment(environment)) == gpu
-
-
-def test_an_address_that_is_given_is_taken() -> None:
-    assert rank_from_environment({**SLURM, "MASTER_ADDR": "h", "MASTER_PORT": "9"})[1] == "tcp://h:9"
-
-
-def test_a_batch_script_itself_is_one_process() -> None:
-    environment = {name: value for name, value in SLURM.items() if name != "SLURM_STEP_ID"}
-    assert rank_from_environment(environment) == (ProcessRank(), "")
-
-
-@pytest.mark.parametrize(
-    ("nodes", "host"),
-    [("a", "a"), ("a,b", "a"), ("a[1,3]", "a1"), ("a[001-200]", "a001"), ("n[2-3].x.org,m", "n2.x.org")],
-)
-def test_the_first_machine_of_a_list(nodes: str, host: str) -> None:
-    assert first_host(nodes) == host
-
-
-@pytest.mark.parametrize(
-    ("environment", "message"),
-    [
-        ({"RANK": "4", "WORLD_SIZE": "4"}, "RANK=4 is not below WORLD_SIZE=4"),
-        ({"RANK": "x", "WORLD_SIZE": "4"}, "RANK: expected a whole number"),
-        ({**SLURM, "SLURM_STEP_NODELIST": ""}, "node list"),
-    ],
-)
-def test_an_environment_that_contradicts_itself_is_refused(environment: dict[str, str], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        rank_from_environment(environment)
 
 
 def test_a_device_that_is_not_there_is_refused(no_gpu: None) -> None:

@@ -14,6 +14,7 @@ from joint_training import DenseTeacher
 from training_scenes import LOSSES, SMALL, SideTeacher, prepared
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import save_heads
@@ -22,7 +23,6 @@ from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train import run
-from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.run import TrainConfig, fit
 from gsencoder.train.samples import SampleDataset

@@ -22,6 +22,7 @@ from training_scenes import (
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.archive import first_difference
 from gsencoder.core.files.step_log import LOG_FILE, read_log
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.palette import PaletteConfig
@@ -35,7 +36,6 @@ from gsencoder.train.checkpoint import (
 )
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.distill import Distillation, encoder_trainer
-from gsencoder.train.distributed import ProcessRank
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
 from gsencoder.train.run import TrainConfig, resume_settings, train

@@ -16,11 +16,13 @@ class Command:
         name: as the user types it; `gsencoder.app.commands.NAME` is its module.
         config: the name of the settings class in that module.
         help: its purpose, one line.
+        several: whether several processes of one launcher (torchrun, SLURM) can run it together.
     """
 
     name: str
     config: str
     help: str
+    several: bool = False
 
     def load(self) -> tuple[type[CommonConfig], Callable[[Any, Any], None]]:
         """The settings class and `run(config, summary)`."""
@@ -38,18 +40,28 @@ COMMANDS = {
             name="reconstruct",
             config="ReconstructCommandConfig",
             help="make a splat from photographs, with or without poses",
+            several=True,
         ),
         Command(
-            name="fuse", config="FuseCommandConfig", help="lift a teacher's feature maps onto the Gaussians of a scene"
+            name="fuse",
+            config="FuseCommandConfig",
+            help="lift a teacher's feature maps onto the Gaussians of a scene",
+            several=True,
         ),
         Command(
             name="memory",
             config="MemoryCommandConfig",
             help="remember the features of several teachers in a few channels a Gaussian, and a bank",
+            several=True,
         ),
-        Command(name="train", config="TrainCommandConfig", help="distil a teacher into an encoder of splats"),
         Command(
-            name="encode", config="EncodeCommandConfig", help="compute features of a splat with an encoder, in one pass"
+            name="train", config="TrainCommandConfig", help="distil a teacher into an encoder of splats", several=True
+        ),
+        Command(
+            name="encode",
+            config="EncodeCommandConfig",
+            help="compute features of a splat with an encoder, in one pass",
+            several=True,
         ),
         Command(
             name="pack", config="PackConfig", help="store features in a few bytes a Gaussian, or for other programs"
@@ -87,8 +99,9 @@ COMMANDS = {
             name="tune",
             config="TuneCommandConfig",
             help="train adapters of a vision-language model on questions about scenes and their answers",
+            several=True,
         ),
-        Command(name="evaluate", config="EvaluateConfig", help="compute metrics on labeled scenes"),
+        Command(name="evaluate", config="EvaluateConfig", help="compute metrics on labeled scenes", several=True),
         Command(
             name="score",
             config="ScoreConfig",

@@ -1,6 +1,5 @@
 """`gsencoder evaluate SCENE… protocol=…`: a metric on labeled scenes, of fused features or of an encoder's."""
 
-import os
 from pathlib import Path
 
 from gsencoder.app.commands.evaluate_protocols import absent, grounding, localization, naming
@@ -10,7 +9,7 @@ from gsencoder.app.commands.evaluate_sources import source_of_head, stored_featu
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.process_rank import refuse_several
 from gsencoder.evaluate.benchmark_files import BenchmarkProtocol
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,
@@ -19,13 +18,15 @@ from gsencoder.evaluate.protocols.grounding import (
     GroundingProtocol,
 )
 from gsencoder.evaluate.protocols.naming import NamingProtocol
-from gsencoder.train.distributed import rank_from_environment
 
 __all__ = ["EvaluateConfig", "run"]
 
 
 def run(config: EvaluateConfig, summary: Summary) -> None:
     """Evaluates, prints the scores, and writes them with one row for each object, name or class."""
+    if not isinstance(config.protocol, BenchmarkProtocol):
+        advice = "start it once; recognition, instances, semantics and referring are what processes share the scenes of"
+        refuse_several(f"protocol={config.protocol.name}", advice)
     if config.features:
         source, words = stored_features(config)
     else:
@@ -36,11 +37,6 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
 
         run_benchmark(config, config.protocol, source, words, out, summary)
         return
-    if rank_from_environment(os.environ)[0].world_size > 1:
-        raise InputError(
-            f"protocol={config.protocol.name}: runs in one process; recognition, instances, semantics and referring "
-            "share the scenes of several"
-        )
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         if isinstance(config.protocol, NamingProtocol):
             naming(config, config.protocol, source, words, folder, summary)

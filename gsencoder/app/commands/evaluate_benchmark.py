@@ -15,7 +15,9 @@ from gsencoder.app.commands.evaluate_sources import scenes_of
 from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
-from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.errors import InputError, SceneWarning, about, advised, listed
+from gsencoder.core.runtime.process_rank import ProcessRank
+from gsencoder.data.scenes import find_scenes, scene_name
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.evaluate.benchmark_files import (
@@ -29,10 +31,11 @@ from gsencoder.evaluate.files.class_files import load_classes, write_classes
 from gsencoder.evaluate.protocols.absent import names_of
 from gsencoder.evaluate.protocols.instances import InstancesProtocol
 from gsencoder.evaluate.protocols.referring import ReferringProtocol, read_expressions
-from gsencoder.evaluate.protocols.semantics import classes_of
+from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
+from gsencoder.evaluate.scores.semantics import check_excluded
 from gsencoder.evaluate.sources import FeatureSource
-from gsencoder.text.build import Words
-from gsencoder.train.distributed import ProcessRank, fail_together, join_processes
+from gsencoder.text.build import Words, check_known
+from gsencoder.train.distributed import fail_together, join_processes
 
 CLASS_IDS = "class_ids.csv"
 """The classes of a benchmark, as `score` takes them."""
@@ -53,6 +56,9 @@ def run_benchmark(
             if process.is_first:
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
             classes, class_names = _classes(config)
+            _check_names(protocol, classes, words)
+            named = {scene_name(path) for path in find_scenes(config.paths)}
+            others = _other_sentences(protocol, named, warn=process.is_first)
             raw_ids = None
             if isinstance(protocol, ReferringProtocol) and config.label_map:
                 raw_ids = read_label_map(Path(config.label_map), COLUMNS["scannet20"])
@@ -74,7 +80,6 @@ def run_benchmark(
         every = _from_all(done, process)
         if folder is None:
             return
-        others = _other_sentences(protocol, {scene.scene for scene in every})
         merge_lists(folder, protocol, parts=process.world_size)
         write_classes(folder / CLASS_IDS, classes)
         for scene in every:
@@ -87,7 +92,21 @@ def run_benchmark(
     print_report(out, report, quiet=config.quiet)
 
 
-def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str]) -> int:
+def _check_names(protocol: BenchmarkProtocol, classes: ClassTable, words: Words) -> None:
+    """Checks, before any scene is read, that names in settings are classes and that the words know all classes.
+
+    Raises:
+        InputError: a name is no class, or no word of a table without a tower.
+    """
+    if isinstance(protocol, SemanticsProtocol):
+        with about("protocol"):
+            check_excluded(protocol.excluded, classes)
+    if not isinstance(protocol, ReferringProtocol):
+        with advised("give words that know all classes, or the classes that they know as classes=FILE"):
+            check_known(words, classes.names)
+
+
+def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str], *, warn: bool) -> int:
     """The number of sentences of a given file that are about scenes which are not evaluated.
 
     Raises:
@@ -105,7 +124,7 @@ def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str]) -> in
             f"protocol.expressions: none of the {len(asked)} sentences of {protocol.expressions} is about a scene that "
             f"is evaluated ({listed(sorted(scenes), 3)}); first {listed(others, 1)}"
         )
-    if others:
+    if others and warn:
         warnings.warn(
             f"{len(others)} of {len(asked)} sentences do not count: they are about {len(set(others))} scenes that are "
             f"not evaluated (first: {others[0]})",

@@ -7,6 +7,7 @@ from gsencoder.app.commands.evaluate_settings import EvaluateConfig
 from gsencoder.app.commands.evaluate_sources import scenes_of
 from gsencoder.app.commands.evaluated_features import stored_memory
 from gsencoder.app.runs.summary import Summary
+from gsencoder.core.errors import about
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.evaluate.grounding import grounding_scores
@@ -34,7 +35,7 @@ from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming,
 from gsencoder.evaluate.sources import (
     FeatureSource,
 )
-from gsencoder.text.build import Words
+from gsencoder.text.build import Words, check_known
 from gsencoder.types import QueryMemory, Scene
 
 
@@ -87,6 +88,8 @@ def absent(
     folder: Path,
     summary: Summary,
 ) -> None:
+    with about("protocol.vocabulary"):
+        check_known(words, protocol.vocabulary)
     vocabulary = protocol.vocabulary or names_of(scene for scene, _ in scenes_of(config))
     scenes = evaluate_absent(
         scenes_of(config),

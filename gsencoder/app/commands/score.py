@@ -82,7 +82,7 @@ class ScoreConfig(CommonConfig):
         metadata={"help": "of instances: smallest number of vertices of a true object and of a mask that count"},
     )
     excluded: tuple[str, ...] = field(
-        default=BACKGROUND, metadata={"help": "of semantics: classes that are not of the foreground"}
+        default=BACKGROUND, metadata={"names": True, "help": "of semantics: classes that are not of the foreground"}
     )
     ks: tuple[int, ...] = field(
         default=(1, 5),

@@ -27,7 +27,7 @@ from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.tuning.run import TuneConfig, open_processor, save_tuned, tune
-from gsencoder.train.tuning.vlm import SERVED_FOLDER, check_peft, link_served
+from gsencoder.train.tuning.vlm import SERVED_FOLDER, check_peft, check_targets, link_served
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,7 +128,8 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
             raise InputError(f"prepared={prepared}: is in the folder of {name}, {taken}; give another folder")
     questions = read_dataset(Path(config.paths[0]), config.split, config.scenes)
     model, features = find_file(config.model, "model", folder=True), Path(config.features)
-    _, _, layout = open_processor(model, with_tokens=bool(config.tokens))
+    stated, _, layout = open_processor(model, with_tokens=bool(config.tokens))
+    check_targets(stated, config.lora.targets)
     recipe = PromptRecipe(
         words=config.words,
         space=config.space,

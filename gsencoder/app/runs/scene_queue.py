@@ -13,6 +13,7 @@ from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.summary import SUMMARY_NAME, Summary
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.json_values import plain
+from gsencoder.core.runtime.process_rank import refuse_several
 from gsencoder.data.scenes import check_names, scene_name
 
 NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device")
@@ -51,10 +52,12 @@ def run_scenes(
         screen: for lines about scenes that are skipped.
 
     Raises:
-        InputError: two scenes have one name, the error of the only scene, or some of several failed.
+        InputError: two scenes have one name, the error of the only scene, several processes for it, or some of several
+            scenes failed.
     """
     check_names(paths)
     if len(paths) == 1:
+        refuse_several(f"{paths[0]}", "start it once, or give several scenes, which processes share")
         name = scene_name(paths[0])
         run(paths[0], out or Path("outputs") / name / part, summary)
         return

@@ -36,7 +36,8 @@ class AbsentProtocol:
 
     name: Literal["absent"] = "absent"
     vocabulary: tuple[str, ...] = field(
-        default=(), metadata={"help": "names that may be absent; empty = the names of all scenes' objects"}
+        default=(),
+        metadata={"names": True, "help": "names that may be absent; empty = the names of all scenes' objects"},
     )
     min_views: int = field(
         default=5, metadata={"help": "smallest number of views in which an object must be seen to be present"}

@@ -40,7 +40,7 @@ class SemanticsProtocol:
         },
     )
     excluded: tuple[str, ...] = field(
-        default=tuple(sorted(BACKGROUND)), metadata={"help": "classes that f-mIoU leaves out"}
+        default=tuple(sorted(BACKGROUND)), metadata={"names": True, "help": "classes that f-mIoU leaves out"}
     )
 
     def __post_init__(self) -> None:

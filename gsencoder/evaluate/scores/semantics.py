@@ -17,11 +17,12 @@ Vertices of these still count as wrong where they are predicted as another class
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 from jaxtyping import Int64
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, listed
 from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.scores.means import mean_of
@@ -133,6 +134,21 @@ def count_labels(
     )
 
 
+def check_excluded(excluded: Collection[str], classes: ClassTable) -> None:
+    """Checks that what is to be left out of the foreground are classes. Names of `BACKGROUND` may be none.
+
+    Raises:
+        InputError: a name is no class.
+    """
+    unknown = [name for name in excluded if name not in classes.names and name not in BACKGROUND]
+    if unknown:
+        near = get_close_matches(unknown[0], classes.names, n=1)
+        raise InputError(
+            f"excluded: {unknown[0][:60]!r} is none of the {len(classes.names)} classes"
+            + (f"; did you mean {near[0]}?" if near else f" ({listed(classes.names)})")
+        )
+
+
 def semantic_scores(
     counts: Sequence[LabelCounts], classes: ClassTable, *, excluded: Collection[str] = BACKGROUND
 ) -> SemanticScores:
@@ -154,10 +170,7 @@ def semantic_scores(
     number = len(classes.names)
     if any(scene.confusion.shape != (number, number + 1) for scene in counts):
         raise InputError("semantics: the scenes were counted with different classes")
-    unknown = [name for name in excluded if name not in classes.names and name not in BACKGROUND]
-    if unknown:
-        raise InputError(f"semantics: cannot exclude {unknown[0]!r}, which is no class")
-
+    check_excluded(excluded, classes)
     confusion = np.sum([scene.confusion for scene in counts], axis=0)
     right = np.diagonal(confusion)
     truths, predictions = confusion.sum(axis=1), confusion[:, :number].sum(axis=0)

@@ -14,10 +14,11 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.pretrained import load_pretrained
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.prompt_store import PromptStore
 from gsencoder.train.checkpoint import TrainingState
-from gsencoder.train.distributed import ProcessRank, check_agreement
+from gsencoder.train.distributed import check_agreement
 from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig
 from gsencoder.train.tuning.network import AnswerObjective, TunedVlm
 from gsencoder.train.tuning.samples import PairSamples, TuningPair, join_pairs

@@ -133,6 +133,25 @@ def load_adapted(
         return peft.get_peft_model(model, lora)
 
 
+def check_targets(config: Any, targets: tuple[str, ...]) -> None:
+    """Checks that a model has the layers that get adapters, by its configuration, without its weights.
+
+    Args:
+        config: of the model.
+        targets: of `AdapterConfig`.
+
+    Raises:
+        InputError: no layer is called as asked.
+    """
+    if not targets:
+        return
+    from transformers import AutoModelForImageTextToText
+
+    with torch.device("meta"), quiet_transformers():
+        model = AutoModelForImageTextToText.from_config(config)
+    _layers(model, targets)
+
+
 def _layers(model: Any, targets: tuple[str, ...]) -> list[str]:
     """Full names of the linear layers that get adapters."""
     decoder, tower, head = model.get_decoder(), model.get_encoder("image"), model.get_output_embeddings()

@@ -118,5 +118,5 @@ def test_a_scene_twice_other_classes_and_unknown_names_are_refused() -> None:
         semantic_scores([], CLASSES)
     with pytest.raises(InputError, match="different classes"):
         semantic_scores([one], CLASSES.without(("sofa",)))
-    with pytest.raises(InputError, match="cannot exclude 'walls', which is no class"):
+    with pytest.raises(InputError, match="excluded: 'walls' is none of the 4 classes; did you mean wall"):
         semantic_scores([one], CLASSES, excluded=("walls",))

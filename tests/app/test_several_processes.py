@@ -1,0 +1,65 @@
+"""Commands that several processes of a launcher start: those that share no work refuse, and write nothing."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_runs import refusal
+
+from gsencoder.app.commands import COMMANDS
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
+
+GIVEN = {"ask": ["features", "question=where"], "score": ["answers"], "demo": []}
+"""What a command needs to come as far as its start."""
+
+
+@pytest.fixture
+def second_of_three(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"RANK": "1", "WORLD_SIZE": "3", "LOCAL_RANK": "1"}.items():
+        monkeypatch.setenv(name, value)
+
+
+@pytest.mark.parametrize("name", [each.name for each in COMMANDS.values() if not each.several])
+def test_a_command_without_work_to_share_says_so(
+    name: str, second_of_three: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / ("out.html" if name == "view" else "out")
+    line = refusal(capsys, name, *GIVEN.get(name, ["scene"]), f"out={out}")
+    assert line.startswith(f"error: {name}: runs in one process, and this is process 1 of 3")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("protocol", ["localization", "naming", "absent", "grounding"])
+def test_a_protocol_that_processes_do_not_share_says_so_before_anything_is_read(
+    protocol: str, second_of_three: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal(capsys, "evaluate", str(tmp_path / "none"), f"protocol={protocol}", "teacher.words=none")
+    assert line.startswith(f"error: protocol={protocol}: runs in one process, and this is process 1 of 3")
+
+
+def test_one_scene_is_not_for_several_processes(
+    second_of_three: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_room(make_room(0, objects=1, views=2, width=40, height=30), tmp_path / "room")
+    line = refusal(capsys, "fuse", str(tmp_path / "room"), "teacher=palette", f"out={tmp_path / 'out'}")
+    assert "room: runs in one process, and this is process 1 of 3" in line
+    assert "give several scenes, which processes share" in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_two_processes_of_questions_write_nothing(tmp_path: Path) -> None:
+    write_room(make_room(0, objects=2, views=2, width=80, height=60), tmp_path / "room")
+    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    command = [*launcher, "-m", "gsencoder", "questions", str(tmp_path / "room"), f"out={tmp_path / 'out'}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, check=False, timeout=120, env=environment, capture_output=True, text=True)
+    assert done.returncode != 0
+    # The launcher stops the others once one has refused, maybe before their own line.
+    assert "error: questions: runs in one process, and this is process " in done.stderr
+    assert " of 2 that a launcher (torchrun, SLURM) started; start it once" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["room"]
