@@ -26,6 +26,11 @@ def listed(names: Sequence[str], limit: int = 8) -> str:
     return ", ".join(names[:limit]) + (", …" if len(names) > limit else "")
 
 
+def counted(number: int, noun: str, several: str = "") -> str:
+    """A number with its noun, for a message: 1 scene, 1,200 scenes; `several` is the plural that does not end in s."""
+    return f"{number:,} {noun if number == 1 else several or f'{noun}s'}"
+
+
 @contextmanager
 def about(what: object) -> Iterator[None]:
     """Prefixes the message of an `InputError` that leaves the block with `what`, unless it contains it already."""

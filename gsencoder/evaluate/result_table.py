@@ -39,12 +39,14 @@ class ResultTable:
         columns: names of the figures, in order; all are percent.
         rows: measured ones first.
         notes: what a reader must know, a sentence each, such as why a column is empty.
+        by_class: those of the columns that are of one class each; Markdown has them as rows of a second table.
     """
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[ResultRow, ...]
     notes: tuple[str, ...] = ()
+    by_class: tuple[str, ...] = ()
 
     def csv_rows(self) -> list[dict[str, object]]:
         """One mapping a row, with None for what is missing."""
@@ -58,15 +60,28 @@ class ResultTable:
         """The table without the rows of papers."""
         return replace(self, rows=tuple(row for row in self.rows if row.source == "measured"))
 
+    def without_classes(self) -> "ResultTable":
+        """The table without the columns that are of one class each."""
+        return replace(self, columns=tuple(each for each in self.columns if each not in self.by_class), by_class=())
+
     def markdown(self) -> str:
-        """The table in Markdown, with notes below it."""
-        head = ["method", *self.columns]
-        lines = [f"**{self.title}** (percent)", "", _line(head), _line(["---", *("---:" for _ in self.columns)])]
-        for row in self.rows:
-            figures = (_known(row.values.get(column)) for column in self.columns)
-            method = row.method if row.source == "measured" else f"{row.method} (published)"
-            lines.append(_line([method, *("" if figure is None else f"{figure:.1f}" for figure in figures)]))
-        return "\n".join([*lines, *(f"\n{note}" for note in self.notes)]) + "\n"
+        """The table in Markdown, with notes below it, and the table of classes, if there are any, below these."""
+        columns = self.without_classes().columns
+        named = [(row.method if row.source == "measured" else f"{row.method} (published)", row) for row in self.rows]
+        lines = _lines(
+            f"**{self.title}** (percent)",
+            ["method", *columns],
+            [[method, *(_figure(row, column) for column in columns)] for method, row in named],
+        )
+        lines += [f"\n{note}" for note in self.notes]
+        if self.by_class:
+            shown = [(method, row) for method, row in named if any(_figure(row, each) for each in self.by_class)]
+            lines += _lines(
+                f"\n**{self.title}, by class** (percent)",
+                ["class", *(method for method, _ in shown)],
+                [[each, *(_figure(row, each) for _, row in shown)] for each in self.by_class],
+            )
+        return "\n".join(lines) + "\n"
 
 
 def table_of(
@@ -76,6 +91,7 @@ def table_of(
     published: str = "",
     columns: Iterable[str] = (),
     notes: Iterable[str] = (),
+    by_class: Iterable[str] = (),
 ) -> ResultTable:
     """A table of measured shares, with a paper's rows below.
 
@@ -85,6 +101,7 @@ def table_of(
         published: name of a file of `published/`, without its ending; empty = none.
         columns: in order; empty = those of the measured rows, in order of first appearance.
         notes: see `ResultTable`.
+        by_class: see there.
     """
     rows = [
         ResultRow(source="measured", method=method, values={name: 100 * value for name, value in values.items()})
@@ -92,7 +109,7 @@ def table_of(
     ]
     names = tuple(columns) or tuple(dict.fromkeys(name for row in rows for name in row.values))
     below = published_rows(published) if published else ()
-    return ResultTable(title=title, columns=names, rows=(*rows, *below), notes=tuple(notes))
+    return ResultTable(title=title, columns=names, rows=(*rows, *below), notes=tuple(notes), by_class=tuple(by_class))
 
 
 def published_rows(name: str) -> tuple[ResultRow, ...]:
@@ -119,6 +136,15 @@ def published_rows(name: str) -> tuple[ResultRow, ...]:
 
 def _known(value: float | None) -> float | None:
     return None if value is None or math.isnan(value) else value
+
+
+def _figure(row: ResultRow, column: str) -> str:
+    figure = _known(row.values.get(column))
+    return "" if figure is None else f"{figure:.1f}"
+
+
+def _lines(title: str, head: list[str], rows: Iterable[list[str]]) -> list[str]:
+    return [title, "", _line(head), _line(["---", *("---:" for _ in head[1:])]), *map(_line, rows)]
 
 
 def _line(cells: Iterable[str]) -> str:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, counted
 from gsencoder.evaluate.files.referring import compare_box_files
 from gsencoder.evaluate.result_table import table_of
 from gsencoder.evaluate.score_report import ScoreReport, spread
@@ -55,10 +55,10 @@ def score_referring(
     kinds |= {f"{method}, best of all": scores.best}
     measured = {name: _accuracies(table) | _by_uniqueness(table) for name, table in kinds.items()}
     overall, best = measured[method], measured[f"{method}, best of all"]
-    notes = [f"{count} sentences are not scored: {reason}." for reason, count in unscored.items()]
+    notes = [f"{counted(count, 'sentence')} not scored: {reason}." for reason, count in unscored.items()]
     if unknown := sum(each.multiple is None for each in sentences):
         notes.append(
-            f"{unknown} sentences count in the overall columns alone: neither file says whether they are unique or "
+            f"{counted(unknown, 'sentence')} in the overall columns alone: neither file says what is unique and what "
             "multiple, which ScanNet's label map tells (label_map=)."
         )
     return ScoreReport(
@@ -88,7 +88,8 @@ def score_referring(
                 for each in sentences
             ],
         },
-        line=f"{scores.sentences} sentences: Acc@0.25 {overall['acc_25']:.3f}, Acc@0.5 {overall['acc_50']:.3f}; "
+        line=f"{counted(scores.sentences, 'sentence')}: Acc@0.25 {overall['acc_25']:.3f}, Acc@0.5 "
+        f"{overall['acc_50']:.3f}; "
         f"{scores.without_box} without a box; of all boxes the best: {best['acc_25']:.3f}, {best['acc_50']:.3f}",
     )
 

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, counted
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.files.instances import match_instance_files
 from gsencoder.evaluate.files.recognition import read_recognition_truth, recognize_files
@@ -63,7 +63,7 @@ def score_instances(
     if not scores.truths.any():
         raise InputError(
             f"{truth}: nothing to score: no object of the {len(classes.names)} classes has {min_region} vertices or "
-            f"more in {len(matches)} scenes; compare its ids with those of classes="
+            f"more in {counted(len(matches), 'scene')}; compare its ids with those of classes="
         )
     overall = _precisions(scores.overall)
     by_scene = [
@@ -79,11 +79,14 @@ def score_instances(
     notes = [EQUAL_SCORES] if scores.equal_scores else []
     others = sum(each.other_classes for each in matches)
     if others:
-        notes.append(f"{others} masks have a class id that is none of the {len(classes.names)} that are scored.")
+        notes.append(
+            f"Not counted: {counted(others, 'mask')} with a class id that is none of the {len(classes.names)} that are "
+            "scored."
+        )
     if scores.shared:
         notes.append(
-            f"{scores.shared} masks overlap several true objects by more than 0.25; AP at 0.25 depends on the order in "
-            "which they are listed, as in ScanNet's script."
+            f"Of the masks {scores.shared:,} overlap several true objects by more than 0.25; AP at 0.25 depends on "
+            "the order in which they are listed, as in ScanNet's script."
         )
     return ScoreReport(
         results={
@@ -101,8 +104,9 @@ def score_instances(
         },
         table=table_of("Instances", {method: overall | groups}, published="splatdistill_2_instances", notes=notes),
         rows={"scenes": by_scene, "classes": by_class},
-        line=f"{int(scores.truths.sum())} objects in {scores.scenes} scenes: AP {overall['ap']:.3f}, AP50 "
-        f"{overall['ap_50']:.3f}, AP25 {overall['ap_25']:.3f}" + (" without classes" if class_agnostic else ""),
+        line=f"{counted(int(scores.truths.sum()), 'object')} in {counted(scores.scenes, 'scene')}: AP "
+        f"{overall['ap']:.3f}, AP50 {overall['ap_50']:.3f}, AP25 {overall['ap_25']:.3f}"
+        + (" without classes" if class_agnostic else ""),
     )
 
 
@@ -135,8 +139,8 @@ def score_semantics(
     scores = semantic_scores(counts, classes, excluded=excluded)
     if not scores.vertices:
         raise InputError(
-            f"{truth}: nothing to score: no vertex of {len(counts)} scenes has one of the {len(classes.names)} "
-            "classes; compare its ids with those of classes="
+            f"{truth}: nothing to score: no vertex of {counted(len(counts), 'scene')} has one of the "
+            f"{len(classes.names)} classes; compare its ids with those of classes="
         )
     overall = asdict(scores.overall) | _foreground(scores.foreground)
     by_scene = [
@@ -162,8 +166,8 @@ def score_semantics(
         },
         table=table_of("Semantic labels", {method: overall}, notes=notes),
         rows={"scenes": by_scene, "classes": by_class},
-        line=f"{scores.vertices:,} labels in {scores.scenes} scenes: mIoU {overall['miou']:.3f}, mAcc "
-        f"{overall['macc']:.3f}, f-mIoU {overall['f_miou']:.3f}; {scores.unlabeled:,} without a prediction",
+        line=f"{counted(scores.vertices, 'label')} in {counted(scores.scenes, 'scene')}: mIoU {overall['miou']:.3f}, "
+        f"mAcc {overall['macc']:.3f}, f-mIoU {overall['f_miou']:.3f}; {scores.unlabeled:,} without a prediction",
     )
 
 
@@ -221,10 +225,13 @@ def score_recognition(
             "spread": spread(by_scene, [f"top_{k}" for k in ks]),
         },
         table=table_of(
-            f"Recognition of given objects, top-{first}", {method: columns}, published="splatdistill_1_recognition"
+            f"Recognition of given objects, top-{first}",
+            {method: columns},
+            published="splatdistill_1_recognition",
+            by_class=names,
         ),
         rows={"scenes": by_scene, "classes": by_class},
-        line=f"{scores.instances} objects, averaged over classes (over objects): "
+        line=f"{counted(scores.instances, 'object')}, averaged over classes (over objects): "
         + ", ".join(f"top-{k} {scores.mean[k]:.3f} ({scores.overall[k]:.3f})" for k in ks),
     )
 

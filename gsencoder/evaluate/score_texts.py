@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, counted
 from gsencoder.data.truth.expressions import read_scanrefer
 from gsencoder.data.truth.questions import read_questions
 from gsencoder.evaluate.files.answer_predictions import read_answer_predictions
@@ -58,7 +58,7 @@ def score_answer_files(
     by_kind = [{"kind": kind, "questions": means.count, **_means(means)} for kind, means in scores.by_kind.items()]
     notes = [f"{column} is absent: {reason}." for column, reason in scores.absent.items()]
     if scores.blank:
-        notes.append(f"{scores.blank} answers are empty when cleaned, and count as right in the refined match.")
+        notes.append(f"{counted(scores.blank, 'answer')} without a word once cleaned: right in the refined match.")
     return ScoreReport(
         results={
             "protocol": "answers",
@@ -78,7 +78,7 @@ def score_answer_files(
             notes=notes,
         ),
         rows={"scenes": by_scene, "kinds": by_kind, "questions": [asdict(row) for row in scores.rows]},
-        line=f"{scores.overall.count} questions, {scores.overall.missing} without an answer: EM@1 "
+        line=f"{counted(scores.overall.count, 'question')}, {scores.overall.missing} without an answer: EM@1 "
         f"{overall['em_1']:.3f}, refined {overall['em_refined']:.3f}, CIDEr {100 * scores.sentences.cider:.1f}",
     )
 
@@ -161,7 +161,7 @@ def score_caption_files(
             notes=[f"{column} is absent: {reason}." for column, reason in scores.sentences.absent.items()],
         ),
         rows={"objects": rows, "scenes": by_scene},
-        line=f"{len(scores.objects)} objects, {scores.missing} without a caption that counts: CIDEr "
+        line=f"{counted(len(scores.objects), 'object')}, {scores.missing} without a caption that counts: CIDEr "
         f"{100 * scores.sentences.cider:.1f}, BLEU-4 {100 * scores.sentences.bleu[3]:.1f}, ROUGE-L "
         f"{100 * scores.sentences.rouge_l:.1f}",
     )
@@ -193,6 +193,6 @@ def _columns(overall: Mapping[str, float], published: tuple[str, ...]) -> tuple[
 def _refuse_missing(missing: list[str], what: str, predictions: Path, allowed: bool) -> None:
     if missing and not allowed:
         raise InputError(
-            f"{predictions}: {len(missing)} {what}(s) without a prediction, first {missing[0][:60]}; "
+            f"{predictions}: {counted(len(missing), what)} without a prediction, first {missing[0][:60]}; "
             "allow_missing=true counts them as wrong"
         )

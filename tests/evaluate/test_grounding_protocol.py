@@ -169,7 +169,7 @@ def test_the_command_writes_pairs_and_names_and_takes_features_of_folders(
     scene, teacher = str(tmp_path / "room_0"), f"teacher.words={tmp_path / 'words.safetensors'}"
     ask = ["evaluate", scene, "protocol=grounding", "protocol.min_pixels=10"]
     assert cli.main([*ask, teacher, f"out={tmp_path / 'fused'}"]) == 0
-    assert "pairs of a view and a name in 1 scenes: mIoU" in " ".join(capsys.readouterr().out.split())
+    assert "pairs of a view and a name in 1 scene: mIoU" in " ".join(capsys.readouterr().out.split())
     fused = results_of(tmp_path / "fused")
     pairs = (tmp_path / "fused" / "pairs.csv").read_text().splitlines()
     assert len(pairs) == 1 + fused["pairs"]

@@ -73,3 +73,20 @@ def test_columns_are_those_of_all_measured_rows_or_those_asked_for() -> None:
 def test_a_table_that_no_paper_has_is_refused() -> None:
     with pytest.raises(InputError, match="there are .*splatdistill_2_instances"):
         published_rows("splatdistill_12")
+
+
+def test_classes_are_rows_of_a_second_table_beside_the_methods_that_have_them() -> None:
+    measured = {"fused": {"mean": 0.5, "bed": 1.0, "lamp": 0.0}}
+    table = table_of("Names", measured, published="splatdistill_1_recognition", by_class=("bed", "lamp"))
+    first, second = table.markdown().split("\n**Names, by class** (percent)\n")
+    assert first.splitlines()[2] == "| method | mean |"
+    assert "| PointCLIP V2 (published) | 11.0 |" in first
+    head, _, *rows = second.strip().splitlines()
+    columns = [cell.strip() for cell in head.strip("|").split("|")]
+    assert columns[:3] == ["class", "fused", "PointCLIP (published)"]
+    bed, lamp = ([cell.strip() for cell in row.strip("|").split("|")] for row in rows)
+    assert bed[:3] == ["bed", "100.0", "0.0"]
+    # The paper has no lamp.
+    assert lamp == ["lamp", "0.0", *[""] * (len(columns) - 2)]
+    assert table.csv_rows()[0]["lamp"] == 0.0
+    assert table.without_classes().columns == ("mean",)

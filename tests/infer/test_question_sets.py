@@ -10,7 +10,7 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.data.truth.entries import box_corners
 from gsencoder.infer.ask.ask import Question
-from gsencoder.infer.ask.predictions import predictions, short_answer, wrapped
+from gsencoder.infer.ask.predictions import predictions, short_answer
 from gsencoder.infer.ask.question_sets import QuestionSet, is_question_set, read_question_set
 
 LOW, HIGH = (0.0, 1.0, 2.0), (1.0, 3.0, 2.5)
@@ -136,7 +136,9 @@ def test_boxes_of_another_file_stand_in_for_those_of_the_set(tmp_path: Path) -> 
         (SCANQA, {"proposals": "localize"}, "are for captions"),
         ([], {}, "holds none"),
         ([1], {}, "entry 0: expected an object"),
-        ({"a": 3}, {}, "a must be a list of objects with a box of eight corners, got 3"),
+        ({"a": 3}, {}, "got an object with a, and no list of boxes as a"),
+        ({"results": {"em": 1}, "seconds": 2}, {}, "expected a list of ScanQA's.*got an object with results, seconds"),
+        ({"a|3|chair": ["sos a chair eos"]}, {}, "no list of boxes as a|3|chair"),
         ({"a": [{"box": [1, 2, 3]}]}, {}, "8 corners"),
         ({"a": [{"box": [1, 2]}]}, {}, r"box\[0\] must be a corner"),
         ({"annotations": []}, {}, "these are SQA3D's annotations"),
@@ -162,4 +164,3 @@ def test_lines_of_questions_are_no_set(tmp_path: Path) -> None:
 def test_answers_lose_case_thoughts_and_the_last_full_stop() -> None:
     assert short_answer("<think>A? B.</think>\n The  Mug on\nthe table.") == "the mug on the table"
     assert short_answer("3.5") == "3.5"
-    assert wrapped("A mug. Red.") == "sos a mug . red . eos"

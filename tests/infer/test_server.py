@@ -123,7 +123,7 @@ def test_answers_that_are_none_are_errors(value: Any) -> None:
     [
         (events("a red ", "mu", finish=None, done=False), "cut off after 8 characters"),
         (events("a red ", "mu", finish=None), "cut off after 8 characters"),
-        (events(finish="stop"), "the answer is empty .it ended with 'stop'"),
+        (events(finish="stop"), "the answer holds no text .it ended with 'stop'"),
         (b"data: {not json}\n\n", "broke off, or is no chat completion"),
         (b"<html>hello</html>", "sent nothing that is a chat"),
         (events("fine") + b'data: {"error": {"message": "GPU fell over"}}\n\n', "GPU fell over|^$"),
@@ -205,7 +205,12 @@ def finished(finish: str, **message: Any) -> dict[str, Any]:
     [
         (finished("content_filter"), "a filter cut the answer off after 6 characters"),
         (finished("stop", content=None, refusal="I must not look"), "the model refuses: I must not look"),
-        (finished("length", content="", reasoning_content="hmm"), "empty .*it thought until vlm.max_tokens"),
+        (
+            finished("length", content="", reasoning_content="hmm"),
+            "no text .*it thought until vlm.max_tokens; raise it",
+        ),
+        (finished("length", content=None), "no text .*it went on until vlm.max_tokens; raise it"),
+        (finished("tool_calls", content=None), "no text .*it calls a tool, and none is offered"),
     ],
 )
 def test_answers_that_a_model_keeps_back_are_about_the_question_and_not_the_server(whole: Any, told: str) -> None:
@@ -215,6 +220,15 @@ def test_answers_that_a_model_keeps_back_are_about_the_question_and_not_the_serv
     ):
         ask(server.url, stream=False)
     assert not isinstance(error.value, ServerError)
+
+
+@pytest.mark.parametrize("text", ["a red mug", None])
+def test_a_server_that_streams_nothing_is_to_be_asked_without_a_stream(text: str | None) -> None:
+    with (
+        serving(lambda handler, _: handler.reply(200, completion(text))) as server,
+        pytest.raises(ServerError, match="JSON in place of the stream that was asked for; give vlm.stream=false, or"),
+    ):
+        ask(server.url)
 
 
 def test_odd_but_whole_answers_are_taken() -> None:

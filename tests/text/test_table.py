@@ -148,7 +148,7 @@ def test_a_half_precision_file_gives_unit_rows_and_the_encoder_of_its_name(table
     ("arrays", "message"),
     [
         ({"names": np.array(["a1"])}, "embeddings is missing"),
-        ({"names": np.array([1.0]), "embeddings": np.eye(1)}, "names: expected 1 axes"),
+        ({"names": np.array([1.0]), "embeddings": np.eye(1)}, "names: expected 1 axis"),
         ({"names": np.array(["a1"]), "embeddings": np.ones(3)}, "embeddings: expected 2 axes"),
         ({"names": np.array(["a1", "b1"]), "embeddings": np.eye(3)}, "one embedding for each name"),
         ({"names": np.array(["x", "X "]), "embeddings": np.eye(2)}, "'X ' in row 1 is repeated"),
@@ -171,7 +171,7 @@ def test_a_table_that_is_none_says_what_is_wrong(
 def test_an_array_of_objects_is_refused_and_never_unpickled(tmp_path: Path) -> None:
     path = tmp_path / "bad.npz"
     np.savez(path, names=np.array([{"a": 1}], dtype=object), embeddings=np.eye(1))
-    with pytest.raises(InputError, match="names: expected 1 axes of type 'U'"):
+    with pytest.raises(InputError, match="names: expected 1 axis of text"):
         load_text_table(path)
 
 

@@ -15,7 +15,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.errors import InputError, SceneWarning, counted, listed
 from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.data.scenes import SceneConfig
@@ -143,7 +143,9 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
     screen = console(config.quiet)
     if server is not None:
         screen.print(printable(row["answer"]), soft_wrap=True)
-    screen.print(f"{out}: {len(row['views'])} pictures, {PROMPT}, {REQUEST}" + (f", {ANSWER}" if server else ""))
+    screen.print(
+        f"{out}: {counted(len(row['views']), 'picture')}, {PROMPT}, {REQUEST}" + (f", {ANSWER}" if server else "")
+    )
 
 
 def made_from(config: AskCommandConfig) -> dict[str, Any]:
@@ -172,7 +174,7 @@ def ask_file(
         write_answers(folder, work.path, rows)
         summary.add_seconds(clock.seconds)
         summary.results.update(questions=len(questions), answers=ANSWERS)
-    console(config.quiet).print(f"{out}: {len(questions)} questions, {ANSWERS}")
+    console(config.quiet).print(f"{out}: {counted(len(questions), 'question')}, {ANSWERS}")
 
 
 def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | None, summary: Summary) -> None:
@@ -186,7 +188,8 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
     folders = scene_folders(config.paths, wanted)
     if not folders:
         raise InputError(
-            f"questions: {config.questions} asks about {len(wanted)} scenes ({listed(sorted(wanted), 3)}), and none of "
+            f"questions: {config.questions} asks about {counted(len(wanted), 'scene')} "
+            f"({listed(sorted(wanted), 3)}), and none of "
             f"them has features in {', '.join(config.paths)}"
         )
     target, clock, screen = Path(os.path.realpath(out)), Clock(), console(config.quiet)
@@ -231,7 +234,8 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
         summary.add_seconds(clock.seconds)
         if not any(counts.values()):
             raise InputError(
-                f"questions: {config.questions} asks about {len(wanted)} scenes ({listed(sorted(wanted), 3)}), and "
+                f"questions: {config.questions} asks about {counted(len(wanted), 'scene')} "
+                f"({listed(sorted(wanted), 3)}), and "
                 f"there are features of others ({listed(sorted(counts), 3) or 'none'})"
             )
         others = {name: count for name, count in wanted.items() if name not in counts}
@@ -258,7 +262,15 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
         )
     if others:
         screen.print(
-            f"{sum(others.values())} questions about {len(others)} scenes without features were not asked: "
+            f"not asked, for want of features: {counted(sum(others.values()), 'question')} about "
+            f"{counted(len(others), 'scene')}: "
             f"{listed(sorted(others), 3)}"
         )
-    screen.print(f"{out}: {len(answered)} " + (f"answers, {PREDICTIONS}" if server else f"requests, {REQUEST}"))
+    screen.print(
+        f"{out}: "
+        + (
+            f"{counted(len(answered), 'answer')}, {PREDICTIONS}"
+            if server
+            else f"{counted(len(answered), 'request')}, {REQUEST}"
+        )
+    )

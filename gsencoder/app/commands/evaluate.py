@@ -10,6 +10,7 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.runtime.process_rank import refuse_several
+from gsencoder.data.scenes import check_names, find_scenes
 from gsencoder.evaluate.benchmark_files import BenchmarkProtocol
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,
@@ -27,6 +28,7 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
     if not isinstance(config.protocol, BenchmarkProtocol):
         advice = "start it once; recognition, instances, semantics and referring are what processes share the scenes of"
         refuse_several(f"protocol={config.protocol.name}", advice)
+    check_names(find_scenes(config.paths))
     if config.features:
         source, words = stored_features(config)
     else:

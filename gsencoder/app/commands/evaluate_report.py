@@ -2,6 +2,8 @@
 
 from rich.table import Table
 
+from gsencoder.core.errors import counted
+
 SHOWN_NAMES = 15
 COLUMNS = {
     "localization": {
@@ -27,26 +29,31 @@ def scores_line(results: dict) -> str:
     """The main figures in one line."""
     if results["protocol"] == "naming":
         return (
-            f"{len(results['names'])} names in {len(results['scenes'])} scenes: accuracy {results['accuracy']:.3f} "
+            f"{counted(len(results['names']), 'name')} in {counted(len(results['scenes']), 'scene')}: accuracy "
+            f"{results['accuracy']:.3f} "
             f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centered cosine "
             f"{results['cosine']:.3f}"
         )
     if results["protocol"] == "absent":
         return (
-            f"{results['present']} present and {results['absent']} absent words in {len(results['scenes'])} scenes: "
+            f"{results['present']} present and {counted(results['absent'], 'absent word')} in "
+            f"{counted(len(results['scenes']), 'scene')}: "
             f"AUROC {results['auroc']:.3f} ± {results['auroc_se']:.3f}, calibration error "
             f"{results['calibration_error']:.3f}, Brier {results['brier']:.3f}; given a box: "
             f"{results['boxed_present']:.3f} of the present, {results['boxed_absent']:.3f} of the absent"
         )
     if results["protocol"] == "grounding":
-        broken = f", {results['not_finite']} maps not finite" if results["not_finite"] else ""
+        broken = f", {counted(results['not_finite'], 'map')} not finite" if results["not_finite"] else ""
         return (
-            f"{results['pairs']} pairs of a view and a name in {len(results['scenes'])} scenes: mIoU "
+            f"{counted(results['pairs'], 'pair')} of a view and a name in "
+            f"{counted(len(results['scenes']), 'scene')}: mIoU "
             f"{results['miou']:.3f} (averaged over names {results['miou_names']:.3f}), cIoU {results['ciou']:.3f}, "
-            f"P@0.5 {results['p50']:.3f}, P@0.6 {results['p60']:.3f}; {results['small']} pairs too small{broken}"
+            f"P@0.5 {results['p50']:.3f}, P@0.6 {results['p60']:.3f}; {counted(results['small'], 'pair')} too "
+            f"small{broken}"
         )
     return (
-        f"{results['objects']} objects in {len(results['scenes'])} scenes: Acc@0.25 {results['acc_25']:.3f}, "
+        f"{counted(results['objects'], 'object')} in {counted(len(results['scenes']), 'scene')}: Acc@0.25 "
+        f"{results['acc_25']:.3f}, "
         f"Acc@0.5 {results['acc_50']:.3f}, mean IoU {results['mean_iou']:.3f} (best of all boxes: "
         f"{results['oracle_acc_25']:.3f}, {results['oracle_acc_50']:.3f}, {results['oracle_mean_iou']:.3f})"
     )

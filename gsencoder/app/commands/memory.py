@@ -15,7 +15,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError, about, advised
+from gsencoder.core.errors import InputError, about, advised, counted
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
@@ -278,11 +278,7 @@ def _describe(memory: QueryMemory, errors: RenderedErrors, size: int) -> str:
     bank = memory.bank
     covered = "every feature has" if bank.coverage == 1 else f"{bank.coverage:.3f} of the features have"
     return (
-        f"{_number(len(bank), 'component')} ({covered} one within a cosine of {bank.threshold:.3f}), queries of "
-        f"{_number(memory.channels, 'channel')} for {int((memory.weights > 0).sum()):,} Gaussians, {size / 1e6:.3g} "
+        f"{counted(len(bank), 'component')} ({covered} one within a cosine of {bank.threshold:.3f}), queries of "
+        f"{counted(memory.channels, 'channel')} for {int((memory.weights > 0).sum()):,} Gaussians, {size / 1e6:.3g} "
         f"MB; rendered features have a cosine of {errors.cosine:.3f} with the teacher's, centered {errors.centered:.3f}"
     )
-
-
-def _number(count: int, noun: str) -> str:
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -9,7 +9,7 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, counted
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
 from gsencoder.data.truth.expressions import write_scanrefer
@@ -81,8 +81,11 @@ def run(config: QuestionsCommandConfig, summary: Summary) -> None:
             files=[QUESTIONS, SITUATED, EXPRESSIONS],
         )
     for kind, count in (kinds | dict(situated)).items():
-        screen.print(f"{kind:>10}: {count} questions")
-    screen.print(f"{out}: {len(questions)} questions, {len(situations)} situated ones, {len(expressions)} expressions")
+        screen.print(f"{kind:>10}: {counted(count, 'question')}")
+    screen.print(
+        f"{out}: {counted(len(questions), 'question')}, {len(situations)} situated, "
+        f"{counted(len(expressions), 'expression')}"
+    )
 
 
 def _seen(config: QuestionsCommandConfig, track: Track) -> Iterator[SeenScene]:

@@ -10,7 +10,7 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
@@ -26,6 +26,8 @@ from gsencoder.evaluate.scores.semantics import BACKGROUND
 TABLE = "table.md"
 MOST_COLUMNS = 10
 """Columns that are printed; more do not fit a terminal."""
+DECIMALS = 6
+"""Of figures in CSV files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,16 +140,23 @@ def run(config: ScoreConfig, summary: Summary) -> None:
 def write_report(folder: Path, report: ScoreReport, summary: Summary) -> None:
     """Writes the table as Markdown and CSV, and the rows by scene and class, and adds the results to the summary."""
     write_bytes(folder / TABLE, report.table.markdown().encode())
-    write_bytes(folder / "table.csv", csv_text(report.table.csv_rows()).encode())
-    for name, rows in report.rows.items():
-        write_bytes(folder / f"{name}.csv", csv_text(rows).encode())
+    # What is 0 but for rounding reads 0; the summary has all digits.
+    tables = {"table": report.table.csv_rows(), **report.rows}
+    for name, rows in tables.items():
+        rounded = [
+            {key: round(value, DECIMALS) if isinstance(value, float) else value for key, value in row.items()}
+            for row in rows
+        ]
+        write_bytes(folder / f"{name}.csv", csv_text(rounded).encode())
     summary.results.update(report.results)
 
 
 def print_report(out: Path, report: ScoreReport, *, quiet: bool) -> None:
     """Prints the measured rows and the main figures."""
     screen = console(quiet)
-    table = report.table.measured()
+    table = report.table.measured().without_classes()
+    if report.table.by_class:
+        screen.print(f"The figures of {counted(len(report.table.by_class), 'class', 'classes')} are in {TABLE}.")
     if len(table.columns) > MOST_COLUMNS:
         table = replace(table, columns=table.columns[:MOST_COLUMNS])
         screen.print(f"The first {MOST_COLUMNS} of {len(report.table.columns)} columns; all are in {TABLE}.")

@@ -3,6 +3,7 @@ questions about scenes and their answers."""
 
 import os
 import shutil
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.model_files import find_file
 from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE, read_log
 from gsencoder.core.runtime.device_names import Device
@@ -152,7 +153,9 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
                     folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
                 prepare_prompts(questions, features, config.photos, recipe, prepared, track=track)
         if config.prepare_only:
-            console(config.quiet or not process.is_first).print(f"{prepared}: prompts of {len(questions)} questions")
+            console(config.quiet or not process.is_first).print(
+                f"{prepared}: prompts of {counted(len(questions), 'question')}"
+            )
             return
         with fail_together():
             if process.is_first:
@@ -200,8 +203,15 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
     screen = console(config.quiet)
     trained = summary.results["trained"]
     screen.print(
-        f"{out}: {done.state.step} steps on {len(questions)} questions, {trained:,} parameters of adapters; the loss "
-        f"of an answer's token went from {losses[0]:.3f} to {losses[-1]:.3f}"
+        f"{out}: {counted(done.state.step, 'step')} on {counted(len(questions), 'question')}, "
+        f"{counted(trained, 'parameter')} of adapters; {_told_losses(losses, config.train.log_every)}"
     )
     if not config.tokens:
         screen.print(f"{out}: transformers serve {out / SERVED_FOLDER}")
+
+
+def _told_losses(losses: Sequence[float], log_every: int) -> str:
+    """How the loss of an answer's token went, by the rows of the log."""
+    if len(losses) == 1:
+        return f"the loss of an answer's token was {losses[0]:.3f} in the log's only row (train.log_every={log_every})"
+    return f"the loss of an answer's token went from {losses[0]:.3f} to {losses[-1]:.3f}"

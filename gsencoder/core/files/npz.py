@@ -15,6 +15,10 @@ MAX_TEXT = 1 << 12
 """Largest number of characters of an entry of a text array; numpy stores all entries with the length of the longest."""
 
 
+_KINDS = {"U": "text", "f": "floating point", "b": "bool", "i": "signed integers", "u": "unsigned integers"}
+"""What messages call numpy's kinds of types."""
+
+
 def read_npz(
     file: Path,
     required: Mapping[str, tuple[str, int]],
@@ -26,7 +30,8 @@ def read_npz(
 
     Args:
         file: the archive.
-        required: kind of type ("U" text, "f" floating point, "b" bool) and number of axes of each array.
+        required: kind of type ("U" text, "f" floating point, "b" bool, "i" and "u" integers) and number of axes of each
+            array.
         optional: the same for arrays that may be missing.
         max_text: largest number of characters of an entry of text.
 
@@ -48,6 +53,11 @@ def read_npz(
         raise InputError(f"{file}: cannot be read as .npz: {message}") from error
 
 
+def _described(dtype: np.dtype, shape: tuple[int, ...]) -> str:
+    name = "Python objects, which would run code" if dtype.hasobject else f"{dtype}"
+    return f"{' × '.join(f'{each:,}' for each in shape) or 'one'} of {name}"
+
+
 def _read_member(archive: zipfile.ZipFile, name: str, kind: str, ndim: int, file: Path, max_text: int) -> np.ndarray:
     """Reads an array; its header must match the size in the archive, which is checked before memory is allocated."""
     where, size = f"{file}: {name}", archive.getinfo(f"{name}.npy").file_size
@@ -61,7 +71,10 @@ def _read_member(archive: zipfile.ZipFile, name: str, kind: str, ndim: int, file
         shape, fortran, dtype = read(stream)
         count = int(np.prod(shape, dtype=object))
         if dtype.kind != kind or len(shape) != ndim:
-            raise InputError(f"{where}: expected {ndim} axes of type {kind!r}, got {dtype}{list(shape)}")
+            raise InputError(
+                f"{where}: expected {ndim} {'axis' if ndim == 1 else 'axes'} of {_KINDS[kind]}, got "
+                f"{_described(dtype, shape)}"
+            )
         length = dtype.itemsize // np.dtype("U1").itemsize
         if kind == "U" and length > max_text:
             raise InputError(f"{where}: entries of {length:,} characters, expected at most {max_text:,}")

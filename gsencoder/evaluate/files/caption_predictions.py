@@ -11,6 +11,7 @@ from typing import Any
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
+from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.entries import (
     Entry,
     box_corners,
@@ -24,7 +25,7 @@ from gsencoder.data.truth.entries import (
     text_list,
     text_value,
 )
-from gsencoder.evaluate.scores.dense_captions import CaptionedBox, CaptionedObject, NamedCaption, wrapped_caption
+from gsencoder.evaluate.scores.dense_captions import CaptionedBox, CaptionedObject, NamedCaption
 
 EXPECTED = (
     "an object from scenes to lists of {caption, box}, or from scene|object_id|object_name to lists of one caption"

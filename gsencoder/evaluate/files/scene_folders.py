@@ -4,7 +4,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsencoder.core.errors import InputError, listed
+from gsencoder.core.errors import InputError, counted, listed
 from gsencoder.data.truth.checked_files import PICKLE_SUFFIXES
 from gsencoder.data.truth.scannet_labels import AGGREGATION
 
@@ -75,10 +75,10 @@ def scene_files(
     chosen = sorted(true_files if scenes is None else set(scenes))
     unknown = [scene for scene in chosen if scene not in true_files]
     if unknown:
-        raise InputError(f"{truth}: no truth of {len(unknown)} scenes to score: {listed(unknown)}")
+        raise InputError(f"{truth}: no truth of {counted(len(unknown), 'scene')} to score: {listed(unknown)}")
     missing = [scene for scene in chosen if scene not in predicted]
     if missing:
-        raise InputError(f"{predictions}: no prediction of {len(missing)} scenes: {listed(missing)}")
+        raise InputError(f"{predictions}: no prediction of {counted(len(missing), 'scene')}: {listed(missing)}")
     return tuple(SceneFiles(scene=s, prediction=predicted[s], truth=true_files[s]) for s in chosen)
 
 

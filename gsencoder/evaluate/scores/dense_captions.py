@@ -18,6 +18,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.first_repeated import first_repeated
+from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.entries import Corner
 from gsencoder.data.truth.expressions import Expression
 from gsencoder.evaluate.scores.box_overlap import box_ious
@@ -131,14 +132,6 @@ def captioned_objects(
         )
         for (scene, number), group in objects.items()
     )
-
-
-def wrapped_caption(text: str) -> str:
-    """A caption between sos and eos with full stops as words, as LEO wraps what a language model says; one that begins
-    with sos and ends with eos is left as it is.
-    """
-    words = text.split(" ")
-    return text if words[0] == "sos" and words[-1] == "eos" else f"sos {text} eos".replace(". ", " . ")
 
 
 def score_box_captions(

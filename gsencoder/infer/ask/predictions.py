@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.entries import box_corners
 from gsencoder.infer.ask.prompts import THOUGHT
 from gsencoder.infer.ask.question_sets import Benchmark, SetQuestion
@@ -23,7 +24,8 @@ def predictions(
     - SQA3D: a list of {scene_id, question_id, situation, question, answer}.
     - ScanRefer: a list of {scene_id, object_id, ann_id, bbox, bboxes}: the box of the mark that the answer names, and
       the same before those of the other marks; null and none where it names no mark, and for what is unanswered.
-    - Scan2Cap: for each scene a list of {caption, box, obj_prob, sem_prob}, captions between "sos" and "eos".
+    - Scan2Cap: for each scene a list of {caption, box, obj_prob, sem_prob}, captions in lower case,
+      between "sos" and "eos".
 
     Boxes are eight corners. Of an answer the case and a full stop at its end are left out (`short_answer`).
 
@@ -37,7 +39,7 @@ def predictions(
         for question, row in answered:
             probabilities = {"obj_prob": [0.0, 1.0], "sem_prob": [1 / CLASSES] * CLASSES} | dict(question.keys)
             entry = {
-                "caption": wrapped(row["answer"]),
+                "caption": wrapped_caption(said(row["answer"]).lower()),
                 "box": target_corners(row["targets"][0]),
                 **probabilities,
             }
@@ -73,11 +75,6 @@ def target_corners(target: Mapping[str, Any]) -> list[list[float]]:
 def said(answer: str) -> str:
     """An answer without what a model thought before it, on one line."""
     return " ".join(THOUGHT.sub("", answer).split())
-
-
-def wrapped(answer: str) -> str:
-    """A caption as Scan2Cap's scripts compare it: in lower case, full stops as words, between "sos" and "eos"."""
-    return f"sos {said(answer).lower()} eos".replace(". ", " . ")
 
 
 def short_answer(answer: str) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, listed
 from gsencoder.data.truth.entries import Corner, corner_bounds, entries_of, object_of, read_benchmark_json, scene_name
 from gsencoder.data.truth.expressions import Expression, read_scanrefer
 from gsencoder.data.truth.questions import Question as TruthQuestion
@@ -95,6 +95,7 @@ def read_question_set(path: Path, task: Task = "answer", proposals: str = "") ->
     content = read_benchmark_json(path)
     first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}
     if isinstance(content, dict) and "questions" not in content and "annotations" not in content:
+        _refuse_other_object(content, path)
         _check_task(path, "Scan2Cap's boxes", task, ("answer", "caption"))
         return QuestionSet(benchmark="scan2cap", questions=_captions(_read_boxes(content, path)))
     if isinstance(content, list) and not content:
@@ -122,6 +123,22 @@ def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: M
     """
     question = Question(task="caption", aabb=(*aabb[0], *aabb[1]))
     return SetQuestion(scene=scene, asked=BatchQuestion(id=f"{scene}/{name}", question=question), keys=keys)
+
+
+def _refuse_other_object(content: Mapping[str, Any], path: Path) -> None:
+    """Raises an error about an object that cannot be Scan2Cap's boxes by scene."""
+    wrong = next((key for key, rows in content.items() if not _are_boxes(rows)), None)
+    if wrong is not None:
+        raise InputError(
+            f"{path}: expected a list of ScanQA's or ScanRefer's entries, SQA3D's object with questions, or "
+            f"Scan2Cap's {{scene: [{{box}}, …]}}; got an object with {listed([key[:40] for key in content], 4)}, and "
+            f"no "
+            f"list of boxes as {wrong[:40]}"
+        )
+
+
+def _are_boxes(rows: Any) -> bool:
+    return isinstance(rows, list) and all(isinstance(row, dict) and "box" in row for row in rows)
 
 
 def _check_task(path: Path, what: str, task: Task, allowed: Sequence[str]) -> None:

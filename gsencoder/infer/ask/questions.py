@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, about
+from gsencoder.data.truth.checked_files import read_checked_text
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.prompts import Task, check_question
 
@@ -45,14 +46,8 @@ def read_questions(path: Path, task: Task = "answer") -> tuple[BatchQuestion, ..
     Raises:
         InputError: no such file, a line that is no such object, an id that comes twice, or no questions.
     """
-    if not path.is_file():
-        raise InputError(f"questions: {path} is no file; expected JSON lines")
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise InputError(f"questions: {path} holds more than {MAX_FILE_BYTES:,} bytes")
-        lines = path.read_bytes().decode("utf-8-sig").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"questions: {path} cannot be read as text: {error}") from error
+    with about("questions"):
+        lines = read_checked_text(path, max_bytes=MAX_FILE_BYTES).split("\n")
     questions: dict[str, BatchQuestion] = {}
     for number, line in enumerate(lines, start=1):
         if line.strip():

@@ -41,6 +41,7 @@ class Heard:
         refusal: the model's words where it refuses to answer.
         thought: whether there was reasoning beside the answer.
         parts: how many parts have come.
+        unstreamed: whether JSON came in place of the stream that was asked for.
     """
 
     text: str = ""
@@ -50,6 +51,7 @@ class Heard:
     refusal: str = ""
     thought: bool = False
     parts: int = 0
+    unstreamed: bool = False
 
     def hear(self, part: Any) -> None:
         """Takes up a completion, or a chunk of one.
@@ -81,8 +83,12 @@ class Heard:
             return f"a filter cut the answer off after {len(self.text)} characters"
         if self.text.strip():
             return None
-        hint = "; it thought until vlm.max_tokens" if self.thought and self.finish == "length" else ""
-        return f"the answer is empty (it ended with {self.finish!r}){hint}"
+        hints = {
+            "length": f"it {'thought' if self.thought else 'went on'} until vlm.max_tokens; raise it",
+            "tool_calls": "it calls a tool, and none is offered; switch tools off on the server, or take another model",
+        }
+        hint = hints.get(self.finish, "")
+        return f"the answer holds no text (it ended with {self.finish!r})" + (f"; {hint}" if hint else "")
 
 
 def _words(content: Any) -> str:

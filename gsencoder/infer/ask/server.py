@@ -194,6 +194,12 @@ class VlmServer:
             raise self._fault(self._guard.fault, ServerError)
         if failed:
             raise self._failure(failed[0], heard) from self._downscaled(failed[0])
+        if heard.unstreamed:
+            raise self._fault(
+                "sent nothing that is a chat completion, but JSON in place of the stream that was asked for; give "
+                "vlm.stream=false, or an address that ends in /v1, as most do",
+                ServerError,
+            )
         if not heard.parts:
             raise self._fault("sent nothing that is a chat completion; such addresses mostly end in /v1", ServerError)
         if not heard.finish:
@@ -221,6 +227,8 @@ class VlmServer:
         with completion as stream:
             for chunk in stream:
                 heard.hear(chunk)
+            kind = stream.response.headers.get("content-type", "")
+        heard.unstreamed = not heard.parts and kind.partition(";")[0].strip().lower() == "application/json"
 
     def _failure(self, error: BaseException, heard: Heard) -> InputError:
         """What went wrong, for people."""

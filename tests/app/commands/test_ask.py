@@ -471,7 +471,8 @@ def test_other_settings_ask_anew(features: Path, tmp_path: Path) -> None:
         (b'{"question": "a \\ud800"}\n', "line 1: question: holds what is no character"),
         (b'{"question": "a", "aabb": [1, 2]}\n', "line 1: aabb: expected six numbers"),
         (b'{"question": "a", "id": null}\n', "line 1: id: expected text"),
-        (b"\xff\xfe\n", "cannot be read as text"),
+        (b"\xff\xfe\n", "not a text file"),
+        (b"\x80\x04]", "is a pickle, which is refused since reading it can run code"),
     ],
 )
 def test_files_of_questions_that_are_wrong_say_where(
@@ -481,7 +482,7 @@ def test_files_of_questions_that_are_wrong_say_where(
     with pytest.raises(InputError) as caught:
         read_questions(tmp_path / "q.jsonl")
     assert told in str(caught.value)
-    with pytest.raises(InputError, match="is no file"):
+    with pytest.raises(InputError, match="no such file"):
         read_questions(tmp_path / "other.jsonl")
 
 

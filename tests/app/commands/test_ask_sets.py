@@ -197,7 +197,7 @@ def test_a_set_and_folders_that_do_not_fit_end_in_one_line(
         ((str(tmp_path / "empty"), file), "holds no features"),
         ((features, f"questions={lines}", "proposals=localize"), "questions about one scene"),
         ((features, features, f"questions={lines}"), "questions about one scene"),
-        ((f"{features}/{ROOMS[0]}", f"questions={other}"), "asks about 1 scenes (hall)"),
+        ((f"{features}/{ROOMS[0]}", f"questions={other}"), "asks about 1 scene (hall)"),
         ((features, str(tmp_path / "again"), file), "so does another folder"),
         ((features, "question=What?", "proposals=localize"), "are boxes for a question set"),
         ((features, str(tmp_path / "again"), "question=What?"), "expected one folder of features"),

@@ -58,3 +58,11 @@ def test_sentences_about_other_scenes_alone(room: Path, capsys: pytest.CaptureFi
     line = refused(capsys, room, "protocol=referring", f"protocol.expressions={room / 'ScanRefer.json'}")
     assert "none of the 1 sentences of " in line
     assert "is about a scene that is evaluated (room); first scene0000_00" in line
+
+
+def test_two_scenes_of_one_name(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make_room(1, objects=3, views=3, width=60, height=45)
+    write_room(made, room / "other" / "room")
+    for protocol in ("semantics", "localization"):
+        line = refused(capsys, room, str(room / "other" / "room"), f"protocol={protocol}")
+        assert "are both called 'room'" in line

@@ -59,7 +59,7 @@ def test_masks_of_classes_that_are_not_scored_are_counted(tmp_path: Path) -> Non
     assert cli.main([*words, f"classes={tmp_path / 'classes.csv'}", "quiet=true"]) == 0
     results = results_of(tmp_path / "out")
     assert (results["other_classes"], results["predictions"], results["ap"]) == (1, 1, 0.5)
-    assert "1 masks have a class id that is none of the 2" in (tmp_path / "out/table.md").read_text()
+    assert "Not counted: 1 mask with a class id that is none of the 2" in (tmp_path / "out/table.md").read_text()
 
 
 def test_a_truth_without_objects_of_the_classes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,6 +133,6 @@ def test_scenes_without_captions_are_refused_or_count_as_empty(
     (tmp_path / "predictions.json").write_text(json.dumps({"a": boxes}))
     files = [f"{name}={tmp_path / name}.json" for name in ("predictions", "truth")]
     asked = ["score", "captions", *files, "java=false", f"out={tmp_path / 'out'}"]
-    assert "1 scene(s) without a prediction, first b" in refusal(capsys, *asked)
+    assert "1 scene without a prediction, first b" in refusal(capsys, *asked)
     assert cli.main([*asked, "allow_missing=true", "quiet=true"]) == 0
     assert results_of(tmp_path / "out")["missing"] == 1

@@ -124,7 +124,7 @@ def test_folders_that_do_not_fit_are_refused(scans: Path, tmp_path: Path, capsys
     message = refusal(capsys, *words_of("instances", scans))
     assert "scene0009_00.txt: there is no truth of this scene" in message
     (predictions / "scene0009_00.txt").unlink()
-    assert "no prediction of 1 scenes: scene0001_00" in refusal(capsys, *words_of("instances", scans))
+    assert "no prediction of 1 scene: scene0001_00" in refusal(capsys, *words_of("instances", scans))
     write_masks(scans, vertices=7)
     assert "has 7 lines, and the scene 420 vertices" in refusal(capsys, *words_of("instances", scans))
     write_masks(scans)
@@ -156,7 +156,7 @@ def test_scanrefers_own_file_is_truth(scans: Path, tmp_path: Path) -> None:
     assert cli.main([*words, f"out={tmp_path / 'unknown'}"]) == 0
     results = results_of(tmp_path / "unknown")
     assert (results["acc_50"], results["unique_50"]) == (pytest.approx(2 / 3), None)
-    assert "3 sentences count in the overall columns alone" in (tmp_path / "unknown" / "table.md").read_text()
+    assert "3 sentences in the overall columns alone" in (tmp_path / "unknown" / "table.md").read_text()
 
 
 def test_sentences_without_boxes_need_scans(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

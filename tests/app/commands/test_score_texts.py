@@ -85,7 +85,7 @@ def test_columns_of_other_tokens_do_not_stand_under_those_of_papers(tmp_path: Pa
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
-        ({"q0": ["red"]}, "2 question(s) without a prediction, first q1"),
+        ({"q0": ["red"]}, "2 questions without a prediction, first q1"),
         ({**ANSWERS, "q9": ["red"]}, "q9"),
         ({**ANSWERS, "q1": [str(number) for number in range(11)]}, "answer_top10 has 11 answers, expected 1 to 10"),
     ],
@@ -137,4 +137,16 @@ def test_captions_of_given_objects_need_no_boxes(tmp_path: Path, capsys: pytest.
     assert results["rouge_l"] == pytest.approx(1.0)
     del captions["s0|1|chair"]
     message = refusal(capsys, *caption_files(tmp_path, captions), f"out={tmp_path / 'other'}")
-    assert "1 object(s) without a prediction, first 1 of s0" in message
+    assert "1 object without a prediction, first 1 of s0" in message
+
+
+def test_a_bleu_that_is_zero_but_for_rounding_reads_zero_in_tables_and_is_whole_in_the_summary(tmp_path: Path) -> None:
+    box = [[x, y, z] for x, y, z in SQUARE]
+    words = caption_files(tmp_path, {"s0": [{"caption": "zebra", "box": box}]})
+    assert cli.main([*words, f"out={tmp_path / 'out'}", "quiet=true"]) == 0
+    values = [value for key, value in results_of(tmp_path / "out").items() if key.startswith("bleu_4")]
+    assert 0 < values[0] < 1e-6
+    for name in ("table", "objects"):
+        with (tmp_path / "out" / f"{name}.csv").open(newline="") as stream:
+            row = next(csv.DictReader(stream))
+        assert [row[key] for key in row if key.startswith("bleu_4")] == ["0"]

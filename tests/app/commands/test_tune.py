@@ -230,3 +230,12 @@ def test_layers_that_the_model_does_not_have_are_refused_before_prompts_are_prep
     line = refusal(capsys, *(word for word in asked if word != "quiet=true"))
     assert "lora.targets: no linear layer outside the vision tower is called fc9; there are " in line
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("log_every", "told"), [(1, "went from "), (3, "in the log's only row (train.log_every=3)")])
+def test_a_loss_of_one_row_went_nowhere(
+    log_every: int, told: str, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = words(given, tmp_path / "out", f"train.log_every={log_every}", "quiet=false")
+    assert cli.main(asked) == 0
+    assert told in " ".join(capsys.readouterr().out.split())

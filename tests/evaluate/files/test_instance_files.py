@@ -168,7 +168,7 @@ def save_npz(path: Path, **changes: object) -> Path:
         ({"pred_masks": np.ones((5, 2), bool)}, "pred_masks is 5 × 2, and the scene has 300 vertices; expected"),
         ({"pred_classes": np.array([4])}, "2 masks, 1 pred_classes and 2 pred_scores"),
         ({"pred_scores": np.array([1, np.nan])}, "prediction 1 has the score nan"),
-        ({"pred_scores": np.array(["a", "b"])}, "pred_scores: expected 1 axes of type 'f'"),
+        ({"pred_scores": np.array(["a", "b"])}, "pred_scores: expected 1 axis of floating point, got 2 of <U1"),
         ({"pred_masks": np.array([None])}, "pred_masks"),
     ],
 )
@@ -193,10 +193,10 @@ def test_scenes_of_one_folder_only_are_refused(folders: tuple[Path, Path]) -> No
     with pytest.raises(InputError, match="scene0022_00.txt: there is no truth of this scene"):
         scene_files(*folders)
     (folders[0] / "scene0022_00.txt").rename(folders[1] / "scene0022_00.txt")
-    with pytest.raises(InputError, match="no prediction of 1 scenes: scene0022_00"):
+    with pytest.raises(InputError, match="no prediction of 1 scene: scene0022_00"):
         scene_files(*folders)
     assert [files.scene for files in scene_files(*folders, scenes=["scene0011_00"])] == ["scene0011_00"]
-    with pytest.raises(InputError, match="no truth of 1 scenes to score: scene0033_00"):
+    with pytest.raises(InputError, match="no truth of 1 scene to score: scene0033_00"):
         scene_files(*folders, scenes=["scene0011_00", "scene0033_00"])
 
 

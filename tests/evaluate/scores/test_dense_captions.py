@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.expressions import Expression
 from gsencoder.evaluate.scores.dense_captions import (
     CaptionedBox,
@@ -14,7 +15,6 @@ from gsencoder.evaluate.scores.dense_captions import (
     captioned_objects,
     score_box_captions,
     score_named_captions,
-    wrapped_caption,
 )
 
 NO_JAVA = "no Java here"
