@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.first_repeated import first_repeated
 
 Pooling = Literal["max", "mean"]
 DISTRACTORS = 1999
@@ -47,6 +48,80 @@ class Retrieval:
     def recalls(self) -> dict[str, float]:
         """Recall at 1, 5 and 10, by "recall_1" and so on."""
         return {f"recall_{k}": self.recall(k) for k in RECALLS}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScoredPairs:
+    """Scores of views with texts, however a method makes them; higher ones fit better.
+
+    Attributes:
+        queries: names of the views that have a text, each once.
+        scores: of each view with the texts of the queries, in their order, then with M texts of other pictures.
+        distractors: scores of M' other pictures with the texts of the queries.
+    """
+
+    queries: tuple[str, ...]
+    scores: Float64[np.ndarray, "Q Q_M"]
+    distractors: Float64[np.ndarray, "M2 Q"]
+
+    def __post_init__(self) -> None:
+        count = len(self.queries)
+        if self.scores.shape[0] != count or self.scores.shape[1] < count or self.distractors.shape[1] != count:
+            raise InputError(
+                f"retrieval: {count} queries need scores of {count} × {count} or more, and scores of other pictures of "
+                f"any × {count}; got {self.scores.shape[0]} × {self.scores.shape[1]} and "
+                f"{self.distractors.shape[0]} × {self.distractors.shape[1]}"
+            )
+        if repeated := first_repeated(self.queries):
+            raise InputError(f"retrieval: the query {repeated[0][:80]!r} is there twice; expected each once")
+
+
+def retrieve(pairs: ScoredPairs, texts: Sequence[str], *, count: int = 0, seed: int = 0) -> tuple[Retrieval, Retrieval]:
+    """The ranks of texts for views, and of views for texts.
+
+    The pool of a query is what belongs to it and distractors, where there are any (M3); else what belongs to the other
+    queries. Views with the same text are no rivals of each other.
+
+    Args:
+        pairs: scores.
+        texts: of the queries.
+        count: distractors in a pool, drawn by the query's name; 0 = all.
+        seed: of the draws.
+
+    Raises:
+        InputError: another number of texts than of queries, or fewer distractors than `count`.
+    """
+    number = len(pairs.queries)
+    if len(texts) != number:
+        raise InputError(f"retrieval: {number} queries and {len(texts)} texts; expected as many of both")
+    _, code = np.unique(np.array(texts, dtype=np.str_), return_inverse=True)
+    rivals = [np.flatnonzero(code != code[query]) for query in range(number)]
+    sides = []
+    for own, others in (
+        (pairs.scores[:, :number], pairs.scores[:, number:]),
+        (pairs.scores[:, :number].T, pairs.distractors.T),
+    ):
+        available = others.shape[1]
+        if available and count > available:
+            raise InputError(
+                f"retrieval: {count:,} distractors are asked for, and there are {available:,}; ask for fewer"
+            )
+        ranks = []
+        for query, name in enumerate(pairs.queries):
+            pool = (
+                others[query, draw(name, available, count or available, seed)]
+                if available
+                else own[query, rivals[query]]
+            )
+            ranks.append(rank_of_first(np.concatenate([own[query, query : query + 1], pool])))
+        sides.append(
+            Retrieval(
+                ranks=np.array(ranks, np.int64),
+                distractors=(count or available) if available else max(number - 1, 0),
+                not_finite=int((~np.isfinite(np.diagonal(own))).sum()),
+            )
+        )
+    return sides[0], sides[1]
 
 
 def view_scores(

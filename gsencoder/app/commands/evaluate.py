@@ -19,6 +19,7 @@ from gsencoder.evaluate.protocols.grounding import (
     GroundingProtocol,
 )
 from gsencoder.evaluate.protocols.naming import NamingProtocol
+from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol
 
 __all__ = ["EvaluateConfig", "run"]
 
@@ -38,6 +39,11 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
         from gsencoder.app.commands.evaluate_benchmark import run_benchmark
 
         run_benchmark(config, config.protocol, source, words, out, summary)
+        return
+    if isinstance(config.protocol, RetrievalProtocol):
+        from gsencoder.app.commands.evaluate_retrieval import run_retrieval
+
+        run_retrieval(config, config.protocol, source, words, out, summary)
         return
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
         if isinstance(config.protocol, NamingProtocol):

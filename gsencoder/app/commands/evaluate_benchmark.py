@@ -11,7 +11,7 @@ from pathlib import Path
 from torch import distributed
 
 from gsencoder.app.commands.evaluate_settings import EvaluateConfig
-from gsencoder.app.commands.evaluate_sources import scenes_of
+from gsencoder.app.commands.evaluate_sources import method_name, scenes_of
 from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
@@ -84,7 +84,7 @@ def run_benchmark(
         write_classes(folder / CLASS_IDS, classes)
         for scene in every:
             summary.add_seconds(scene.seconds)
-        report = score_written(folder, protocol, classes, _method(config))
+        report = score_written(folder, protocol, classes, method_name(config))
         write_report(folder, report, summary)
         if others:
             summary.results["other_scenes"] = others
@@ -132,13 +132,6 @@ def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str], *, wa
             stacklevel=2,
         )
     return len(others)
-
-
-def _method(config: EvaluateConfig) -> str:
-    """What the row of the table is called."""
-    if config.features:
-        return Path(config.features).resolve().name
-    return "encoded" if config.weights else "fused"
 
 
 def _from_first(folder: Path | None, process: ProcessRank) -> Path:

@@ -19,6 +19,7 @@ from gsencoder.evaluate.protocols.localization import (
 from gsencoder.evaluate.protocols.naming import NamingProtocol
 from gsencoder.evaluate.protocols.recognition import RecognitionProtocol
 from gsencoder.evaluate.protocols.referring import ReferringProtocol
+from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers.build import TeacherConfig
@@ -72,6 +73,7 @@ class EvaluateConfig(CommonConfig):
         | InstancesProtocol
         | SemanticsProtocol
         | ReferringProtocol
+        | RetrievalProtocol
     ) = field(default_factory=LocalizationProtocol)
     classes: str = field(
         default="",

@@ -1,6 +1,7 @@
 """What `gsencoder evaluate` evaluates: scenes, the source of their features, and words."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from gsencoder.app.commands.evaluate_settings import EvaluateConfig
 from gsencoder.app.commands.evaluated_features import stored_source, stored_words, with_stored_features
@@ -102,3 +103,10 @@ def scenes_of(config: EvaluateConfig, *, part: tuple[int, int] = (0, 1)) -> Iter
         options = {"head": config.head, "space": config.space}
         return with_stored_features(scenes, config.features, text=config.text, **options)
     return scenes
+
+
+def method_name(config: EvaluateConfig) -> str:
+    """What the row of the table is called."""
+    if config.features:
+        return Path(config.features).resolve().name
+    return "encoded" if config.weights else "fused"

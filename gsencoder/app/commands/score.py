@@ -16,9 +16,11 @@ from gsencoder.core.files.json_values import write_bytes
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.data.truth.split_files import read_split
 from gsencoder.evaluate.files.class_files import load_classes
+from gsencoder.evaluate.retrieval import Pooling
 from gsencoder.evaluate.score_boxes import score_referring
 from gsencoder.evaluate.score_files import score_instances, score_recognition, score_semantics
 from gsencoder.evaluate.score_report import ScoreReport
+from gsencoder.evaluate.score_retrieval import score_retrieval
 from gsencoder.evaluate.score_texts import score_answer_files, score_caption_files
 from gsencoder.evaluate.scores.instance_matches import MIN_REGION
 from gsencoder.evaluate.scores.semantics import BACKGROUND
@@ -37,7 +39,7 @@ class ScoreConfig(CommonConfig):
     paths: tuple[str, ...] = field(
         default=(),
         metadata={
-            "help": "what is scored: instances, semantics, recognition, referring, answers or captions",
+            "help": "what is scored: instances, semantics, recognition, referring, answers, captions or retrieval",
             "metavar": "PROTOCOL",
             "required": True,
         },
@@ -100,6 +102,14 @@ class ScoreConfig(CommonConfig):
     min_iou: float = field(
         default=0.5, metadata={"help": "of captions: IoU that a box must be above for its caption to count"}
     )
+    distractors: int = field(
+        default=0,
+        metadata={"help": "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all"},
+    )
+    seed: int = field(default=0, metadata={"help": "of retrieval: of their draw"})
+    pooling: Pooling = field(
+        default="max", metadata={"help": "of retrieval, where predictions are features: over the cells of a view"}
+    )
     java: bool = field(
         default=True,
         metadata={
@@ -119,6 +129,8 @@ class ScoreConfig(CommonConfig):
             raise InputError(f"ks: expected numbers from 1, got {', '.join(map(str, self.ks)) or 'none'}")
         if not 0 <= self.min_iou <= 1:
             raise InputError(f"min_iou: expected a share in [0, 1], got {self.min_iou}")
+        if self.distractors < 0:
+            raise InputError(f"distractors: expected 0 or more, got {self.distractors}")
         taken = TAKEN[self.paths[0]]
         defaults = type(self).__dataclass_fields__
         for name in dict.fromkeys(each for names in TAKEN.values() for each in names):
@@ -233,6 +245,17 @@ def _captions(config: ScoreConfig) -> ScoreReport:
     )
 
 
+def _retrieval(config: ScoreConfig) -> ScoreReport:
+    return score_retrieval(
+        Path(config.predictions),
+        Path(config.truth),
+        method=config.method,
+        count=config.distractors,
+        seed=config.seed,
+        pooling=config.pooling,
+    )
+
+
 def _given_classes(config: ScoreConfig) -> str:
     if not config.classes:
         raise InputError("classes= is missing: scannet20, scannet200, or a CSV file with the columns id and name")
@@ -257,6 +280,7 @@ PROTOCOLS: dict[str, Callable[[ScoreConfig], ScoreReport]] = {
     "referring": _referring,
     "answers": _answers,
     "captions": _captions,
+    "retrieval": _retrieval,
 }
 """What can be scored."""
 TAKEN = {
@@ -266,5 +290,6 @@ TAKEN = {
     "referring": ("label_map", "scans", "ks", "allow_missing"),
     "answers": ("java", "allow_missing"),
     "captions": ("min_iou", "java", "allow_missing"),
+    "retrieval": ("distractors", "seed", "pooling"),
 }
 """Settings of each protocol beside those that all have."""
