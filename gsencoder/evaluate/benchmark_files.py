@@ -6,7 +6,7 @@ is therefore what anyone finds who scores the same files.
 
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,6 +73,7 @@ def write_predictions(
     protocol: BenchmarkProtocol,
     class_names: Mapping[str, str] | None = None,
     raw_ids: Mapping[str, int] | None = None,
+    labeled: Collection[str] | None = None,
     part: int = 0,
     seeds: SeedConfig = SeedConfig(),
     localization: LocalizeConfig = LocalizeConfig(),
@@ -89,6 +90,7 @@ def write_predictions(
         protocol: what is predicted.
         class_names: the class of each name that objects have, where these are not class names themselves.
         raw_ids: nyu40id of each raw name, which tells unique sentences of a file from multiple ones.
+        labeled: of ScanNet++, raw names of the objects that a vertex can belong to; None = all.
         part: number of the process, where several have scenes of their own; `merge_lists` joins their files.
         seeds: how Gaussians are made for scenes without.
         localization: settings of `localize`.
@@ -110,7 +112,7 @@ def write_predictions(
     for loaded, load_seconds in scenes:
         scene, features, seconds = with_features(loaded, source, seeds)
         start = time.perf_counter()
-        mesh = None if scene.folder is None else find_labels(scene.folder)
+        mesh = None if scene.folder is None else find_labels(scene.folder, names=labeled)
         if isinstance(protocol, ReferringProtocol):
             asked = _expressions(scene, mesh, given, raw_ids)
             # Boxes of a file are in the aligned frame of its scans, those of a scene's objects in its world.

@@ -48,6 +48,7 @@ def score_instances(
     Raises:
         InputError: files that cannot be used or that do not belong together.
     """
+    classes.check_instance_ids()
     matches = list(
         match_instance_files(
             predictions,

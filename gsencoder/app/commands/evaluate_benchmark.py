@@ -20,6 +20,7 @@ from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.data.scenes import find_scenes, scene_name
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
+from gsencoder.data.truth.scannetpp_classes import ids_of_benchmark
 from gsencoder.evaluate.benchmark_files import (
     BenchmarkProtocol,
     PredictedScene,
@@ -55,7 +56,7 @@ def run_benchmark(
         with fail_together():
             if process.is_first:
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
-            classes, class_names = _classes(config)
+            classes, class_names, labeled = _classes(config)
             _check_names(protocol, classes, words)
             named = {scene_name(path) for path in find_scenes(config.paths)}
             others = _other_sentences(protocol, named, warn=process.is_first)
@@ -73,6 +74,7 @@ def run_benchmark(
                 protocol=protocol,
                 class_names=class_names,
                 raw_ids=raw_ids,
+                labeled=labeled,
                 part=process.rank,
                 seeds=config.seeds,
                 localization=config.localize,
@@ -151,15 +153,24 @@ def _from_all(done: list[PredictedScene], process: ProcessRank) -> list[Predicte
     return sorted((scene for part in parts for scene in part), key=lambda scene: scene.scene)
 
 
-def _classes(config: EvaluateConfig) -> tuple[ClassTable, dict[str, str] | None]:
-    """The classes that can be predicted, and where a label map is given the class of each raw name."""
+def _classes(config: EvaluateConfig) -> tuple[ClassTable, dict[str, str] | None, Collection[str] | None]:
+    """The classes that can be predicted; with a label map the class of each raw name; and with ScanNet++'s map the raw
+    names of the objects that a vertex can belong to, those of all its classes."""
     if not config.classes:
         if config.label_map and not isinstance(config.protocol, ReferringProtocol):
-            raise InputError("label_map: leads to the ids of a benchmark; give classes=scannet20 or classes=scannet200")
-        return classes_of(names_of(scene for scene, _ in scenes_of(config))), None
+            raise InputError(
+                "label_map: leads to the classes of a benchmark; give classes=scannet20, classes=scannet200 or, of "
+                "ScanNet++, classes=top100.txt"
+            )
+        return classes_of(names_of(scene for scene, _ in scenes_of(config))), None, None
     classes = load_classes(config.classes, instances=isinstance(config.protocol, InstancesProtocol))
     if not config.label_map:
-        return classes, None
-    name_of = classes.name_of
-    ids = read_label_map(Path(config.label_map), COLUMNS.get(config.classes, DEFAULT_COLUMN))
-    return classes, {raw: name_of[number] for raw, number in ids.items() if number in name_of}
+        return classes, None, None
+    name_of, path = classes.name_of, Path(config.label_map)
+    scannetpp = path.suffix.lower() == ".csv"
+    if scannetpp:
+        ids = ids_of_benchmark(path, load_classes(config.classes))
+    else:
+        ids = read_label_map(path, COLUMNS.get(config.classes, DEFAULT_COLUMN))
+    names = {raw: name_of[number] for raw, number in ids.items() if number in name_of}
+    return classes, names, list(ids) if scannetpp else None

@@ -63,8 +63,8 @@ def run_retrieval(
     with advised("sentences need the tower that made the words (text=)"):
         check_known(words, texts)
     for path in find_scenes(config.paths):
-        scene = load_scene(path, options=config.data)
-        views_of(scene, [each for each in captions if each.scene == scene.name])
+        loaded = load_scene(path, options=config.data)
+        views_of(loaded, [each for each in captions if each.scene == loaded.name])
 
     def memory_of(scene: Scene) -> QueryMemory | None:
         # Outputs of a head are features of their own; the memory holds those of the teacher.

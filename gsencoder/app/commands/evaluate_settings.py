@@ -78,15 +78,15 @@ class EvaluateConfig(CommonConfig):
     classes: str = field(
         default="",
         metadata={
-            "help": "of recognition, instances and semantics: scannet20, scannet200, or a CSV file with the columns "
-            "id, name and group; empty = the names of the scenes' objects"
+            "help": "of recognition, instances and semantics: scannet20, scannet200, a CSV file with the columns id, "
+            "name and group, or ScanNet++'s top100.txt; empty = the names of the scenes' objects"
         },
     )
     label_map: str = field(
         default="",
         metadata={
-            "help": "scannetv2-labels.combined.tsv, which gives the raw names of ScanNet's objects a class of "
-            "classes=, and of referring tells unique from multiple"
+            "help": "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv, which gives the raw names of "
+            "objects a class of classes=, and of referring tells unique from multiple"
         },
     )
     splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})

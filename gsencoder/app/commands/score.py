@@ -14,6 +14,7 @@ from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
+from gsencoder.data.truth.scannetpp_classes import ids_of_benchmark
 from gsencoder.data.truth.split_files import read_split
 from gsencoder.evaluate.files.class_files import load_classes
 from gsencoder.evaluate.retrieval import Pooling
@@ -51,7 +52,7 @@ class ScoreConfig(CommonConfig):
         default="",
         metadata={
             "help": "file or folder of the truth, in the benchmark's format; of instances and semantics also a folder "
-            "of ScanNet's scans, with label_map=",
+            "of scans of ScanNet or ScanNet++, with label_map=",
             "required": True,
         },
     )
@@ -59,15 +60,17 @@ class ScoreConfig(CommonConfig):
     classes: str = field(
         default="",
         metadata={
-            "help": "of instances, semantics and recognition: scannet20, scannet200, or a CSV file with the columns "
-            "id, name and, if there are any, group; empty for recognition = all names of the truth"
+            "help": "of instances, semantics and recognition: scannet20, scannet200, a CSV file with the columns id, "
+            "name and, if there are any, group, or ScanNet++'s top100.txt; empty for recognition = all names of the "
+            "truth"
         },
     )
     label_map: str = field(
         default="",
         metadata={
-            "help": "scannetv2-labels.combined.tsv: of instances and semantics it gives the objects of truth=SCANS a "
-            "class, of referring it tells unique from multiple where the truth does not"
+            "help": "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv: of instances and semantics it "
+            "gives the objects of truth=SCANS a class, of referring it tells unique from multiple where "
+            "the truth does not"
         },
     )
     scans: str = field(
@@ -263,9 +266,11 @@ def _given_classes(config: ScoreConfig) -> str:
 
 
 def _raw_ids(config: ScoreConfig) -> dict[str, int] | None:
-    """Class ids of the raw names of ScanNet's objects."""
+    """Class ids of the raw names of ScanNet's or ScanNet++'s objects."""
     if not config.label_map:
         return None
+    if Path(config.label_map).suffix.lower() == ".csv":
+        return ids_of_benchmark(Path(config.label_map), load_classes(_given_classes(config)))
     return read_label_map(Path(config.label_map), COLUMNS.get(config.classes, DEFAULT_COLUMN))
 
 

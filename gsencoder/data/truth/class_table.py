@@ -53,6 +53,21 @@ class ClassTable:
         """The id of each name."""
         return dict(zip(self.names, self.ids, strict=True))
 
+    def check_instance_ids(self) -> None:
+        """Checks that files of instances can hold all ids: class id · 1000 + number, below 1000 = no instance.
+
+        Raises:
+            InputError: a class has the id 0.
+        """
+        if 0 in self.ids:
+            raise InputError(
+                f"classes: {self.name_of[0]!r} has the id 0, which files of instances cannot hold: a vertex has "
+                f"class id "
+                "· 1000 + number of the instance, and below 1000 it has none; give the class another id, here and in "
+                f"the "
+                "files, or leave it out of classes="
+            )
+
     def without(self, names: Collection[str]) -> "ClassTable":
         """The table without some names, of which those that it does not have are passed over."""
         kept = [row for row, name in enumerate(self.names) if name not in names]

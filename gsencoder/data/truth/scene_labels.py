@@ -1,7 +1,7 @@
 """The labels beside the photographs of a ScanNet or ScanNet++ scene, as objects and instance maps of the scene."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,11 +28,12 @@ NAMELESS = frozenset(("object", "objects", "unknown", "unlabeled", "unlabelled",
 """Names that say nothing: what has one is not placed either."""
 
 
-def find_labels(folder: Path) -> MeshLabels | None:
+def find_labels(folder: Path, *, names: Collection[str] | None = None) -> MeshLabels | None:
     """The labels of a scene's mesh in the files of ScanNet or ScanNet++; None where there is no annotation.
 
     Args:
         folder: of the scene (`Scene.folder`).
+        names: of ScanNet++, raw names of the objects that are labeled (`read_scannetpp_labels`); None = all.
 
     Raises:
         InputError: a file is missing or wrong.
@@ -41,7 +42,7 @@ def find_labels(folder: Path) -> MeshLabels | None:
     if scannet is not None:
         return read_scannet_labels(scannet)
     scannetpp = find_scannetpp_files(folder)
-    return None if scannetpp is None else read_scannetpp_labels(scannetpp)
+    return None if scannetpp is None else read_scannetpp_labels(scannetpp, names=names)
 
 
 def labels_of_layout(folder: Path, layout: str) -> MeshLabels | None:

@@ -9,7 +9,8 @@ from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.data.truth.checked_files import read_checked_text
 from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.label_sets import COLUMNS, scannet_classes
+from gsencoder.data.truth.label_sets import COLUMNS, read_class_list, scannet_classes
+from gsencoder.data.truth.scannetpp_classes import read_instance_classes
 
 MAX_CLASS_BYTES = 4 << 20
 
@@ -22,21 +23,33 @@ def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
     """The classes of a benchmark, or of a file.
 
     Args:
-        classes: scannet20, scannet200, or a CSV file with the columns id and name, and group where classes have groups.
+        classes: scannet20, scannet200, a CSV file with the columns id, name and group where classes have groups, or a
+            list of names (.txt) such as ScanNet++'s top100.txt, whose ids count its lines from 0.
         instances: whether instances are scored: the benchmarks then leave out wall and floor, so that 18 and 198
-            classes remain. Those of a file are all scored.
+            classes remain. Of a list those in NAME_instance.txt beside it; those of a CSV file are all scored.
 
     Raises:
-        InputError: no such benchmark or file, or one that is not such a table.
+        InputError: no such benchmark or file, one that is not such a table, or instances of a class with the id 0.
     """
+    table = _table(classes, instances)
+    if instances:
+        table.check_instance_ids()
+    return table
+
+
+def _table(classes: str, instances: bool) -> ClassTable:
     if classes in COLUMNS:
         every = scannet_classes(classes)
         return every.without(STUFF) if instances else every
     path = Path(classes)
     if not path.is_file():
         raise InputError(
-            f"classes: {classes} is no file; expected {', '.join(COLUMNS)}, or a CSV file with the columns id and name"
+            f"classes: {classes} is no file; expected {', '.join(COLUMNS)}, a CSV file with the columns id and name, "
+            f"or "
+            "a list of names (.txt)"
         )
+    if path.suffix.lower() == ".txt":
+        return read_instance_classes(path) if instances else read_class_list(path)
     text = read_checked_text(path, max_bytes=MAX_CLASS_BYTES)
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:

@@ -1,4 +1,4 @@
-"""Truth of instances and of semantic labels from the labels of ScanNet's scans, without files in between.
+"""Truth of instances and of semantic labels from the labels of scans of ScanNet or ScanNet++, without files in between.
 
 It is what `gsencoder.data.truth.write_truth` writes, and what ScanNet's own export writes: class id · 1000 + objectId
 + 1, and class ids.
@@ -12,9 +12,14 @@ from jaxtyping import Int64
 
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.label_sets import ids_of_names, vertex_classes
-from gsencoder.data.truth.scannet_labels import read_scannet_labels
+from gsencoder.data.truth.scannet_labels import find_scannet_files, read_scannet_labels
+from gsencoder.data.truth.scannetpp_labels import find_scannetpp_files, read_scannetpp_labels
 from gsencoder.data.truth.write_truth import instance_truth
 from gsencoder.evaluate.scores.instance_masks import InstanceTruth
+from gsencoder.types import MeshLabels
+
+NONE = -1
+"""Of vertices of no class."""
 
 
 def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> InstanceTruth:
@@ -28,14 +33,24 @@ def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTa
     Raises:
         InputError: label files that are missing or wrong.
     """
-    labels = read_scannet_labels(folder)
+    labels = _labels(folder, raw_ids)
     names = dict(labels.objects)
     class_of = ids_of_names(names.values(), raw_ids, classes)
     return InstanceTruth(scene=folder.name, ids=instance_truth(labels.instances, names, class_of))
 
 
 def classes_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> Int64[np.ndarray, " V"]:
-    """The class id of each vertex of a scan's mesh, 0 = none; arguments and errors as of `instances_of_scan`."""
-    labels = read_scannet_labels(folder)
+    """The class id of each vertex of a scan's mesh, −1 = none; arguments and errors as of `instances_of_scan`."""
+    labels = _labels(folder, raw_ids)
     names = dict(labels.objects)
-    return vertex_classes(labels.instances, names, ids_of_names(names.values(), raw_ids, classes)).astype(np.int64)
+    ids = ids_of_names(names.values(), raw_ids, classes)
+    # 0 stands for none there, unless a raw name leads to it.
+    class_of = {name: number for name, number in ids.items() if number or (raw_ids.get(name) == 0 and 0 in classes.ids)}
+    return vertex_classes(labels.instances, names, class_of, none=NONE).astype(np.int64)
+
+
+def _labels(folder: Path, raw_ids: Mapping[str, int]) -> MeshLabels:
+    """The labels of a scan; of ScanNet++ those of the objects that have a class, as its toolkit takes them."""
+    if find_scannet_files(folder) is None and find_scannetpp_files(folder) is not None:
+        return read_scannetpp_labels(folder, names=raw_ids)
+    return read_scannet_labels(folder)

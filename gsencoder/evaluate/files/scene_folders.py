@@ -7,6 +7,7 @@ from pathlib import Path
 from gsencoder.core.errors import InputError, counted, listed
 from gsencoder.data.truth.checked_files import PICKLE_SUFFIXES
 from gsencoder.data.truth.scannet_labels import AGGREGATION
+from gsencoder.data.truth.scannetpp_labels import ANNOTATION
 
 RESULT_FILES = ("semantic_instance_evaluation.txt", "semantic_label_evaluation.txt")
 """What ScanNet's scripts write into the folder of the predictions."""
@@ -85,16 +86,24 @@ def scene_files(
 def _true_files(truth: Path, scans: bool) -> dict[str, Path]:
     """The file or the scan's folder of each scene with truth, by its name."""
     files = {path.stem: path for path in _files(truth, (".txt",))}
-    folders = {path.name: path for path in sorted(truth.iterdir()) if (path / f"{path.name}{AGGREGATION}").is_file()}
+    folders = {
+        path.name: path
+        for path in sorted(truth.iterdir())
+        if (path / f"{path.name}{AGGREGATION}").is_file() or (path / "scans" / ANNOTATION).is_file()
+    }
     if scans:
         if not folders:
             instead = "; SCENE.txt has ids of classes and needs no label map" if files else ""
-            raise InputError(f"{truth}: no scans; expected SCENE/SCENE{AGGREGATION} and the files beside it{instead}")
+            raise InputError(
+                f"{truth}: no scans; expected SCENE/SCENE{AGGREGATION} or SCENE/scans/{ANNOTATION}, and the "
+                f"files beside it{instead}"
+            )
         return folders
     if not files:
         instead = (
-            f"; the labels of {len(folders)} ScanNet scans that it holds become truth by scannetv2-labels.combined.tsv "
-            "(label_map=)"
+            f"; the labels of {counted(len(folders), 'scan')} that it holds become truth by "
+            f"scannetv2-labels.combined.tsv "
+            "or ScanNet++'s map_benchmark.csv (label_map=)"
             if folders
             else ""
         )

@@ -23,8 +23,8 @@ from gsencoder.evaluate.scores.semantics import BACKGROUND
 from gsencoder.text.encoder import TextEncoder
 from gsencoder.types import GaussianFeatures, Gaussians
 
-NO_CLASS = 0
-"""Id of points of no class, in truth and predictions."""
+NO_CLASS, NO_CLASS_BESIDE_ZERO = 0, -100
+"""Ids of points of no class, in truth and predictions; the second where 0 is the id of a class, as in ScanNet++."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,8 +49,13 @@ class SemanticsProtocol:
 
 
 def semantic_truth(points: LabeledPoints, classes: ClassTable) -> Int32[np.ndarray, " P"]:
-    """The class id of each point's object; `NO_CLASS` for points without a named object."""
-    return vertex_classes(points.objects, points.names, classes.id_of, none=NO_CLASS)
+    """The class id of each point's object; `id_of_none` for points without a named object."""
+    return vertex_classes(points.objects, points.names, classes.id_of, none=id_of_none(classes))
+
+
+def id_of_none(classes: ClassTable) -> int:
+    """The id of points of no class."""
+    return NO_CLASS_BESIDE_ZERO if 0 in classes.ids else NO_CLASS
 
 
 def predict_semantics(
@@ -61,7 +66,7 @@ def predict_semantics(
     text: TextEncoder,
     protocol: SemanticsProtocol = SemanticsProtocol(),
 ) -> Int32[np.ndarray, " P"]:
-    """The predicted class id of each point; `NO_CLASS` where no Gaussian has a feature.
+    """The predicted class id of each point; `id_of_none` where no Gaussian has a feature.
 
     Args:
         points: of a scene.
@@ -75,11 +80,12 @@ def predict_semantics(
         InputError: words of another space, or a name that `text` does not know.
     """
     nearest = nearest_class(features, classes.names, text)
-    labels = np.array([*classes.ids, NO_CLASS], np.int32)[nearest]
+    none = id_of_none(classes)
+    labels = np.array([*classes.ids, none], np.int32)[nearest]
     if points.positions is None:
         return labels
     return labels_of_vertices(
-        points.positions, gaussians.means, labels, k=protocol.voters, none=NO_CLASS, voters=nearest >= 0
+        points.positions, gaussians.means, labels, k=protocol.voters, none=none, voters=nearest >= 0
     )
 
 

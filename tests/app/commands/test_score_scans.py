@@ -113,7 +113,7 @@ def test_the_200_classes_take_another_column_of_the_label_map(scans: Path, tmp_p
 def test_folders_that_do_not_fit_are_refused(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     predictions = write_masks(scans)
     without_map = [word for word in words_of("instances", scans) if not word.startswith("label_map")]
-    assert "no truth; expected SCENE.txt for each scene; the labels of 2 ScanNet scans" in refusal(capsys, *without_map)
+    assert "no truth; expected SCENE.txt for each scene; the labels of 2 scans" in refusal(capsys, *without_map)
     truth = write_truth_files(scans, "nyu40id", write_instance_truth)
     words = [word for word in words_of("instances", scans) if not word.startswith("truth")]
     message = refusal(capsys, *words, f"truth={truth}")
