@@ -7,9 +7,12 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.even_indices import even_indices
+from gsencoder.data.readers.label_archives import ArchivedLabels
 from gsencoder.data.readers.posed import PosedImage, PosedImages
+from gsencoder.data.truth.mesh_instances import MeshInstances
 from gsencoder.data.up import Up, up_of_scene
 from gsencoder.types import Scene, Views
+from gsencoder.types.scene import Selected
 
 MAX_DEPTH_IMAGES = 24
 """So many depth images, evenly spaced, are read for their coverage and range."""
@@ -53,6 +56,7 @@ class SceneFacts:
         empty: share of the pixels that show that nothing is there; None where nothing says so.
         points: of structure from motion.
         objects: labeled ones.
+        instances: where instance maps come from; empty where there are none.
         metres_per_unit: None where unknown.
         up: stated or estimated; None where nothing says.
         missing: what is not there, and what follows from it.
@@ -70,6 +74,7 @@ class SceneFacts:
     empty: float | None
     points: int
     objects: int
+    instances: str
     metres_per_unit: float | None
     up: Up | None
     missing: tuple[str, ...]
@@ -98,6 +103,7 @@ class SceneFacts:
             "empty": self.empty,
             "points": self.points,
             "objects": self.objects,
+            "instances": self.instances,
             "metres_per_unit": self.metres_per_unit,
             "up": None if up is None else up.to_dict(),
             "missing": list(self.missing),
@@ -139,6 +145,7 @@ def scene_facts(scene: Scene, posed: PosedImages, layout: str) -> SceneFacts:
         empty=_empty_share(views),
         points=0 if scene.sfm_points is None else len(scene.sfm_points),
         objects=len(scene.objects),
+        instances=_instances_source(views),
         metres_per_unit=scene.metres_per_unit,
         up=up,
         missing=_missing(scene, up),
@@ -150,6 +157,17 @@ def _empty_share(views: Views) -> float | None:
         return None
     rows = even_indices(len(views), MAX_MASKS)
     return float(np.mean([views.empty[int(row)].mean() for row in rows]))
+
+
+def _instances_source(views: Views) -> str:
+    maps = views.instances
+    while isinstance(maps, Selected):
+        maps = maps.items
+    if isinstance(maps, ArchivedLabels):
+        return f"pictures in {maps.archive.name}"
+    if isinstance(maps, MeshInstances):
+        return "drawn from the labeled mesh"
+    return "" if maps is None else "pictures"
 
 
 def _depth_facts(scene: Scene, posed: PosedImages) -> DepthFacts | None:

@@ -27,7 +27,12 @@ from gsencoder.data.readers.scene_splat import (
 )
 from gsencoder.data.readers.transforms_json import TRANSFORMS
 from gsencoder.data.splats import load_splat
-from gsencoder.data.truth.scene_labels import labels_of_layout, objects_of_labels, with_mesh_instances
+from gsencoder.data.truth.scene_labels import (
+    labels_of_layout,
+    objects_of_labels,
+    with_archived_instances,
+    with_mesh_instances,
+)
 from gsencoder.types import Scene
 
 
@@ -161,6 +166,8 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     beside_transforms = root.suffix.lower() == ".json" or any((folder / file).is_file() for file in TRANSFORMS)
     labels = labels_of_layout(folder, layout)
     if labels is not None:
+        if layout == "ScanNet":
+            views = with_archived_instances(views, folder)
         views = with_mesh_instances(views, labels, origin)
     found = read_objects(objects) if beside_transforms and objects.is_file() else ()
     points = posed.points

@@ -54,6 +54,8 @@ def scene_table(facts: SceneFacts) -> Table:
         table.add_row("points", f"{facts.points:,} of structure from motion")
     if facts.objects:
         table.add_row("objects", f"{facts.objects:,} with boxes")
+    if facts.instances:
+        table.add_row("instance maps", facts.instances)
     table.add_row("unit", "unknown" if facts.metres_per_unit is None else f"{facts.metres_per_unit:g} m")
     table.add_row("up", "unknown" if facts.up is None else facts.up.describe())
     for line in facts.missing:

@@ -13,6 +13,7 @@ Rules that hold for all of them:
 - A smaller scale averages color over areas; depth and instances take the pixel at the new center.
 """
 
+import io
 import operator
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -44,12 +45,21 @@ def check_picture_size(path: Path, width: int, height: int) -> None:
         raise InputError(f"{path}: {width}×{height} pixels, expected 1 to {PIXEL_LIMIT:,}; make the picture smaller")
 
 
-def _open(path: Path) -> "Image":
+def picture_of(path: Path, data: io.BytesIO) -> "Image":
+    """A picture whose header was read from bytes of a file of that name.
+
+    Raises:
+        InputError: unreadable, or more than `PIXEL_LIMIT` pixels.
+    """
+    return _open(path, data)
+
+
+def _open(path: Path, data: io.BytesIO | None = None) -> "Image":
     """Reads a picture's header. Pillow raises nearly anything on hostile files, hence the wide net."""
     from PIL import Image
 
     try:
-        picture = Image.open(path, formats=FORMATS)
+        picture = Image.open(path if data is None else data, formats=FORMATS)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except Exception as error:
@@ -191,9 +201,12 @@ def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
     return np.asarray(values[..., : len(bands) - ("A" in bands)].any(axis=2))
 
 
-def read_integers(path: Path, what: str, *, wide: bool) -> np.ndarray:
-    """A single-channel integer PNG [H, W], int32; `wide` asks for more than 8 bits, as depth in millimetres has."""
-    with _open(path) as opened:
+def read_integers(path: Path, what: str, *, wide: bool, data: io.BytesIO | None = None) -> np.ndarray:
+    """A single-channel integer PNG [H, W], int32; `wide` asks for more than 8 bits, as depth in millimetres has.
+
+    With `data`, the content of the file is there already, and `path` names it in messages.
+    """
+    with _open(path, data) as opened:
         if opened.format == "JPEG":
             raise InputError(f"{path}: {what} was saved as JPEG, which changes values; expected PNG")
         allowed = DEEP_GREY + (() if wide else ("L", "P", "1"))

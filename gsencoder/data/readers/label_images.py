@@ -26,7 +26,7 @@ class LabelFiles(PictureFiles[Int32[np.ndarray, "H W"]]):
     def _load(self, view: int) -> Int32[np.ndarray, "H W"]:
         path, grid = self._paths[view], self._grids[view]
         assert path is not None
-        labels = read_labels(path)
+        labels = self._read(path)
         if labels.shape != (grid.source.height, grid.source.width):
             raise InputError(
                 f"{path}: {labels.shape[1]}×{labels.shape[0]} pixels, expected {grid.source.width}×"
@@ -34,13 +34,17 @@ class LabelFiles(PictureFiles[Int32[np.ndarray, "H W"]]):
             )
         return self._nearest(view, labels)
 
+    def _read(self, path: Path) -> Int32[np.ndarray, "H W"]:
+        return read_labels(path)
 
-def label_files(paths: Sequence[Path], views: Views) -> PictureFiles[Any]:
+
+def label_files(paths: Sequence[Path], views: Views, kind: type[LabelFiles] = LabelFiles) -> PictureFiles[Any]:
     """Label images of views, read on access.
 
     Args:
         paths: a file for each view.
         views: where their photographs come from files, labels belong to the pixels of these files; else to the cameras.
+        kind: how files are read.
 
     Returns:
         int32 [H, W] for each view, 0 = none.
@@ -50,8 +54,8 @@ def label_files(paths: Sequence[Path], views: Views) -> PictureFiles[Any]:
     while isinstance(pictures, Selected):
         pictures, rows = pictures.items, [pictures.rows[row] for row in rows]
     if isinstance(pictures, PictureFiles):
-        return LabelFiles(paths, [pictures.grids[row] for row in rows], pictures.remaps)
-    return LabelFiles(paths, [_grid_of(views, view) for view in range(len(views))], RemapCache())
+        return kind(paths, [pictures.grids[row] for row in rows], pictures.remaps)
+    return kind(paths, [_grid_of(views, view) for view in range(len(views))], RemapCache())
 
 
 def _grid_of(views: Views, view: int) -> PixelGrid:

@@ -3,12 +3,14 @@
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning, counted
+from gsencoder.data.readers.label_archives import ArchivedLabels, archived_size, members_by_stem
+from gsencoder.data.readers.label_images import label_files
 from gsencoder.data.truth.mesh_instances import MeshInstances
 from gsencoder.data.truth.scannet_labels import find_scannet_files, read_scannet_labels
 from gsencoder.data.truth.scannetpp_labels import find_scannetpp_files, read_scannetpp_labels
@@ -24,6 +26,8 @@ STRUCTURE = frozenset(
     .split("; ")
 )
 """Parts of the building, which are not placed."""
+ARCHIVES = ("_2d-instance-filt.zip", "_2d-instance.zip")
+"""Endings of ScanNet's archives of instance maps: 8-bit PNGs with objectId + 1, filtered by depth or not."""
 NAMELESS = frozenset(("object", "objects", "unknown", "unlabeled", "unlabelled", "remove", "split", "misc", "other"))
 """Names that say nothing: what has one is not placed either."""
 
@@ -124,6 +128,43 @@ def objects_of_labels(labels: MeshLabels) -> tuple[SceneObject, ...]:
         for number, name in labels.objects
         if number in boxes
     )
+
+
+def with_archived_instances(views: Views, folder: Path) -> Views:
+    """Views of a ScanNet scan with the instance maps of SCAN_2d-instance-filt.zip, or else of SCAN_2d-instance.zip,
+    where one lies beside the annotation and the views have no pictures of instances of their own.
+
+    Args:
+        views: called as their color frames.
+        folder: of the scene.
+
+    Raises:
+        InputError: the archive is damaged.
+
+    Warns:
+        SceneWarning: the archive is not used, since it lacks frames or its pictures have another size.
+    """
+    scan = find_scannet_files(folder)
+    archives = () if scan is None else tuple(scan.aggregation.with_name(f"{scan.name}{end}") for end in ARCHIVES)
+    archive = next((path for path in archives if path.is_file()), None)
+    if archive is None or views.instances is not None or not len(views):
+        return views
+    members = members_by_stem(archive)
+    stems = [PurePosixPath(name).stem for name in views.names]
+    missing = [stem for stem in stems if stem not in members]
+    fault = ""
+    if missing:
+        fault = f"has no picture of {counted(len(missing), 'view')} of {len(stems)} (first: {missing[0]}.png)"
+    else:
+        maps = label_files([members[stem] for stem in stems], views, ArchivedLabels)
+        size, source = archived_size(members[stems[0]]), maps.grids[0].source
+        if size == (source.width, source.height):
+            return replace(views, instances=maps)
+        fault = f"has pictures of {size[0]}×{size[1]} pixels, and photographs have {source.width}×{source.height}"
+    warnings.warn(
+        f"{archive}: {fault}, so that instance maps are drawn from the labeled mesh", SceneWarning, stacklevel=3
+    )
+    return views
 
 
 def with_mesh_instances(views: Views, labels: MeshLabels, origin: Float64[np.ndarray, "3"]) -> Views:

@@ -1,5 +1,7 @@
 """A room as a scan of ScanNet or ScanNet++: its objects, its instance maps, and `evaluate` on it."""
 
+import io
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,11 +10,13 @@ import pytest
 from command_runs import refusal, results_of
 from labeled_scans import group, write_ply, write_scannet_labels, write_scannet_scan, write_scannetpp_scan
 from named_rooms import write_words
+from PIL import Image
 from rgbd_layouts import write_scannet_frames
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.scene_facts import scene_facts
+from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.truth.mesh_instances import MeshInstances, draw_instances
 from gsencoder.data.truth.scene_labels import find_labels, is_placed, with_counted_views
@@ -141,8 +145,6 @@ def test_a_scene_far_from_zero_has_the_same_maps_and_boxes_there(tmp_path: Path)
 
 
 def test_pictures_of_instances_come_before_maps_of_the_mesh(room: Scene, tmp_path: Path) -> None:
-    from PIL import Image
-
     folder = write_scannet_scan(room, tmp_path / "scene0000_00")
     (folder / "instance-filt").mkdir()
     for view in range(VIEWS):
@@ -150,6 +152,84 @@ def test_pictures_of_instances_come_before_maps_of_the_mesh(room: Scene, tmp_pat
     scene = with_counted_views(load_scene(folder))
     assert {each.id: each.views for each in scene.objects if each.views} == {5: VIEWS}
     assert {each.max_pixels for each in scene.objects} == {0, 72 * 96}
+
+
+def pack(path: Path, inner: str, maps: list[np.ndarray]) -> None:
+    """An archive of instance maps as ScanNet's: a folder of 8-bit pictures, named as the frames."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for view, values in enumerate(maps):
+            data = io.BytesIO()
+            Image.fromarray(values.astype(np.uint8)).save(data, format="PNG")
+            archive.writestr(f"{inner}/{view}.png", data.getvalue())
+
+
+def source_of_maps(folder: Path) -> str:
+    """What `inspect` says of a scene's instance maps."""
+    posed, _, layout = read_posed(folder, SceneConfig())
+    assert posed is not None
+    return scene_facts(load_scene(folder), posed, layout).instances
+
+
+def test_archives_of_instances_come_before_maps_of_the_mesh_and_the_filtered_one_first(
+    room: Scene, tmp_path: Path
+) -> None:
+    folder = write_scannet_scan(room, tmp_path / "scene0000_00")
+    assert source_of_maps(folder) == "drawn from the labeled mesh"
+    assert room.views is not None
+    assert room.views.instances is not None
+    pack(folder / "scene0000_00_2d-instance.zip", "instance", [np.full((72, 96), 7)] * VIEWS)
+    scene = load_scene(folder)
+    assert scene.views is not None
+    assert scene.views.instances is not None
+    assert np.unique(scene.views.instances[2]).tolist() == [7]
+    given = [room.views.instances[view] for view in range(VIEWS)]
+    pack(folder / "scene0000_00_2d-instance-filt.zip", "instance-filt", given)
+    assert source_of_maps(folder) == "pictures in scene0000_00_2d-instance-filt.zip"
+    scene = load_scene(folder)
+    assert scene.views is not None
+    assert scene.views.instances is not None
+    for view in range(VIEWS):
+        np.testing.assert_array_equal(scene.views.instances[view], given[view])
+    half = scene.views.instances[1:2]
+    np.testing.assert_array_equal(half[0], given[1])
+    # Unpacked ones come first.
+    (folder / "instance-filt").mkdir()
+    for view in range(VIEWS):
+        Image.fromarray(np.full((72, 96), 5, np.uint8)).save(folder / "instance-filt" / f"{view}.png")
+    assert source_of_maps(folder) == "pictures"
+
+
+@pytest.mark.parametrize(
+    ("maps", "told"),
+    [
+        ([np.ones((72, 96))] * (VIEWS - 1), f"has no picture of 1 view of {VIEWS} \\(first: {VIEWS - 1}.png\\)"),
+        ([np.ones((36, 48))] * VIEWS, "has pictures of 48×36 pixels, and photographs have 96×72"),
+    ],
+)
+def test_an_archive_that_does_not_fit_is_named_and_maps_are_drawn(
+    maps: list[np.ndarray], told: str, room: Scene, tmp_path: Path
+) -> None:
+    folder = write_scannet_scan(room, tmp_path / "scene0000_00")
+    pack(folder / "scene0000_00_2d-instance-filt.zip", "instance-filt", maps)
+    with pytest.warns(SceneWarning, match=f"{told}, so that instance maps are drawn from the labeled mesh"):
+        assert source_of_maps(folder) == "drawn from the labeled mesh"
+
+
+def test_a_damaged_archive_is_an_error(room: Scene, tmp_path: Path) -> None:
+    folder = write_scannet_scan(room, tmp_path / "scene0000_00")
+    archive = folder / "scene0000_00_2d-instance-filt.zip"
+    archive.write_bytes(b"PK no")
+    with pytest.raises(InputError, match=r"_2d-instance-filt.zip: cannot be read as .zip"):
+        load_scene(folder)
+    pack(archive, "instance-filt", [np.ones((72, 96))] * VIEWS)
+    scene = load_scene(folder)
+    data = archive.read_bytes()
+    start = data.index(b"IDAT", data.index(b"IDAT") + 4)
+    archive.write_bytes(data[:start] + bytes(byte ^ 255 for byte in data[start : start + 9]) + data[start + 9 :])
+    assert scene.views is not None
+    assert scene.views.instances is not None
+    with pytest.raises(InputError, match=r"instance-filt.zip/instance-filt/1.png: cannot be read"):
+        _ = scene.views.instances[1]
 
 
 def test_an_annotation_without_its_files_leaves_the_photographs(room: Scene, tmp_path: Path) -> None:
