@@ -9,12 +9,13 @@ from typing import Any
 
 from gsencoder.app.commands.asker import load_asker
 from gsencoder.app.commands.question_scenes import localized_captions, photos_of, scene_folders
+from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import printable
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
-from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed
 from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.clock import Clock
@@ -34,7 +35,7 @@ PREDICTIONS = "predictions.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AskCommandConfig(CommonConfig):
+class AskCommandConfig(WordsOptions):
     """Settings of `ask`."""
 
     paths: tuple[str, ...] = field(
@@ -71,15 +72,6 @@ class AskCommandConfig(CommonConfig):
     )
     aabb: tuple[float, ...] = field(
         default=(), metadata={"help": "a box to show instead of words: lower and upper corner in world coordinates"}
-    )
-    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
-    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
-    head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
-            "features themselves are"
-        },
     )
     photos: str = field(
         default="",

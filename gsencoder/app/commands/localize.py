@@ -15,11 +15,11 @@ from gsencoder.app.commands.from_poses import (
 )
 from gsencoder.app.commands.query_words import asked_scene, query_words
 from gsencoder.app.commands.shown_scene import shown_scene
+from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.threads import import_ahead
@@ -33,7 +33,7 @@ from gsencoder.types import Localization
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LocalizeCommandConfig(CommonConfig):
+class LocalizeCommandConfig(WordsOptions):
     """Settings of `localize`."""
 
     paths: tuple[str, ...] = field(
@@ -42,15 +42,6 @@ class LocalizeCommandConfig(CommonConfig):
     )
     query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
     queries: str = field(default="", metadata={"help": "a text file with one query a line"})
-    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
-    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
-    head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
-            "features themselves are"
-        },
-    )
     pose: str = field(
         default="",
         metadata={

@@ -7,11 +7,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.threads import import_ahead
@@ -33,7 +33,7 @@ REST, HOLES = "rest", "holes.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SelectCommandConfig(CommonConfig):
+class SelectCommandConfig(WordsOptions):
     """Settings of `select`."""
 
     paths: tuple[str, ...] = field(
@@ -60,15 +60,6 @@ class SelectCommandConfig(CommonConfig):
         },
     )
     format: Format = field(default="ply", metadata={"help": "of the objects and the rest: ply, compressed.ply or spz"})
-    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
-    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
-    head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
-            "features themselves are"
-        },
-    )
     select: SelectConfig = field(default_factory=SelectConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)

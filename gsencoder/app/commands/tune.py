@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Literal
 
 from gsencoder.app.commands.tuning_prompts import PromptRecipe, prepare_prompts, read_dataset, tuning_pairs
+from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import lies_in, output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
-from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.model_files import find_file
 from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE, read_log
@@ -32,7 +33,7 @@ from gsencoder.train.tuning.vlm import SERVED_FOLDER, check_peft, check_targets,
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TuneCommandConfig(TuneConfig, CommonConfig):
+class TuneCommandConfig(TuneConfig, WordsOptions):
     """Settings of `tune`."""
 
     paths: tuple[str, ...] = field(
@@ -65,15 +66,6 @@ class TuneCommandConfig(TuneConfig, CommonConfig):
     scenes: tuple[str, ...] = field(
         default=(),
         metadata={"names": True, "help": "scenes to train on, with * and ?; empty = all of DATASET"},
-    )
-    words: str = field(default="", metadata={"help": "text table; empty = the one in the folders of features"})
-    space: str = field(default="", metadata={"help": "name of the feature space, if the folders hold several"})
-    head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
-            "features themselves are"
-        },
     )
     tokens: str = field(
         default="",

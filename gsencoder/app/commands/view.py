@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gsencoder.app.commands.query_words import asked_scene
+from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import refuse_existing
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.json_values import write_json
@@ -33,7 +33,7 @@ SUFFIX = ".html"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ViewConfig(CommonConfig):
+class ViewConfig(WordsOptions):
     """Settings of `view`."""
 
     paths: tuple[str, ...] = field(
@@ -49,15 +49,6 @@ class ViewConfig(CommonConfig):
         metadata={
             "help": "an .html file that holds page and scene, and opens without a server; empty = serve the page",
             "metavar": "FILE",
-        },
-    )
-    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
-    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
-    head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
-            "features themselves are"
         },
     )
     photos: str = field(
