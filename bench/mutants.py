@@ -89,7 +89,66 @@ WORD_FILES = {
     "reconstruct/expected_time": ("tests/reconstruct/test_expected_time.py",),
 }
 """Modules of words, of cameras in bare splats and of times and exposures, drawn with `--words`, and their tests."""
-LISTED_FILES = SCENE_FILES | WORD_FILES
+SCORE_TESTS = {
+    "evaluate/scores": {
+        "answers": ("answers", "lemmas", "sentences"),
+        "dense_captions": ("dense_captions",),
+        "instances": ("instance_masks", "instance_matches", "instances"),
+        "java_metrics": ("java_metrics",),
+        "means": ("means",),
+        "ngrams": ("ngrams",),
+        "recognition": ("recognition",),
+        "referring": ("box_overlap", "referring", "referring_kinds"),
+        "semantics": ("semantics",),
+    },
+    "evaluate/files": {
+        "answer_predictions": ("answer_predictions",),
+        "caption_predictions": ("caption_predictions",),
+        "instance_files": ("class_files", "instances", "scan_truth", "scene_folders", "semantics"),
+        "json_files": ("recognition", "referring"),
+    },
+    "evaluate": {
+        "picture_truth": ("picture_truth",),
+        "result_table": ("result_table",),
+        "scripted_answerer": ("answer_sheets", "scripted_answerer"),
+        "semantics_protocol": ("class_scores", "labeled_points"),
+    },
+    "data/truth": {
+        "class_table": ("class_table",),
+        "expressions": ("entries", "expression_boxes", "expressions"),
+        "label_sets": ("label_sets", "split_files", "write_truth"),
+        "made_expressions": ("made_expressions", "made_situations", "write_sqa3d"),
+        "made_questions": ("color_names", "english_nouns", "made_questions", "relations", "seen_objects"),
+        "mesh_labels": ("mesh_file", "scannet_labels", "scannetpp_labels", "segment_files"),
+        "nearest_vertices": ("nearest_vertices",),
+        "questions": ("questions",),
+        "scene_labels": ("mesh_instances", "mesh_raster", "scene_labels"),
+    },
+    "data": {"prompt_store": ("prompt_store",)},
+}
+"""Modules of a folder by the test file that they have."""
+SCORE_COMMAND = tuple(f"tests/app/commands/test_{name}.py" for name in ("score_limits", "score_scans"))
+SCORE_FILES = {
+    **{
+        f"{folder}/{module}": (f"tests/{folder}/test_{test}.py",)
+        for folder, tests in SCORE_TESTS.items()
+        for test, modules in tests.items()
+        for module in modules
+    },
+    **{f"evaluate/score_{name}": SCORE_COMMAND for name in ("boxes", "files", "report")},
+    "evaluate/score_texts": ("tests/app/commands/test_score_texts.py",),
+    **{
+        f"data/truth/{name}": ("tests/evaluate/files/test_instance_files.py",)
+        for name in ("checked_files", "number_files")
+    },
+    **{f"infer/ask/{name}": ("tests/infer/test_question_sets.py",) for name in ("predictions", "question_sets")},
+    **{
+        f"train/tuning/{name}": ("tests/train/test_tuning.py",)
+        for name in ("network", "run", "samples", "towers", "vlm")
+    },
+}
+"""Modules that read the truth of benchmarks, score, ask and tune, drawn with `--scores`, and the tests they have."""
+LISTED_FILES = SCENE_FILES | WORD_FILES | SCORE_FILES
 NOT_COPIED = shutil.ignore_patterns(".git", ".venv", "outputs", "dist", "build", ".*_cache")
 
 SWAPS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
@@ -270,6 +329,7 @@ def main() -> None:
     parser.add_argument("--modules", nargs="+", choices=(*MODULES, *LISTED_FILES), metavar="MODULE")
     parser.add_argument("--scenes", action="store_true", help="modules that read, check and seed scenes of others")
     parser.add_argument("--words", action="store_true", help="modules of words, cameras in bare splats and times")
+    parser.add_argument("--scores", action="store_true", help="modules of truth, scores, questions and tuning")
     parser.add_argument("--out", type=Path, help="default: outputs/mutants_SEED.jsonl")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="judge the survivors once more")
@@ -283,7 +343,11 @@ def main() -> None:
     for line in out.read_text().splitlines() if out.exists() else []:
         row = json.loads(line)
         known[Mutant(*(row[name] for name in Mutant.__dataclass_fields__))] = row
-    groups = (*(SCENE_FILES if chosen.scenes else ()), *(WORD_FILES if chosen.words else ()))
+    groups = (
+        *(SCENE_FILES if chosen.scenes else ()),
+        *(WORD_FILES if chosen.words else ()),
+        *(SCORE_FILES if chosen.scores else ()),
+    )
     modules = chosen.modules or groups or MODULES
     mutants = [mutant for module in modules for mutant in draw(module, chosen.count, chosen.seed)]
     due = [each for each in mutants if each not in known or (chosen.again and not known[each]["killed"])]

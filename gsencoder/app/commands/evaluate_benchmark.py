@@ -29,7 +29,7 @@ from gsencoder.evaluate.files.class_files import load_classes, write_classes
 from gsencoder.evaluate.protocols.absent import names_of
 from gsencoder.evaluate.protocols.instances import InstancesProtocol
 from gsencoder.evaluate.protocols.referring import ReferringProtocol, read_expressions
-from gsencoder.evaluate.protocols.semantics import classes_of
+from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
 from gsencoder.evaluate.sources import FeatureSource
 from gsencoder.text.build import Words
 from gsencoder.train.distributed import ProcessRank, fail_together, join_processes
@@ -146,6 +146,8 @@ def _classes(config: EvaluateConfig) -> tuple[ClassTable, dict[str, str] | None]
             raise InputError("label_map: leads to the ids of a benchmark; give classes=scannet20 or classes=scannet200")
         return classes_of(names_of(scene for scene, _ in scenes_of(config))), None
     classes = load_classes(config.classes, instances=isinstance(config.protocol, InstancesProtocol))
+    if isinstance(config.protocol, InstancesProtocol | SemanticsProtocol):
+        classes.check_zero_is_free()
     if not config.label_map:
         return classes, None
     name_of = classes.name_of

@@ -53,6 +53,18 @@ class ClassTable:
         """The id of each name."""
         return dict(zip(self.names, self.ids, strict=True))
 
+    def check_zero_is_free(self) -> None:
+        """Checks that 0 is no class, where it stands for what has none.
+
+        Raises:
+            InputError: a class has the id 0.
+        """
+        if 0 in self.ids:
+            raise InputError(
+                f"classes: {self.name_of[0]!r} has the id 0, which stands for no class in labels of scenes; expected "
+                "ids from 1"
+            )
+
     def without(self, names: Collection[str]) -> "ClassTable":
         """The table without some names, of which those that it does not have are passed over."""
         kept = [row for row, name in enumerate(self.names) if name not in names]

@@ -26,8 +26,9 @@ def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTa
         classes: that are scored; objects of others do not count.
 
     Raises:
-        InputError: label files that are missing or wrong.
+        InputError: label files that are missing or wrong, or a class with the id 0, which is that of no class here.
     """
+    classes.check_zero_is_free()
     labels = read_scannet_labels(folder)
     names = dict(labels.objects)
     class_of = ids_of_names(names.values(), raw_ids, classes)
@@ -36,6 +37,7 @@ def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTa
 
 def classes_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> Int64[np.ndarray, " V"]:
     """The class id of each vertex of a scan's mesh, 0 = none; arguments and errors as of `instances_of_scan`."""
+    classes.check_zero_is_free()
     labels = read_scannet_labels(folder)
     names = dict(labels.objects)
     return vertex_classes(labels.instances, names, ids_of_names(names.values(), raw_ids, classes)).astype(np.int64)

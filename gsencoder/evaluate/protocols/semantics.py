@@ -49,7 +49,12 @@ class SemanticsProtocol:
 
 
 def semantic_truth(points: LabeledPoints, classes: ClassTable) -> Int32[np.ndarray, " P"]:
-    """The class id of each point's object; `NO_CLASS` for points without a named object."""
+    """The class id of each point's object; `NO_CLASS` for points without a named object.
+
+    Raises:
+        InputError: a class has the id `NO_CLASS`.
+    """
+    classes.check_zero_is_free()
     return vertex_classes(points.objects, points.names, classes.id_of, none=NO_CLASS)
 
 
@@ -72,8 +77,9 @@ def predict_semantics(
         protocol: how many Gaussians vote for a vertex.
 
     Raises:
-        InputError: words of another space, or a name that `text` does not know.
+        InputError: words of another space, a name that `text` does not know, or a class with the id `NO_CLASS`.
     """
+    classes.check_zero_is_free()
     nearest = nearest_class(features, classes.names, text)
     labels = np.array([*classes.ids, NO_CLASS], np.int32)[nearest]
     if points.positions is None:
