@@ -100,18 +100,25 @@ SCORE_TESTS = {
         "recognition": ("recognition",),
         "referring": ("box_overlap", "referring", "referring_kinds"),
         "semantics": ("semantics",),
+        "instance_laws": ("instance_masks", "instance_matches", "instances", "recognition", "semantics"),
+        "score_laws": ("answers", "box_overlap", "dense_captions", "lemmas", "ngrams", "sentences"),
     },
     "evaluate/files": {
         "answer_predictions": ("answer_predictions",),
         "caption_predictions": ("caption_predictions",),
         "instance_files": ("class_files", "instances", "scan_truth", "scene_folders", "semantics"),
         "json_files": ("recognition", "referring"),
+        "class_files": ("class_files", "scan_truth", "scene_folders", "semantics"),
     },
     "evaluate": {
         "picture_truth": ("picture_truth",),
         "result_table": ("result_table",),
         "scripted_answerer": ("answer_sheets", "scripted_answerer"),
         "semantics_protocol": ("class_scores", "labeled_points"),
+        "answer_sheets": ("answer_sheets",),
+        "class_scores": ("class_scores",),
+        "labeled_points": ("labeled_points",),
+        "score_reports": ("score_boxes", "score_files", "score_report", "score_texts"),
     },
     "data/truth": {
         "class_table": ("class_table",),
@@ -123,30 +130,47 @@ SCORE_TESTS = {
         "nearest_vertices": ("nearest_vertices",),
         "questions": ("questions",),
         "scene_labels": ("mesh_instances", "mesh_raster", "scene_labels"),
+        "entries": ("entries",),
+        "expression_boxes": ("expression_boxes",),
+        "instance_maps": ("mesh_instances", "mesh_raster", "scene_labels"),
+        "mesh_limits": ("mesh_file", "scannet_labels", "scannetpp_labels", "segment_files"),
+        "relations": ("english_nouns", "relations"),
+        "seen_laws": (
+            *("color_names", "made_expressions", "made_questions", "made_situations", "questions", "seen_objects"),
+            "write_sqa3d",
+        ),
     },
+    "infer/ask": {
+        "question_sets": ("predictions", "question_sets"),
+        "ask_predictions": ("predictions", "question_sets"),
+    },
+    "train/tuning": {name: ("network", "run", "samples", "towers", "vlm") for name in ("tuning", "tuning_laws")},
     "data": {"prompt_store": ("prompt_store",)},
 }
-"""Modules of a folder by the test file that they have."""
+"""Modules of a folder by the test files that they have."""
 SCORE_COMMAND = tuple(f"tests/app/commands/test_{name}.py" for name in ("score_limits", "score_scans"))
-SCORE_FILES = {
-    **{
-        f"{folder}/{module}": (f"tests/{folder}/test_{test}.py",)
-        for folder, tests in SCORE_TESTS.items()
-        for test, modules in tests.items()
-        for module in modules
-    },
+OTHER_SCORE_TESTS = {
     **{f"evaluate/score_{name}": SCORE_COMMAND for name in ("boxes", "files", "report")},
     "evaluate/score_texts": ("tests/app/commands/test_score_texts.py",),
     **{
         f"data/truth/{name}": ("tests/evaluate/files/test_instance_files.py",)
         for name in ("checked_files", "number_files")
     },
-    **{f"infer/ask/{name}": ("tests/infer/test_question_sets.py",) for name in ("predictions", "question_sets")},
-    **{
-        f"train/tuning/{name}": ("tests/train/test_tuning.py",)
-        for name in ("network", "run", "samples", "towers", "vlm")
-    },
 }
+
+
+def _score_files() -> dict[str, tuple[str, ...]]:
+    files = dict(OTHER_SCORE_TESTS)
+    for folder, tests in SCORE_TESTS.items():
+        place = {"infer/ask": "infer", "train/tuning": "train"}.get(folder, folder)
+        for test, modules in tests.items():
+            for module in modules:
+                name = f"{folder}/{module}"
+                files[name] = (*files.get(name, ()), f"tests/{place}/test_{test}.py")
+    return files
+
+
+SCORE_FILES = _score_files()
 """Modules that read the truth of benchmarks, score, ask and tune, drawn with `--scores`, and the tests they have."""
 LISTED_FILES = SCENE_FILES | WORD_FILES | SCORE_FILES
 NOT_COPIED = shutil.ignore_patterns(".git", ".venv", "outputs", "dist", "build", ".*_cache")

@@ -45,7 +45,7 @@ def test_other_object_ids_are_refused(value: Any) -> None:
 
 
 def test_a_number_is_finite_and_at_most_so_large() -> None:
-    assert (number(3, HERE, "x"), number(-1e15, HERE, "x"), number(5, HERE, "x", largest=5)) == (3.0, -1e15, 5.0)
+    assert (number(3, HERE, "x"), number(-1e15, HERE, "x"), number(5, HERE, "x", largest=5.0)) == (3.0, -1e15, 5.0)
     assert isinstance(number(3, HERE, "x"), float)
     for value in (float("nan"), float("inf"), 1.1e15, -1.1e15, 10**400):
         assert "x must be a finite number of at most 1e+15" in refused(number, value, HERE, "x")
