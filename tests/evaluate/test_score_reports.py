@@ -16,6 +16,7 @@ from gsencoder.evaluate.score_boxes import score_referring
 from gsencoder.evaluate.score_files import EQUAL_SCORES, score_instances, score_recognition, score_semantics
 from gsencoder.evaluate.score_report import spread
 from gsencoder.evaluate.score_texts import score_answer_files, score_caption_files
+from gsencoder.evaluate.scores import sentences
 from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
 
 CLASSES = ClassTable(
@@ -330,3 +331,16 @@ def test_captions_are_reported_with_their_k(tmp_path: Path, min_iou: float, endi
     assert any(row.source == "published" for row in report.table.rows) is published
     # A k of one half is what is taken where none is given.
     assert (score_caption_files(*files, java=False).results["missing"] == results["missing"]) is published
+
+
+def test_java_is_looked_for_unless_it_is_not_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sentences, "find_java_tools", lambda: "there is none")
+    questions = [{"scene_id": "s", "question_id": "q", "question": "What is it?", "answers": ["a"]}]
+    asked = written(tmp_path / "t.json", questions), [{"question_id": "q", "answer_top10": ["a"]}]
+    described = [{"scene_id": "s", "object_id": 1, "object_name": "x", "ann_id": 0, "description": "a", "token": ["a"]}]
+    captioned = written(tmp_path / "d.json", described), {"s|1": ["a"]}
+    for score, (truth, said) in ((score_answer_files, asked), (score_caption_files, captioned)):
+        predictions = written(tmp_path / "p.json", said)
+        assert score(predictions, truth).results["absent"]["METEOR"] == "there is none"
+        refused = score(predictions, truth, java=False).results["absent"]["METEOR"]
+        assert refused == "Java was not asked for (java=false)"
