@@ -344,3 +344,27 @@ def test_java_is_looked_for_unless_it_is_not_asked_for(tmp_path: Path, monkeypat
         assert score(predictions, truth).results["absent"]["METEOR"] == "there is none"
         refused = score(predictions, truth, java=False).results["absent"]["METEOR"]
         assert refused == "Java was not asked for (java=false)"
+
+
+def test_what_is_scored_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
+    truth = written(tmp_path / "t.json", [{"scene_id": "s", "object_id": 1, "label": "bed"}])
+    ranked = written(tmp_path / "p.json", [{"scene_id": "s", "object_id": 1, "labels": ["bed"]}])
+    none = written(tmp_path / "n.json", [])
+    found = score_recognition(ranked, truth).results
+    assert {name for name in found if name.startswith(("mean_", "overall_"))} == {
+        f"{kind}_{k}" for kind in ("mean", "overall") for k in (1, 5)
+    }
+    with pytest.raises(InputError, match="object 1 of s has no prediction"):
+        score_recognition(none, truth)
+    keys = {"scene_id": "s", "object_id": 1, "ann_id": "0"}
+    said = written(tmp_path / "d.json", [keys | {"object_name": "x", "description": "x", "token": [], "bbox": cube(0)}])
+    boxes = score_referring(written(tmp_path / "b.json", [keys | {"bbox": cube(0)}]), said)
+    assert set(boxes.results["best_of"]) == {"5", "all"}
+    with pytest.raises(InputError, match="sentence 0 about object 1 of s has no prediction"):
+        score_referring(none, said)
+    asked = written(tmp_path / "q.json", [{"scene_id": "s", "question_id": "q", "question": "x", "answers": ["a"]}])
+    with pytest.raises(InputError, match="1 question\\(s\\) without a prediction, first q; allow_missing=true counts"):
+        score_answer_files(none, asked, java=False)
+    with pytest.raises(InputError, match="1 object\\(s\\) without a prediction, first 1 of s"):
+        score_caption_files(written(tmp_path / "c.json", {}), said, java=False)
+    assert score_caption_files(tmp_path / "c.json", said, java=False, allow_missing=True).results["missing"] == 1

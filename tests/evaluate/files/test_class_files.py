@@ -136,8 +136,10 @@ def test_labels_of_no_class_are_not_taken_for_instances_of_class_0(tmp_path: Pat
 def test_ids_of_instances_are_told_from_classes_by_the_thousand(tmp_path: Path) -> None:
     classes = ClassTable(names=("wall", "bed"), ids=(1, 4))
     folders = label_folders(tmp_path, predictions=[4000, 0, 0], truth=[1, 4, 4])
-    with pytest.raises(InputError, match=r"ids such as 4000 are those of instances, class id · 1000 \+ number"):
-        list(count_label_files(*folders, classes))
+    for number in (1000, 4000):
+        write_whole_numbers(folders[0] / "s.txt", np.array([number, 0, 0]))
+        with pytest.raises(InputError, match=rf"ids such as {number} are those of instances, class id · 1000 \+ number"):
+            list(count_label_files(*folders, classes))
     # One id of a class is enough to take the others for ids of no class.
     write_whole_numbers(folders[0] / "s.txt", np.array([4000, 1, 0]))
     assert [counts.confusion.tolist() for counts in count_label_files(*folders, classes)] == [[[0, 0, 1], [1, 0, 1]]]
