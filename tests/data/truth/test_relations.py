@@ -41,6 +41,8 @@ def test_a_thing_stands_on_another_within_four_centimeters_and_with_six_tenths_o
     table = box(1, (0, 0, 0))
     for height, on in ((1.0, True), (1.039, True), (0.961, True), (1.041, False), (0.959, False)):
         assert stands_on(box(2, (0, 0, height)), table) is on
+    # Four centimeters are near enough.
+    assert stands_on(box(2, (0, 0, 0.04)), box(1, (0, 0, -1)))
     for shift, on in ((0.39, True), (0.41, False)):
         assert stands_on(box(2, (shift, 0, 1)), table) is on
     # It is the share of the upper outline, not of the lower one.

@@ -242,3 +242,10 @@ def test_a_file_without_questions_is_no_file_of_sqa3d(tmp_path: Path) -> None:
         path.write_text(json.dumps(content))
         with pytest.raises(InputError, match=f"expected SQA3D's object with questions, got {got}"):
             read_sqa3d(path)
+
+
+def test_two_hundred_pixels_are_enough_to_be_asked_about_where_nothing_else_is_said() -> None:
+    assert QuestionsConfig().min_pixels == 200
+    seen = see_objects(photographed([picture(RED, 10)]))
+    assert (seen.objects[0].pixels, seen.shown(seen.objects[0])) == (200, True)
+    assert not replace(seen, min_pixels=seen.min_pixels + 1).shown(seen.objects[0])

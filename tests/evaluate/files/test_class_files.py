@@ -138,7 +138,9 @@ def test_ids_of_instances_are_told_from_classes_by_the_thousand(tmp_path: Path) 
     folders = label_folders(tmp_path, predictions=[4000, 0, 0], truth=[1, 4, 4])
     for number in (1000, 4000):
         write_whole_numbers(folders[0] / "s.txt", np.array([number, 0, 0]))
-        with pytest.raises(InputError, match=rf"ids such as {number} are those of instances, class id · 1000 \+ number"):
+        with pytest.raises(
+            InputError, match=rf"ids such as {number} are those of instances, class id · 1000 \+ number"
+        ):
             list(count_label_files(*folders, classes))
     # One id of a class is enough to take the others for ids of no class.
     write_whole_numbers(folders[0] / "s.txt", np.array([4000, 1, 0]))

@@ -319,3 +319,11 @@ def test_an_object_without_a_prediction_is_refused_unless_it_may_be_missing(tmp_
         recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"])
     found, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"], allow_missing=True)
     assert ([(each.place, each.first) for each in found], others) == ([(0, None)], 0)
+
+
+def test_bbox_is_the_first_of_bboxes_and_no_other_of_them(tmp_path: Path) -> None:
+    other = [[5.0, 0.0, 0.0], [6.0, 1.0, 1.0]]
+    (read,) = read_referring_predictions(written(tmp_path / "p.json", [PREDICTED | {"bboxes": [CORNERS, other]}]))
+    assert read.boxes.tolist() == [BOX.tolist(), other]
+    with pytest.raises(InputError, match="bbox is not the first of bboxes"):
+        read_referring_predictions(written(tmp_path / "p.json", [PREDICTED | {"bboxes": [other, CORNERS]}]))
