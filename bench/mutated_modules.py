@@ -91,6 +91,7 @@ SCORE_TESTS = {
         "class_scores": ("class_scores",),
         "labeled_points": ("labeled_points",),
         "score_reports": ("score_boxes", "score_files", "score_report", "score_texts"),
+        "text_reports": ("score_texts",),
     },
     "data/truth": {
         "class_table": ("class_table",),
