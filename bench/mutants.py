@@ -28,68 +28,10 @@ from pathlib import Path
 from queue import Queue
 from tempfile import TemporaryDirectory
 
+from mutated_modules import FOLDERS, MODULES, SCENE_FILES, SCORE_FILES, WORD_FILES
+
 ROOT = Path(__file__).parents[1]
-MODULES = (
-    *(
-        "geometry",
-        "fusion/lift",
-        "fusion/basis",
-        "fusion/visibility",
-        "infer/localize/boxes",
-        "infer/localize/relevancy",
-    ),
-    *("infer/views/utility", "train/losses", "train/samples", "models/grid/serialize", "models/grid/plan"),
-    *("data/seeding/depth", "data/readers/transforms_json", "reconstruct/prune"),
-)
-FOLDERS = {"geometry": ("tests/test_geometry.py", "tests/render", "tests/data")}
-CHECKS = ("color_agreement", "depth_agreement", "epipolar", "pose_readings", "readings", "scene_check", "stray_views")
-REPAIRS = ("data/check/registration_fit", "data/check/repair_scene", "data/readers/write_transforms")
-LAYOUTS = ("registration", "replica", "scannetpp", "seven_scenes", "tum")
-FILES = ("layouts", "posed")
-PHOTOGRAPHS = ("feature_matches", "from_photographs", "triangulate", "view_pairs")
-SCENE_FILES = {
-    **{f"data/check/{name}": ("tests/data/check",) for name in CHECKS},
-    **dict.fromkeys(REPAIRS, ("tests/data/check", "tests/app/commands/test_inspect_scene.py")),
-    **{f"data/readers/{name}": ("tests/data/readers", "tests/data/test_layouts.py") for name in LAYOUTS},
-    **{
-        f"data/readers/{name}": (
-            "tests/data/readers",
-            "tests/data/test_layouts.py",
-            "tests/data/test_scenes.py",
-            "tests/data/test_transforms_json.py",
-        )
-        for name in FILES
-    },
-    **{f"data/seeding/{name}": ("tests/data/seeding", "tests/data/test_triangulate.py") for name in PHOTOGRAPHS},
-    "data/up": ("tests/data/test_up.py",),
-    "app/runs/scene_queue": ("tests/app/test_scene_queue.py",),
-    "types/scene": ("tests/test_types.py",),
-}
-"""Modules that read, check and seed scenes of others, drawn with `--scenes`, and the tests that belong to them."""
-SEGMENTER = "tests/fusion/test_segmenter.py"
-TOWERS = ("build", "embedding_cache", "onnx_tower", "open_vocabulary", "towers", "transformers_tower")
-SEGMENTERS = ("build", "segmenter", "segmenter_classes", "segmenter_onnx", "segmenter_transformers")
-WORD_FILES = {
-    **{f"text/{name}": ("tests/text",) for name in TOWERS},
-    "core/pretrained": (
-        "tests/core/test_pretrained.py",
-        "tests/text/test_transformers_tower.py",
-        "tests/fusion/test_radio.py",
-        SEGMENTER,
-    ),
-    **{f"fusion/teachers/{name}": (SEGMENTER, "tests/fusion/test_teachers.py") for name in SEGMENTERS},
-    "fusion/lift": ("tests/fusion/test_lift.py", SEGMENTER, "tests/fusion/test_fuse.py"),
-    "fusion/interior_views": ("tests/fusion/test_interior_views.py",),
-    "fusion/orbit_views": ("tests/fusion/test_interior_views.py",),
-    "fusion/teacher_maps": ("tests/fusion/test_teacher_maps.py", SEGMENTER),
-    "types/features": ("tests/test_types.py", SEGMENTER),
-    "infer/localize/presence": ("tests/infer/test_presence.py",),
-    "infer/localize/threshold": ("tests/infer/test_presence.py", "tests/infer/test_relevancy.py"),
-    **{f"reconstruct/{name}": (f"tests/reconstruct/test_{name}.py",) for name in ("exposure_prediction", "budget")},
-    "reconstruct/expected_time": ("tests/reconstruct/test_expected_time.py",),
-}
-"""Modules of words, of cameras in bare splats and of times and exposures, drawn with `--words`, and their tests."""
-LISTED_FILES = SCENE_FILES | WORD_FILES
+LISTED_FILES = SCENE_FILES | WORD_FILES | SCORE_FILES
 NOT_COPIED = shutil.ignore_patterns(".git", ".venv", "outputs", "dist", "build", ".*_cache")
 
 SWAPS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
@@ -270,6 +212,7 @@ def main() -> None:
     parser.add_argument("--modules", nargs="+", choices=(*MODULES, *LISTED_FILES), metavar="MODULE")
     parser.add_argument("--scenes", action="store_true", help="modules that read, check and seed scenes of others")
     parser.add_argument("--words", action="store_true", help="modules of words, cameras in bare splats and times")
+    parser.add_argument("--scores", action="store_true", help="modules of truth, scores, questions and tuning")
     parser.add_argument("--out", type=Path, help="default: outputs/mutants_SEED.jsonl")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="judge the survivors once more")
@@ -283,7 +226,11 @@ def main() -> None:
     for line in out.read_text().splitlines() if out.exists() else []:
         row = json.loads(line)
         known[Mutant(*(row[name] for name in Mutant.__dataclass_fields__))] = row
-    groups = (*(SCENE_FILES if chosen.scenes else ()), *(WORD_FILES if chosen.words else ()))
+    groups = (
+        *(SCENE_FILES if chosen.scenes else ()),
+        *(WORD_FILES if chosen.words else ()),
+        *(SCORE_FILES if chosen.scores else ()),
+    )
     modules = chosen.modules or groups or MODULES
     mutants = [mutant for module in modules for mutant in draw(module, chosen.count, chosen.seed)]
     due = [each for each in mutants if each not in known or (chosen.again and not known[each]["killed"])]

@@ -1,5 +1,6 @@
 """Prompts on disk: what is written is read, pictures are shared, and what was cut off or changed is noticed."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -64,4 +65,81 @@ def test_a_changed_picture_is_refused(tmp_path: Path) -> None:
 def test_lines_that_no_store_wrote_are_refused(tmp_path: Path, line: bytes) -> None:
     (tmp_path / PROMPTS_FILE).write_bytes(line + b"\n")
     with pytest.raises(InputError, match="line 1 is no prompt"):
+        PromptStore(tmp_path)
+
+
+def test_names_are_those_of_formats_and_tokens_of_other_shapes_are_others(tmp_path: Path) -> None:
+    store = PromptStore(tmp_path)
+    jpeg = bytes([255, 216, 255, 224]) + b"no picture"
+    values = np.arange(12, dtype=np.float16)
+    first = store.add("a", "t", [jpeg, png(0)], values.reshape(2, 3, 2))
+    second = store.add("b", "t", [png(0)], values.reshape(2, 2, 3))
+    assert [name.rpartition(".")[2] for name in first.pictures] == ["jpg", "png"]
+    assert {len(Path(name).stem) for name in (*first.pictures, first.tokens)} == {32}
+    assert second.pictures == first.pictures[1:]
+    # Of the same bytes.
+    assert first.tokens != second.tokens
+    assert store.tokens(first.tokens).shape == (2, 3, 2)
+    assert store.tokens(second.tokens).shape == (2, 2, 3)
+    again = PromptStore(tmp_path).prompts
+    assert (again["a"], again["b"]) == (first, second)
+    assert [len(list((tmp_path / folder).iterdir())) for folder in (PICTURES_FOLDER, TOKENS_FOLDER)] == [2, 2]
+
+
+def test_a_prompt_that_is_written_again_replaces_the_one_before(tmp_path: Path) -> None:
+    store = PromptStore(tmp_path)
+    store.add("a", "old", [png(0)])
+    store.add("b", "other", [png(1)])
+    store.add("a", "new", [png(0)])
+    for found in (store, PromptStore(tmp_path)):
+        assert {key: each.text for key, each in found.prompts.items()} == {"a": "new", "b": "other"}
+
+
+@pytest.mark.parametrize("cut", [1, 2, 40])
+def test_a_cut_line_of_any_length_is_dropped_and_whole_ones_stay(tmp_path: Path, cut: int) -> None:
+    store = PromptStore(tmp_path)
+    for key in ("a", "b", "c"):
+        store.add(key, f"text {key}", [png(0)])
+    path = tmp_path / PROMPTS_FILE
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-cut])
+    again = PromptStore(tmp_path)
+    assert list(again.prompts) == ["a", "b"]
+    again.add("c", "text c", [png(0)])
+    assert path.read_bytes() == whole
+    # A line that ends stays, also where nothing was cut off.
+    PromptStore(tmp_path).add("d", "text d", [png(0)])
+    assert list(PromptStore(tmp_path).prompts) == ["a", "b", "c", "d"]
+
+
+def test_folders_of_pictures_are_there_once_and_damaged_files_are_named(tmp_path: Path) -> None:
+    store = PromptStore(tmp_path)
+    prompt = store.add("a", "text", [png(0)], np.zeros((1, 2, 3), np.float16))
+    (tmp_path / TOKENS_FOLDER / prompt.tokens).unlink()
+    with pytest.raises(InputError, match=prompt.tokens):
+        store.tokens(prompt.tokens)
+    (tmp_path / PICTURES_FOLDER / prompt.pictures[0]).unlink()
+    with pytest.raises(InputError, match="cannot be read; remove"):
+        store.picture(prompt.pictures[0])
+    # What is gone is written again.
+    store.add("b", "text", [png(0)], np.zeros((1, 2, 3), np.float16))
+    assert store.tokens(prompt.tokens).shape == (1, 2, 3)
+    assert store.picture(prompt.pictures[0]).shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"tokens": "a/b"},
+        {"tokens": 3},
+        {"pictures": [3]},
+        {"pictures": [".."]},
+        {"pictures": ["a/b.png"]},
+        {"space": None},
+    ],
+)
+def test_names_that_leave_the_folder_are_no_prompt(tmp_path: Path, changes: dict[str, object]) -> None:
+    row = {"key": "a", "text": "t", "pictures": ["x.png"], "tokens": "", "space": ""}
+    (tmp_path / PROMPTS_FILE).write_text(json.dumps(row) + "\n" + json.dumps(row | changes) + "\n")
+    with pytest.raises(InputError, match="line 2 is no prompt; remove the folder to prepare it anew"):
         PromptStore(tmp_path)

@@ -89,6 +89,14 @@ def test_an_answer_needs_each_of_its_objects_in_some_picture(answerer: ScriptedA
     assert (answerer.requests, answerer.unknown_pictures, answerer.unknown_questions) == (4, 0, 0)
 
 
+def test_pixels_of_several_pictures_do_not_add_up(answerer: ScriptedAnswerer) -> None:
+    answerer.sheet.pictures[digest(b"lamp")] = SentPicture(scene="room", pixels={3: 199, 2: 900})
+    line = "\nQuestion: What is next to the lamp?"
+    assert asked(answerer, line, NEAR, b"lamp", FAR) == "unknown"
+    answerer.sheet.pictures[digest(b"lamp")] = SentPicture(scene="room", pixels={3: 200, 2: 900})
+    assert asked(answerer, line, NEAR, b"lamp", FAR) == "book"
+
+
 def test_presence_needs_one_object_and_absence_none(answerer: ScriptedAnswerer) -> None:
     assert asked(answerer, "\nQuestion: Is there a mug?", NEAR) == "yes"
     assert asked(answerer, "\nQuestion: Is there a mug?", FAR) == "unknown"

@@ -62,10 +62,8 @@ class ClassTable:
         if 0 in self.ids:
             raise InputError(
                 f"classes: {self.name_of[0]!r} has the id 0, which files of instances cannot hold: a vertex has "
-                f"class id "
-                "· 1000 + number of the instance, and below 1000 it has none; give the class another id, here and in "
-                f"the "
-                "files, or leave it out of classes="
+                "class id · 1000 + number of the instance, and below 1000 it has none; give the class another id, here "
+                "and in the files, or leave it out of classes="
             )
 
     def without(self, names: Collection[str]) -> "ClassTable":

@@ -3,11 +3,12 @@
 from typing import no_type_check
 
 import numpy as np
+from numba import njit
 
-from gsencoder.core.runtime.threads import kernel
 
-
-@kernel
+# Without fused products, unlike `gsencoder.core.runtime.threads.kernel`: of an edge of two triangles, each then finds a
+# pixel exactly as far on its side as the other finds it beyond, and no pixel between them is left to neither.
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def draw_triangles(local, faces, labels, K, near, inverse, instances):
     """Draws triangles into a buffer of 1/z, which is linear in the picture; the larger one is nearer."""
@@ -32,7 +33,8 @@ def draw_triangles(local, faces, labels, K, near, inverse, instances):
                 u, v = column + 0.5, row + 0.5
                 wa = ((ub - u) * (vc - v) - (vb - v) * (uc - u)) / area
                 wb = ((uc - u) * (va - v) - (vc - v) * (ua - u)) / area
-                wc = 1 - wa - wb
+                # And not 1 - wa - wb, which rounds otherwise.
+                wc = ((ua - u) * (vb - v) - (va - v) * (ub - u)) / area
                 if wa < 0 or wb < 0 or wc < 0:
                     continue
                 nearness = wa * za + wb * zb + wc * zc

@@ -1,5 +1,6 @@
 """Text files with one whole number a line: labels of vertices, instances of truth, and masks, in ScanNet's formats."""
 
+import re
 import warnings
 from codecs import BOM_UTF8
 from contextlib import suppress
@@ -82,5 +83,8 @@ def _parsed(path: Path, data: bytes, hint: str) -> Int64[np.ndarray, " n"]:
 
 
 def _plain(data: bytes) -> bool:
-    """Whether a file has digits, signs and blanks alone."""
-    return not data.translate(None, b"0123456789+- \t\r\n")
+    """Whether a file has digits, signs before digits, and blanks alone."""
+    if data.translate(None, b"0123456789+- \t\r\n"):
+        return False
+    # numpy reads a sign alone as 0.
+    return not ((b"+" in data or b"-" in data) and re.search(rb"[+-](?![0-9])", data))

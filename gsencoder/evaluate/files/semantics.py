@@ -50,7 +50,8 @@ def _labels(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
     labels = read_whole_numbers(path)
     if not len(labels):
         raise InputError(f"{path}: no vertices; expected one class id for each")
-    if not (classes.rows(labels) >= 0).any() and (classes.rows(labels // IDS_PER_CLASS) >= 0).any():
+    instances = labels[labels >= IDS_PER_CLASS] // IDS_PER_CLASS
+    if not (classes.rows(labels) >= 0).any() and (classes.rows(instances) >= 0).any():
         raise InputError(
             f"{path}: ids such as {labels.max()} are those of instances, class id · {IDS_PER_CLASS} + number; expected "
             "class ids"

@@ -51,8 +51,9 @@ def true_instances(points: LabeledPoints, classes: ClassTable) -> InstanceTruth:
     """The true instances of a scene.
 
     Raises:
-        InputError: a class has a thousand objects or more, whose ids the benchmark's format cannot hold.
+        InputError: a class has a thousand objects or more, whose ids the benchmark's format cannot hold, or the id 0.
     """
+    classes.check_instance_ids()
     with about(f"scene {points.scene}"):
         return InstanceTruth(scene=points.scene, ids=instance_truth(points.objects, points.names, classes.id_of))
 

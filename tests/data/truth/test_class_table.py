@@ -47,3 +47,16 @@ def test_a_table_that_contradicts_itself_is_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         ClassTable(names=names, ids=ids, groups=groups)
+
+
+def test_ids_in_any_order_lead_to_the_rows_of_their_names() -> None:
+    table = ClassTable(names=("c", "a", "b"), ids=(30, 10, 20), groups={"g": ("b", "c")})
+    assert table.rows(np.array([10, 20, 30, 0, 25, 99, -10])).tolist() == [1, 2, 0, -1, -1, -1, -1]
+    assert table.without(("a", "x")).rows(np.array([10, 20, 30])).tolist() == [-1, 1, 0]
+    assert (len(table), table.name_of, table.id_of["b"]) == (3, {30: "c", 10: "a", 20: "b"}, 20)
+
+
+def test_0_is_a_class_only_where_it_does_not_stand_for_none() -> None:
+    ClassTable(names=("a",), ids=(1,)).check_instance_ids()
+    with pytest.raises(InputError, match="classes: 'b' has the id 0, which stands for no class .* expected ids from 1"):
+        ClassTable(names=("a", "b"), ids=(1, 0)).check_instance_ids()

@@ -142,6 +142,7 @@ def test_a_wrong_entry_of_scanrefer_is_named(tmp_path: Path, content: Any, messa
         ({"tokens": "[1]"}, r"line 2: tokens\[0\] must be a text"),
         ({"target_id": "8.5"}, "line 2: target_id must be a whole number"),
         ({"stimulus_id": "scene0525_00-can-4-8-10-14"}, "line 2: stimulus_id must be"),
+        ({"stimulus_id": "scene0525_00-can-2-8-10-14"}, "line 2: stimulus_id must be"),
         ({"correct_guess": "maybe"}, "line 2: correct_guess must be True or False"),
         ({"utterance": "x" * (MAX_TEXT + 1)}, "line 2: utterance has 20,001 characters"),
         ({"utterance": "x" * 200_000}, "not a readable CSV file"),

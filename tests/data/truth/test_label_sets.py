@@ -1,5 +1,6 @@
 """Classes of ScanNet's benchmarks, the map of raw names, splits, and the truth files that are made of them."""
 
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -192,3 +193,63 @@ def test_more_instances_of_a_class_than_the_format_can_hold_are_refused() -> Non
     assert instance_truth(many[:999], dict.fromkeys(many.tolist(), "couch"), {"couch": 6}).max() == 6999
     # Objects without a class are not counted.
     assert instance_truth(many, {}, {"couch": 6}).tolist() == [0] * 1000
+
+
+def test_the_classes_are_those_of_scannets_own_lists() -> None:
+    names = (
+        *("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "picture"),
+        *("counter", "desk", "curtain", "refrigerator", "shower curtain", "toilet", "sink", "bathtub"),
+        "otherfurniture",
+    )
+    twenty = scannet_classes("scannet20")
+    assert twenty.names == names
+    assert twenty.ids == (*range(1, 13), 14, 16, 24, 28, 33, 34, 36, 39)
+    # Of "id name group" for each id in VALID_CLASS_IDS_200, with CLASS_LABELS_200 of scannet200_constants.py and the
+    # three lists of scannet200_splits.py (ScanNet's repository, 520d564).
+    many = scannet_classes("scannet200")
+    group_of = {name: group for group, members in many.groups.items() for name in members}
+    text = "".join(f"{number} {name} {group_of[name]}\n" for number, name in many.name_of.items())
+    assert sha256(text.encode()).hexdigest() == "8a4c044c50bed27ac77eb2ce1a0714ecfe56fb73fd8b88002f7ff569dfa708e1"
+
+
+@pytest.mark.parametrize(
+    ("ids", "expected"),
+    [
+        ([1, 999], [5001, 5999, 0]),
+        # 1000 would be read as an object of the next class.
+        ([1, 1000], [5001, 5002, 0]),
+        ([700, 1500], [5001, 5002, 0]),
+    ],
+)
+def test_ids_below_a_thousand_are_the_numbers_of_instances(ids: list[int], expected: list[int]) -> None:
+    instances = np.array([*ids, 0], np.int32)
+    assert instance_truth(instances, dict.fromkeys(ids, "chair"), {"chair": 5}).tolist() == expected
+
+
+def test_objects_are_numbered_within_their_class_in_the_order_of_their_ids() -> None:
+    instances = np.array([2000, 3, 0, 1200, 77, 2000], np.int32)
+    names = {3: "bed", 77: "chair", 1200: "chair", 2000: "bed"}
+    assert instance_truth(instances, names, {"bed": 4, "chair": 5}).tolist() == [4002, 4001, 0, 5002, 5001, 4002]
+    # Without a class the number means nothing, and may be none.
+    assert instance_truth(instances, names, {"bed": 4}).tolist() == [4002, 4001, 0, 0, 0, 4002]
+    assert instance_truth(np.zeros(0, np.int32), {}, {}).tolist() == []
+
+
+def test_no_more_than_999_objects_of_a_class_fit(tmp_path: Path) -> None:
+    instances = np.arange(1001, 2001, dtype=np.int32)
+    names = dict.fromkeys(range(1001, 2001), "bed")
+    assert instance_truth(instances[:999], names, {"bed": 4}).tolist() == list(range(4001, 5000))
+    with pytest.raises(InputError, match="'bed': 1,000 objects are of its class; up to 999 fit"):
+        instance_truth(instances, names, {"bed": 4})
+    # Objects of no class may be any number.
+    assert not instance_truth(instances, names, {}).any()
+
+
+def test_names_of_scenes_are_as_long_as_folders_names(tmp_path: Path) -> None:
+    path = tmp_path / "split.txt"
+    path.write_text("b\n" + "a" * 255 + "\n")
+    assert read_split(path) == ("b", "a" * 255)
+    for wrong in ("a" * 256, "a b", "..", "a\\b"):
+        path.write_text(f"b\n{wrong}\n")
+        with pytest.raises(InputError, match="line 2: expected the name of a scene"):
+            read_split(path)

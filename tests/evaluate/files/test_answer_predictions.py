@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -117,3 +118,21 @@ def test_scanqas_pickles_are_refused(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(pickle.dumps({"s0": {"q0": {"pred_answers_at10": ["a"]}}}))
         with pytest.raises(InputError, match="is a pickle"):
             read_answer_predictions(tmp_path / name, SCANQA)
+
+
+def test_situations_at_one_place_are_told_apart_by_where_one_faces(tmp_path: Path) -> None:
+    turned = replace(SQA3D[0], id="7", rotation=(0.6, 0.0, 0.0, 0.8))
+    row = {"scene_id": "s0", "situation": "I stand.", "question": "Which?", "answer": "right"}
+    place = {"agent_pos": {"x": 0.0, "y": 0.5, "z": 0}}
+    for question in (SQA3D[0], turned):
+        w, x, y, z = question.rotation or ()
+        faced = {"agent_rot": {"_x": x, "_y": y, "_z": z, "_w": w}}
+        found = read_answer_predictions(written(tmp_path, [row | place | faced]), (SQA3D[0], turned))
+        assert found == {question.id: ("right",)}
+    with pytest.raises(InputError, match="are those of 2 questions; give its question_id"):
+        read_answer_predictions(written(tmp_path, [row | place]), (SQA3D[0], turned))
+    write_answer_predictions(tmp_path / "p.json", (turned,), {"7": ("right", "left")})
+    (said,) = json.loads((tmp_path / "p.json").read_text())
+    assert said["agent_rot"] == {"_x": 0.0, "_y": 0.0, "_z": 0.8, "_w": 0.6}
+    assert said["agent_pos"] == {"x": 0.0, "y": 0.5, "z": 0.0}
+    assert (said["answer"], said["situation"], said["question"]) == ("right", "I stand.", "Which?")

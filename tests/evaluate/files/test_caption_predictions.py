@@ -108,3 +108,32 @@ def test_a_scene_that_is_there_twice_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "pred.json").write_text('{"s0": [], "s0": []}')
     with pytest.raises(InputError, match="'s0' is there twice"):
         read_caption_predictions(tmp_path / "pred.json", OBJECTS)
+
+
+def test_boxes_are_written_by_scene_with_the_probability_of_nothing_before_that_of_an_object(tmp_path: Path) -> None:
+    aabb = ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    boxes = [
+        CaptionedBox(scene="s1", caption="one", aabb=aabb, objectness=0.75, class_probabilities=(0.25, 0.5)),
+        CaptionedBox(scene="s0", caption="sos two eos", aabb=aabb),
+        CaptionedBox(scene="s1", caption="three", aabb=aabb, objectness=0.0),
+    ]
+    write_box_captions(tmp_path / "p.json", boxes)
+    content = json.loads((tmp_path / "p.json").read_text())
+    assert {scene: [row["caption"] for row in rows] for scene, rows in content.items()} == {
+        "s1": ["sos one eos", "sos three eos"],
+        "s0": ["sos two eos"],
+    }
+    assert [row["obj_prob"] for row in content["s1"]] == [[0.25, 0.75], [1.0, 0.0]]
+    assert content["s1"][0]["sem_prob"] == [0.25, 0.5]
+    assert content["s0"][0] == {"caption": "sos two eos", "box": CORNERS, "sem_prob": [], "obj_prob": [0.0, 1.0]}
+
+
+def test_captions_of_objects_are_written_under_their_names_and_once_each(tmp_path: Path) -> None:
+    said = [NamedCaption(scene="s1", object_id=3, caption="a"), NamedCaption(scene="s0", object_id=3, caption="b.")]
+    write_named_captions(tmp_path / "p.json", OBJECTS, said)
+    content = json.loads((tmp_path / "p.json").read_text())
+    assert content == {"s1|3|office_chair": ["sos a eos"], "s0|3|office_chair": ["sos b . eos"]}
+    with pytest.raises(InputError, match="has two captions; expected one"):
+        write_named_captions(tmp_path / "p.json", OBJECTS, [said[0], said[0]])
+    with pytest.raises(InputError, match="object 4 of s1 is captioned and is not in the truth"):
+        write_named_captions(tmp_path / "p.json", OBJECTS, [NamedCaption(scene="s1", object_id=4, caption="a")])

@@ -310,3 +310,20 @@ def test_entries_that_are_there_twice_swapped_or_of_no_class_are_named(tmp_path:
         recognize_files(truth, written(tmp_path / "p.json", [NAMES]), ("chair",))
     with pytest.raises(InputError, match="p.json: object 3 of scene0011_00 is predicted as 'bed', which is no class"):
         recognize_files(tmp_path / "p.json", truth, ("chair",))
+
+
+def test_an_object_without_a_prediction_is_refused_unless_it_may_be_missing(tmp_path: Path) -> None:
+    write_recognition_truth(tmp_path / "t.json", [NamedInstance(scene="s", object="1", name="bed")])
+    write_recognition_predictions(tmp_path / "p.json", [])
+    with pytest.raises(InputError, match=r"p\.json: object 1 of s has no prediction"):
+        recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"])
+    found, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"], allow_missing=True)
+    assert ([(each.place, each.first) for each in found], others) == ([(0, None)], 0)
+
+
+def test_bbox_is_the_first_of_bboxes_and_no_other_of_them(tmp_path: Path) -> None:
+    other = [[5.0, 0.0, 0.0], [6.0, 1.0, 1.0]]
+    (read,) = read_referring_predictions(written(tmp_path / "p.json", [PREDICTED | {"bboxes": [CORNERS, other]}]))
+    assert read.boxes.tolist() == [BOX.tolist(), other]
+    with pytest.raises(InputError, match="bbox is not the first of bboxes"):
+        read_referring_predictions(written(tmp_path / "p.json", [PREDICTED | {"bboxes": [other, CORNERS]}]))

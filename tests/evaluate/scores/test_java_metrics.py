@@ -86,6 +86,62 @@ def test_the_reason_for_going_without_java_is_named(monkeypatch: pytest.MonkeyPa
     assert "lacks tokenizer/stanford-corenlp" in str(find_java_tools())
 
 
+LISTENER = """
+import sys
+heard = open({log!r}, "a", encoding="utf-8")
+print(*sys.argv[1:], sep="\\n", file=heard, flush=True)
+if "-stdio" not in sys.argv:
+    sys.stdout.write(open(sys.argv[-1], encoding="utf-8").read())
+    sys.exit()
+for line in sys.stdin:
+    heard.write(line); heard.flush()
+    kind, *fields = line.rstrip("\\n").split(" ||| ")
+    for row in range(len(fields) + 1 if kind == "EVAL" else 1):
+        print(0.125 * row if kind == "EVAL" else f"count {{fields[-1]}}", flush=True)
+"""
+
+
+def listener(folder: Path) -> tuple[JavaTools, Path]:
+    """A program in Java's place that writes down what it gets."""
+    java, log = folder / "java", folder / "heard.txt"
+    java.write_text(f"#!{sys.executable}\n" + LISTENER.format(log=str(log)))
+    java.chmod(java.stat().st_mode | stat.S_IXUSR)
+    return JavaTools(java=str(java), folder=folder), log
+
+
+def test_meteor_gets_references_before_the_hypothesis_and_gives_each_score_and_then_that_of_all(tmp_path: Path) -> None:
+    tools, log = listener(tmp_path)
+    whole, each = meteor(["a  b", "c ||| d\ne"], [["r1", "r2"], ["r3"]], tools)
+    lines = log.read_text().splitlines()
+    assert lines[-3:] == [
+        "SCORE ||| r1 ||| r2 ||| a b",
+        "SCORE ||| r3 ||| c d e",
+        "EVAL ||| count a b ||| count c d e",
+    ]
+    assert (whole, each.tolist()) == (0.25, [0.0, 0.125])
+    assert [word for word in lines if word.startswith("-")] == [
+        *java_metrics.ENCODING,
+        *("-Xmx2G", "-jar", "-", "-", "-stdio", "-l", "-norm"),
+    ]
+
+
+def test_the_tokenizer_gets_texts_that_are_none_and_tokens_lose_punctuation(tmp_path: Path) -> None:
+    tools, log = listener(tmp_path)
+    assert ptb_tokens(["", "a , b .", "  ", "c\x85d ''"], tools) == ["", "a b", "", "c d"]
+    assert {"-preserveLines", "-lowerCase", "edu.stanford.nlp.process.PTBTokenizer"} <= set(
+        log.read_text().splitlines()
+    )
+
+
+def test_options_for_java_of_the_environment_do_not_reach_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    java = tmp_path / "java"
+    java.write_text(f"#!{sys.executable}\nimport os\nprint(os.environ.get('JAVA_TOOL_OPTIONS'), os.environ['KEPT'])\n")
+    java.chmod(java.stat().st_mode | stat.S_IXUSR)
+    for name in ("JAVA_TOOL_OPTIONS", "_JAVA_OPTIONS", "KEPT"):
+        monkeypatch.setenv(name, "x")
+    assert ptb_tokens(["a"], JavaTools(java=str(java), folder=tmp_path)) == ["None x"]
+
+
 @pytest.mark.slow
 def test_the_treebank_tokenizer_agrees_with_ours_on_plain_texts(real: JavaTools) -> None:
     texts = ["The chair's (brown) leg isn't here.", "twenty-three 3.5 and 1/2", "", "café, o'clock?"]

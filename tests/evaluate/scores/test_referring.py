@@ -241,3 +241,10 @@ def test_sentences_are_scored_once() -> None:
         referring_scores([*results, *results])
     with pytest.raises(InputError, match="k of 1 or more, got 0"):
         referring_scores(results, ks=(0,))
+
+
+def test_the_best_of_five_boxes_is_scored_where_nothing_else_is_asked_for() -> None:
+    results, _ = compare_boxes([found(1, FAR, FAR, FAR, FAR, CUBE), found(2, *[FAR] * 5, CUBE)], [truth(1), truth(2)])
+    scores = referring_scores(results)
+    assert {k: table["overall"]["overall"].acc50 for k, table in scores.best_of.items()} == {5: 1 / 2}
+    assert (scores.top1["overall"]["overall"].acc25, scores.best["overall"]["overall"].acc25) == (0, 1)

@@ -1,0 +1,251 @@
+"""What photographs show of objects, questions that may be asked of it, and where one stands."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splats import front_camera, random_gaussians
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.color_names import RANGES, color_counts, color_name, hsv
+from gsencoder.data.truth.made_expressions import make_expressions
+from gsencoder.data.truth.made_questions import QuestionsConfig, make_questions
+from gsencoder.data.truth.made_situations import make_situations, side_of
+from gsencoder.data.truth.questions import Question, read_questions, read_sqa3d
+from gsencoder.data.truth.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, see_objects
+from gsencoder.data.truth.write_sqa3d import write_sqa3d
+from gsencoder.types import Scene, SceneObject, Views
+
+RED, BLUE, GREEN = (200, 20, 30), (20, 60, 220), (20, 160, 40)
+
+
+def thing(number: int, name: str | None, low: tuple[float, float, float], size: float = 0.1) -> SeenObject:
+    lower = np.array(low, np.float64)
+    return SeenObject(id=number, name=name, aabb_min=lower, aabb_max=lower + size, pixels=500)
+
+
+def scene_of(*things: SeenObject, unit: float = 1.0) -> SeenScene:
+    return SeenScene(name="made", objects=things, min_pixels=200, metres_per_unit=unit)
+
+
+def photographed(pictures: list[tuple[np.ndarray, np.ndarray]], ids: tuple[int, ...] = (40, 7, 12)) -> Scene:
+    """A scene of 30 × 20 photographs with instance maps; the unit is half a metre."""
+    return Scene(
+        name="made",
+        gaussians=random_gaussians(1),
+        metres_per_unit=0.5,
+        views=Views(
+            cameras=front_camera(30, 20).select([0] * len(pictures)),
+            names=tuple(map(str, range(len(pictures)))),
+            images=[image for image, _ in pictures],
+            instances=[labels for _, labels in pictures],
+        ),
+        objects=tuple(
+            SceneObject(
+                id=each, name=f"thing {each}", aabb_min=np.full(3, float(each)), aabb_max=np.full(3, each + 2.0)
+            )
+            for each in ids
+        ),
+    )
+
+
+def picture(color: tuple[int, int, int], width: int, label: int = 7) -> tuple[np.ndarray, np.ndarray]:
+    """A thing of a color in the left columns of a photograph."""
+    image, labels = np.full((20, 30, 3), 128, np.uint8), np.zeros((20, 30), np.int32)
+    image[:, :width], labels[:, :width] = color, label
+    return image, labels
+
+
+def test_areas_are_those_of_the_objects_own_value_and_boxes_become_metres() -> None:
+    labels = np.zeros((20, 30), np.int32)
+    labels[:, :10], labels[:5, 10:], labels[5:, 10:] = 7, 40, 99
+    other = np.full((20, 30), 12, np.int32)
+    other[0] = 40
+    gray = np.full((20, 30, 3), 128, np.uint8)
+    seen = see_objects(photographed([(gray, labels), (gray, other)]), min_pixels=50)
+    assert [(each.id, each.name, each.pixels) for each in seen.objects] == [
+        (7, "thing 7", 200),
+        (12, "thing 12", 570),
+        (40, "thing 40", 100),
+    ]
+    assert (seen.objects[0].aabb_min.tolist(), seen.objects[0].aabb_max.tolist()) == ([3.5] * 3, [4.5] * 3)
+    assert seen.objects[0].center.tolist() == [4.0] * 3
+    assert seen.metres_per_unit == 0.5
+    assert (seen.shown(seen.objects[2]), replace(seen, min_pixels=101).shown(seen.objects[2])) == (True, False)
+
+
+def test_the_color_is_that_of_the_photographs_that_show_most_of_a_thing() -> None:
+    # Four photographs show more of it than the blue one, which is not looked at.
+    pictures = [picture(BLUE, 11), *(picture(RED, 12 + number) for number in range(COLOR_VIEWS))]
+    assert see_objects(photographed(pictures), min_pixels=100).objects[0].color == "red"
+    assert see_objects(photographed(pictures[:COLOR_VIEWS]), min_pixels=100).objects[0].color is None
+    # One that shows too little to be asked about is not looked at either: 220 pixels and 240.
+    few = [pictures[0], pictures[1]]
+    assert see_objects(photographed(few), min_pixels=221).objects[0].color == "red"
+    assert see_objects(photographed(few), min_pixels=241).objects[0].color is None
+
+
+@pytest.mark.parametrize(
+    ("rgb", "expected"),
+    [
+        ((255, 0, 0), (0, 1, 1)),
+        ((0, 255, 0), (120, 1, 1)),
+        ((0, 0, 255), (240, 1, 1)),
+        ((255, 255, 0), (60, 1, 1)),
+        ((255, 0, 255), (300, 1, 1)),
+        ((100, 50, 50), (0, 0.5, 100 / 255)),
+        ((50, 100, 75), (150, 0.5, 100 / 255)),
+        ((60, 75, 120), (225, 0.5, 120 / 255)),
+        ((255, 0, 30), (360 - 60 * 30 / 255, 1, 1)),
+        ((7, 7, 7), (0, 0, 7 / 255)),
+        ((0, 0, 0), (0, 0, 0)),
+    ],
+)
+def test_hue_saturation_and_value_are_those_of_the_hexagon(
+    rgb: tuple[int, int, int], expected: tuple[float, float, float]
+) -> None:
+    found = hsv(np.array([rgb], np.uint8))
+    assert [float(each[0]) for each in found] == pytest.approx(expected)
+
+
+def test_reds_lie_on_both_sides_of_zero() -> None:
+    words = [each.word for each in RANGES]
+    for rgb, word in (((220, 10, 40), "red"), ((220, 40, 10), "red"), ((220, 10, 80), None), ((220, 50, 10), None)):
+        counts = color_counts(np.array([rgb], np.uint8))
+        assert [words[row] for row in np.flatnonzero(counts)] == ([word] if word else [])
+
+
+def test_a_color_needs_six_tenths_and_no_other_has_more_than_three_twentieths() -> None:
+    def of(reds: int, blues: int) -> str | None:
+        """Of a hundred inner pixels."""
+        image = np.full((12, 12, 3), 128, np.uint8)
+        inner = image[1:11, 1:11].reshape(100, 3).copy()
+        inner[:reds], inner[reds : reds + blues] = RED, BLUE
+        image[1:11, 1:11] = inner.reshape(10, 10, 3)
+        return color_name([(image, np.ones((12, 12), bool))])
+
+    assert (of(60, 0), of(59, 0), of(60, 15), of(60, 16), of(0, 60)) == ("red", None, "red", None, "blue")
+
+
+# Questions
+
+
+def test_of_many_questions_of_a_kind_only_so_many_are_asked() -> None:
+    names = ("mug", "ball", "lamp", "apple", "lemon", "clock", "book")
+    things = [
+        replace(thing(number, name, (3.0 * number, 0, 0)), color=f"c{number}") for number, name in enumerate(names)
+    ]
+    made = make_questions([scene_of(*things)], QuestionsConfig(balance=False, per_kind=5))
+    assert sum("What color" in each.text for each in made) == 5
+    # An odd number leaves half of a pair out, and at most half, rounded up, have one answer.
+    assert sum("there a" in each.text for each in made) == 4
+    assert sum("How many" in each.text for each in made) == 3
+    assert {each.answers for each in made if "How many" in each.text} == {("1", "one")}
+
+
+def test_the_largest_means_the_largest_and_words_of_names_are_joined_in_files() -> None:
+    boxes = [thing(1, "card box", (0, 0, 0)), thing(2, "card box", (5, 0, 0)), thing(3, "card box", (9, 0, 0), 0.2)]
+    made = {each.expression.text: each for each in make_expressions([scene_of(*boxes, unit=0.5)])}
+    assert set(made) == {"the largest card box"}
+    found = made["the largest card box"]
+    assert (found.expression.object_id, found.expression.object_name, found.unique) == (3, "card_box", False)
+    assert found.needed == (3, 1, 2)
+    # Files have units of half a metre.
+    np.testing.assert_allclose(found.expression.aabb, [[18, 0, 0], [18.4, 0.4, 0.4]])
+    assert (found.expression.multiple, found.expression.tokens) == (True, ("the", "largest", "card", "box"))
+
+
+# Situations
+
+
+def test_a_side_needs_twenty_degrees_from_straight_ahead_and_from_straight_behind() -> None:
+    def of(degrees: float) -> str | None:
+        place = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0]) * 10
+        return side_of(
+            thing(1, "a", (0, 0, 0), 1e-6), thing(2, "b", (10, 0, 0), 1e-6), thing(3, "c", tuple(place), 1e-6)
+        )
+
+    assert [of(angle) for angle in (19.9, 20.1, 90, 159.9, 160.1)] == [None, "left", "left", "left", None]
+    assert [of(-angle) for angle in (19.9, 20.1, 90, 159.9, 160.1)] == [None, "right", "right", "right", None]
+
+
+def test_one_stands_at_the_center_from_the_middle_of_the_scene_and_turns_to_what_one_faces() -> None:
+    things = [
+        thing(1, "table", (1, 1, 0), 1.0),
+        thing(2, "lamp", (1.45, 6, 0)),
+        thing(3, "mug", (6, 1.45, 0)),
+        thing(4, "clock", (-5, 1.45, 0)),
+    ]
+    made = make_situations([scene_of(*things)], per_kind=4)
+    facing_lamp = [each for each in made if each.situation == "I am standing at the table and facing the lamp."]
+    assert facing_lamp
+    for each in facing_lamp:
+        # The scene reaches from -5 to 6.1 and from 1 to 6.1; the lamp is straight in y, a quarter turn about z.
+        assert each.position == pytest.approx((1.5 - 0.55, 1.5 - 3.55, 0))
+        assert each.rotation == pytest.approx((np.sqrt(0.5), 0, 0, np.sqrt(0.5)), abs=1e-6)
+        assert each.object_ids[:2] == (1, 2)
+    sides = {each.text: each.answers[0] for each in facing_lamp if "left" in each.text}
+    assert set(sides.items()) <= {
+        ("Is the mug on my left or on my right?", "right"),
+        ("Is the clock on my left or on my right?", "left"),
+    }
+    answers = [each.answers[0] for each in made if "left or" in each.text]
+    assert answers.count("left") == answers.count("right") > 0
+
+
+def test_of_each_kind_there_are_at_most_so_many() -> None:
+    rng = np.random.default_rng(0)
+    names = ("table", "lamp", "mug", "clock", "apple", "guitar", "piano", "tent")
+    things = [thing(number, name, tuple(rng.uniform(0, 30, 3) * (1, 1, 0)), 0.6) for number, name in enumerate(names)]
+    for per_kind in (2, 5):
+        made = make_situations([scene_of(*things)], per_kind=per_kind)
+        kinds = [each.id.split("-")[1] for each in made]
+        assert kinds.count("side") == 2 * (per_kind // 2)
+        assert kinds.count("nearer") == per_kind
+    with pytest.raises(InputError, match="per_kind from 2, got 1"):
+        make_situations([scene_of(*things)], per_kind=1)
+
+
+# SQA3D's files
+
+
+SITUATED = Question(
+    dataset="sqa3d",
+    id="7",
+    scene="s",
+    text="Left?",
+    answers=("yes", "y"),
+    situation="I sit.",
+    position=(1.0, 2.0, 0.0),
+    rotation=(0.5, 0.1, 0.2, 0.8),
+)
+
+
+def test_situated_questions_are_written_in_sqa3ds_two_files(tmp_path: Path) -> None:
+    beside = write_sqa3d(tmp_path / "v1_questions_x.json", [SITUATED])
+    assert beside == tmp_path / "v1_sqa_annotations_x.json"
+    (annotation,) = json.loads(beside.read_text())["annotations"]
+    assert annotation["rotation"] == {"_x": 0.1, "_y": 0.2, "_z": 0.8, "_w": 0.5}
+    assert annotation["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
+    assert [(row["answer"], row["answer_id"]) for row in annotation["answers"]] == [("yes", 1), ("y", 2)]
+    assert read_questions(tmp_path / "v1_questions_x.json") == (SITUATED,)
+    for lacking in ("situation", "position", "rotation"):
+        with pytest.raises(InputError, match="question 7 has no situation"):
+            write_sqa3d(tmp_path / "questions.json", [replace(SITUATED, **{lacking: None})])
+
+
+def test_a_file_without_questions_is_no_file_of_sqa3d(tmp_path: Path) -> None:
+    path = tmp_path / "questions.json"
+    for content, got in (({"annotations": []}, "an object"), ([], "a list"), (["questions"], "a list")):
+        path.write_text(json.dumps(content))
+        with pytest.raises(InputError, match=f"expected SQA3D's object with questions, got {got}"):
+            read_sqa3d(path)
+
+
+def test_two_hundred_pixels_are_enough_to_be_asked_about_where_nothing_else_is_said() -> None:
+    assert QuestionsConfig().min_pixels == 200
+    seen = see_objects(photographed([picture(RED, 10)]))
+    assert (seen.objects[0].pixels, seen.shown(seen.objects[0])) == (200, True)
+    assert not replace(seen, min_pixels=seen.min_pixels + 1).shown(seen.objects[0])

@@ -1,0 +1,171 @@
+"""Classes from CSV files, and truth from the labels of scans: whose id is on which vertex."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from labeled_scans import group, write_scannet_labels
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.truth.number_files import write_whole_numbers
+from gsencoder.evaluate.files.class_files import load_classes, write_classes
+from gsencoder.evaluate.files.scan_truth import classes_of_scan, instances_of_scan
+from gsencoder.evaluate.files.scene_folders import scene_files
+from gsencoder.evaluate.files.semantics import count_label_files
+
+TABLE = ClassTable(
+    names=("office chair", "bed", "lamp"), ids=(12, 4, 999_999_999), groups={"tail": ("lamp",), "head": ("bed",)}
+)
+
+
+def written(path: Path, text: str) -> str:
+    path.write_text(text)
+    return str(path)
+
+
+def test_a_table_is_read_as_it_was_written_with_groups_and_classes_of_none(tmp_path: Path) -> None:
+    write_classes(tmp_path / "c.csv", TABLE)
+    again = load_classes(str(tmp_path / "c.csv"), instances=True)
+    assert (again.names, again.ids, dict(again.groups)) == (TABLE.names, TABLE.ids, dict(TABLE.groups))
+
+
+def test_columns_may_come_in_any_order_and_names_lose_blanks_at_their_ends(tmp_path: Path) -> None:
+    path = written(tmp_path / "c.csv", '\ufeffname,color,id\n" wall, white ",x,1\nfloor ,,0\n')
+    table = load_classes(path, instances=True)
+    # Those of a file are all scored as instances, walls and floors too.
+    assert (table.names, table.ids, table.groups) == (("wall, white", "floor"), (1, 0), {})
+
+
+def test_the_benchmarks_leave_out_wall_and_floor_where_instances_are_scored() -> None:
+    twenty = load_classes("scannet20")
+    instances = load_classes("scannet20", instances=True)
+    assert set(twenty.names) - set(instances.names) == {"wall", "floor"}
+    assert "ceiling" in load_classes("scannet200", instances=True).names
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("id,name\n1,bed\nx,lamp\n", r"line 3: expected a whole number and a name, got 'x', 'lamp'"),
+        ("id,name\n-1,bed\n", "line 2: expected a whole number"),
+        ("id,name\n1.0,bed\n", "line 2: expected a whole number"),
+        ("id,name\n٣,bed\n", "line 2: expected a whole number"),
+        ("id,name\n,bed\n", "line 2: expected a whole number and a name, got ''"),
+        ("id,name\n1234567890,bed\n", "line 2: expected a whole number and a name, got '1234567890'"),
+        ("id,name\n1, \n", "line 2: expected a whole number and a name, got '1', ' '"),
+        ("id,name\n1\n", "line 2: expected a whole number and a name, got '1', ''"),
+        ("id,label\n1,bed\n", "expected the columns id and name, got id, label"),
+        ("", "expected the columns id and name, got none"),
+        ('id,name\n1,"bed\n', "not a readable CSV file"),
+        ("id,name\n", "expected one id for each of one or more names"),
+        ("id,name\n1,bed\n1,lamp\n", "the id 1 is there twice"),
+    ],
+)
+def test_a_wrong_table_is_refused_with_its_line(tmp_path: Path, text: str, said: str) -> None:
+    path = written(tmp_path / "c.csv", text)
+    with pytest.raises(InputError, match=said) as error:
+        load_classes(path)
+    assert str(error.value).startswith(path)
+
+
+def test_what_is_no_table_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="scannet40 is no file; expected scannet20, scannet200, or a CSV"):
+        load_classes("scannet40")
+    with (tmp_path / "large.csv").open("wb") as stream:
+        stream.truncate((4 << 20) + 1)
+    with pytest.raises(InputError, match="4,194,305 bytes; at most 4,194,304 are read"):
+        load_classes(str(tmp_path / "large.csv"))
+
+
+# Truth of scans
+
+
+CLASSES = ClassTable(names=("chair", "sofa"), ids=(5, 6))
+RAW = {"office chair": 5, "couch": 6, "wall": 1}
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    """Objects in another order than their ids, of which 8 is missing; two vertices belong to none."""
+    segments = np.array([30, 10, 10, 20, 40, 50, 30])
+    groups = [
+        group(9, "couch", [20]),
+        group(0, "office chair", [10]),
+        group(4, "wall", [30]),
+        group(7, "beanbag", [40]),
+    ]
+    vertices = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
+    return write_scannet_labels(tmp_path / "scans" / "s0", "s0", vertices, segments, groups)
+
+
+def test_vertices_of_a_scan_have_class_and_objectId_plus_one(scan: Path) -> None:
+    with pytest.warns(SceneWarning, match="1 of 4 names are not in the label map"):
+        truth = instances_of_scan(scan, RAW, CLASSES)
+    assert truth.scene == "s0"
+    # A wall has an id of the map that is not scored: it is no class, as the beanbag is.
+    assert truth.ids.tolist() == [5, 5001, 5001, 6010, 8, 0, 5]
+    with pytest.warns(SceneWarning):
+        assert classes_of_scan(scan, RAW, CLASSES).tolist() == [0, 5, 5, 6, 0, 0, 0]
+
+
+def test_a_class_of_id_0_is_refused_where_0_stands_for_no_class(scan: Path) -> None:
+    zero = ClassTable(names=("chair", "wall"), ids=(5, 0))
+    for read in (instances_of_scan, classes_of_scan):
+        with pytest.raises(InputError, match="classes: 'wall' has the id 0, which stands for no class"):
+            read(scan, RAW, zero)
+
+
+# Folders
+
+
+def label_folders(folder: Path, **labels: list[int]) -> tuple[Path, Path]:
+    for name in ("predictions", "truth"):
+        (folder / name).mkdir()
+        write_whole_numbers(folder / name / "s.txt", np.array(labels[name]))
+    return folder / "predictions", folder / "truth"
+
+
+@pytest.mark.parametrize("wrong", [[7, 9, 100], [255, 255, 255], [-1, -1, -1]])
+def test_labels_of_no_class_are_not_taken_for_instances_of_class_0(tmp_path: Path, wrong: list[int]) -> None:
+    classes = ClassTable(names=("wall", "bed"), ids=(0, 4))
+    (counts,) = count_label_files(*label_folders(tmp_path, predictions=wrong, truth=[0, 4, 4]), classes)
+    assert counts.confusion.tolist() == [[0, 0, 1], [0, 0, 2]]
+
+
+def test_ids_of_instances_are_told_from_classes_by_the_thousand(tmp_path: Path) -> None:
+    classes = ClassTable(names=("wall", "bed"), ids=(1, 4))
+    folders = label_folders(tmp_path, predictions=[4000, 0, 0], truth=[1, 4, 4])
+    for number in (1000, 4000):
+        write_whole_numbers(folders[0] / "s.txt", np.array([number, 0, 0]))
+        with pytest.raises(
+            InputError, match=rf"ids such as {number} are those of instances, class id · 1000 \+ number"
+        ):
+            list(count_label_files(*folders, classes))
+    # One id of a class is enough to take the others for ids of no class.
+    write_whole_numbers(folders[0] / "s.txt", np.array([4000, 1, 0]))
+    assert [counts.confusion.tolist() for counts in count_label_files(*folders, classes)] == [[[0, 0, 1], [1, 0, 1]]]
+
+
+def test_truth_and_prediction_of_a_scene_are_not_taken_for_each_other(tmp_path: Path) -> None:
+    folders = label_folders(tmp_path, predictions=[1, 1, 4], truth=[1, 4, 4])
+    classes = ClassTable(names=("wall", "bed"), ids=(1, 4))
+    (counts,) = count_label_files(*folders, classes)
+    # Rows are true classes.
+    assert counts.confusion.tolist() == [[1, 0, 0], [1, 1, 0]]
+    (files,) = scene_files(*folders)
+    assert (files.prediction, files.truth) == (folders[0] / "s.txt", folders[1] / "s.txt")
+
+
+def test_of_many_scenes_those_asked_for_are_taken_by_name_and_three_are_named_where_one_is_foreign(
+    tmp_path: Path,
+) -> None:
+    predictions, truth = label_folders(tmp_path, predictions=[1], truth=[1])
+    for name in ("e", "b", "d", "a"):
+        for folder in (predictions, truth):
+            write_whole_numbers(folder / f"{name}.txt", np.array([1]))
+    assert [files.scene for files in scene_files(predictions, truth)] == ["a", "b", "d", "e", "s"]
+    assert [files.scene for files in scene_files(predictions, truth, scenes=["s", "b", "s"])] == ["b", "s"]
+    write_whole_numbers(predictions / "x.txt", np.array([1]))
+    with pytest.raises(InputError, match=r"x\.txt: there is no truth of this scene .*; it has a, b, d(?!.*\be\b)"):
+        scene_files(predictions, truth)

@@ -1,0 +1,145 @@
+"""Limits, ties and orders of the scores of instances, labels and recognized objects, worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
+from gsencoder.evaluate.scores.instance_matches import MAX_TABLE, match_instances
+from gsencoder.evaluate.scores.instances import average_precision, instance_scores
+from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames, recognition_scores, recognize
+from gsencoder.evaluate.scores.semantics import count_labels, semantic_scores
+
+CLASSES = ClassTable(names=("bed", "chair"), ids=(4, 5), groups={"head": ("chair",), "tail": ("bed",)})
+
+
+def matched(ids: list[tuple[int, int]], masks: list[tuple[int, int, int, float]], **options: bool) -> object:
+    """Runs of ids, and masks by first vertex, end, class and score."""
+    truth = np.concatenate([np.full(count, number) for number, count in ids])
+    rows = np.arange(len(truth))
+    made = prediction_of_masks(
+        "s",
+        [(rows >= first) & (rows < last) for first, last, _, _ in masks],
+        [label for _, _, label, _ in masks],
+        [score for _, _, _, score in masks],
+        num_vertices=len(truth),
+    )
+    return match_instances(InstanceTruth(scene="s", ids=truth), made, CLASSES, **options)
+
+
+def test_a_truth_of_a_smaller_id_chooses_first_whatever_the_scores_are() -> None:
+    # P lies on both beds by 120 / 240 at least: a third of 160 and 100 vertices more.
+    found = matched([(4001, 100), (4002, 100), (0, 50)], [(40, 160, 4, 0.1), (0, 100, 4, 0.9)])
+    quarter = found.thresholds == 9  # type: ignore[attr-defined]
+    # The first bed takes P, which is listed first, and the higher score is that of the match; the other is wrong.
+    assert sorted(zip(found.outcome_scores[quarter], found.hits[quarter], strict=True)) == [(0.1, False), (0.9, True)]  # type: ignore[attr-defined]
+
+
+def test_groups_that_are_small_and_of_no_class_are_counted_twice_as_in_scannets_script() -> None:
+    # With a class of id 0, ids from 1 to 999 are groups of it. 60 of 200 vertices of a mask are on a small one: a share
+    # of 0.3 counted once, and 0.6 counted twice, which is above 0.5.
+    classes = ClassTable(names=("wall", "bed"), ids=(0, 4))
+    truth = np.concatenate([np.full(60, 7), np.full(140, 4001), np.full(300, 4002)])
+    made = prediction_of_masks("s", [np.arange(500) < 200], [0], [0.9], num_vertices=500)
+    found = match_instances(InstanceTruth(scene="s", ids=truth), made, classes)
+    # False from 0.6 on, the third of nine thresholds: 0.5 and 0.55 ignore it, and so does 0.25.
+    assert found.thresholds[~found.hits].tolist() == [2, 3, 4, 5, 6, 7, 8]
+
+
+def test_ids_far_apart_are_counted_as_those_that_are_near() -> None:
+    near = matched([(4001, 150), (5001, 150), (0, 20)], [(0, 140, 4, 0.5), (150, 290, 5, 0.6)])
+    far = matched([(4001, 150), (5001, 150), (MAX_TABLE + 7, 20)], [(0, 140, 4, 0.5), (150, 290, 5, 0.6)])
+    for name in ("truths", "hits", "outcome_scores", "rows", "thresholds"):
+        assert np.array_equal(getattr(near, name), getattr(far, name))
+
+
+def test_two_scenes_are_ranked_together_and_groups_take_their_own_classes() -> None:
+    ids = np.repeat([4001, 5001], [200, 200])
+    rows = np.arange(400)
+    scenes = []
+    for scene, score in (("a", 0.9), ("b", 0.1)):
+        # The bed of each scene is right; the chair's mask of b is on the bed, and wrong.
+        masks = [rows < 200, (rows < 190) if scene == "b" else (rows >= 200)]
+        made = prediction_of_masks(scene, masks, [4, 5], [score, 0.5], num_vertices=400)
+        scenes.append(match_instances(InstanceTruth(scene=scene, ids=ids), made, CLASSES))
+    scores = instance_scores(scenes, CLASSES)
+    # Chairs: one right and one wrong of one score, of two: precision 1/2, 1, recall 1/2, 0, steps 1/4: 3/8.
+    assert (scores.groups["tail"].ap50, scores.groups["head"].ap50) == (1, pytest.approx(3 / 8))
+    assert (scores.classes["bed"].ap25, scores.overall.ap) == (1, pytest.approx((1 + 3 / 8) / 2))
+    assert (scores.truths.tolist(), scores.predictions.tolist(), scores.equal_scores) == ([2, 2], [2, 2], False)
+    other = ClassTable(names=("bed",), ids=(4,))
+    with pytest.raises(InputError, match="matched with different classes"):
+        instance_scores(scenes, other)
+
+
+def test_precision_is_taken_at_each_score_from_the_lowest() -> None:
+    # Hits at 0.9, 0.7 and 0.5, wrong at 0.8 and 0.6, of four truths. From the lowest score: precision 3/5, 2/4, 2/3,
+    # 1/2, 1, and 1; recall 3/4, 1/2, 1/2, 1/4, 1/4, 0.
+    scores, hits = np.array([0.5, 0.9, 0.6, 0.8, 0.7]), np.array([True, True, False, False, True])
+    ap, recall = average_precision(scores, hits, 4)
+    assert recall == 3 / 4
+    assert ap == pytest.approx((3 / 5 + 2 / 4 + 2 / 3 + 1 / 2 + 1 + 1) / 8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"offsets": [1, 2]}, "do not divide their 2 vertices"),
+        ({"offsets": [0, 1]}, "do not divide"),
+        ({"offsets": [0, 2, 1, 2], "labels": [4] * 3, "scores": [0.1] * 3}, "do not divide"),
+        ({"vertices": [1, 1]}, "not ascending, each once"),
+        ({"vertices": [0, 3]}, "a vertex outside of the scene's 3"),
+        ({"vertices": [-1, 2]}, "a vertex outside"),
+        ({"scores": [-math.inf]}, "prediction 0 has the score -inf"),
+    ],
+)
+def test_masks_that_contradict_themselves_are_refused(changes: dict[str, list[float]], said: str) -> None:
+    parts = {"vertices": [0, 2], "offsets": [0, 2], "labels": [4], "scores": [0.5]} | changes
+    arrays = {name: np.array(part, np.float64 if name == "scores" else np.int64) for name, part in parts.items()}
+    with pytest.raises(InputError, match=said):
+        InstancePrediction(scene="s", num_vertices=3, **arrays)
+
+
+def test_masks_begin_anew_and_may_be_empty() -> None:
+    rows = np.array([[True, False, True], [False] * 3, [True, True, False]])
+    made = prediction_of_masks("s", rows, [4, 5, 4], [0.1, 0.2, 0.3], num_vertices=3)
+    assert [made.mask(row).tolist() for row in range(3)] == [[0, 2], [], [0, 1]]
+    with pytest.raises(InputError, match="mask 0 has 3 vertices, and the scene 4"):
+        prediction_of_masks("s", rows, [4, 5, 4], [0.1, 0.2, 0.3], num_vertices=4)
+
+
+# Recognition and labels
+
+
+def test_places_count_from_one_and_other_classes_are_counted_beside() -> None:
+    truth = [NamedInstance(scene="s", object=str(k), name=name) for k, name in enumerate(("a", "b", "a", "z"))]
+    said = [("b", "a"), (), ("a",)]
+    ranked = [RankedNames(scene="s", object=str(k), names=names) for k, names in enumerate(said)]
+    found, others = recognize(ranked, truth, ["a", "b"])
+    assert [(each.place, each.first) for each in found] == [(2, "b"), (0, None), (1, "a")]
+    assert others == 1
+    scores = recognition_scores(found, ["b", "a"], ks=(1, 2))
+    assert scores.overall == {1: pytest.approx(1 / 3), 2: pytest.approx(2 / 3)}
+    assert (scores.classes[2], scores.mean[2], scores.unanswered) == ({"b": 0, "a": 1}, 1 / 2, 1)
+    with pytest.raises(InputError, match="object 1 of s has no prediction"):
+        recognize(ranked[:1], truth, ["a", "b"])
+    assert recognize(ranked[:1], truth, ["a", "b"], allow_missing=True)[0][1].place == 0
+
+
+def test_the_ceiling_is_of_the_background_and_no_class_is_of_none() -> None:
+    classes = ClassTable(names=("ceiling", "bed", "floor", "lamp"), ids=(22, 4, 2, 9))
+    truth, said = np.array([22, 4, 4, 2, 9]), np.array([22, 4, 22, 2, 77])
+    scores = semantic_scores([count_labels("s", truth, said, classes)], classes)
+    assert scores.excluded == ("ceiling", "floor")
+    assert scores.foreground.miou == pytest.approx((1 / 2 + 0) / 2)
+    assert {name: (each.truths, each.predictions) for name, each in scores.classes.items()} == {
+        "ceiling": (1, 2),
+        "bed": (2, 1),
+        "floor": (1, 1),
+        "lamp": (1, 0),
+    }
+    # A class that is there and never predicted counts among those in truth.
+    assert scores.overall.miou_present == pytest.approx((1 / 2 + 1 / 2 + 1 + 0) / 4)

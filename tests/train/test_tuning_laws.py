@@ -1,0 +1,250 @@
+"""Pairs, batches, losses and towers of tuning, on stand-ins for a model: shapes, padding, and what is refused."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.prompt_store import StoredPrompt
+from gsencoder.train.trainer import TrainerConfig
+from gsencoder.train.tuning.network import TERM, AnswerObjective
+from gsencoder.train.tuning.run import TuneConfig, check_pairs, pairs_digest, tuning_training
+from gsencoder.train.tuning.samples import IGNORED, TuningBatch, TuningPair, TuningSample, chat, join_pairs
+from gsencoder.train.tuning.towers import SPLIT, TokenHook, TowerLayout, tower_layout
+from gsencoder.train.tuning.vlm import AdapterConfig
+
+
+def made(
+    name: str, ids: list[int], answer: int, pictures: tuple[int, int] = (1, 2), tokens: bool = False
+) -> TuningSample:
+    """A sample whose last tokens are the answer."""
+    count, side = pictures
+    labels = torch.tensor([IGNORED] * (len(ids) - answer) + ids[len(ids) - answer :])
+    inputs = {
+        "input_ids": torch.tensor([ids]),
+        "attention_mask": torch.ones(1, len(ids), dtype=torch.int64),
+        "pixel_values": torch.ones(1, count, 3, side, side),
+    }
+    return TuningSample(name=name, inputs=inputs, labels=labels, tokens=torch.ones(count, 4, 5) if tokens else None)
+
+
+def joined(*samples: TuningSample, padding: int = 7) -> TuningBatch:
+    batch = join_pairs(samples, padding=padding)
+    assert isinstance(batch, TuningBatch)
+    return batch
+
+
+def test_shorter_samples_are_filled_at_their_ends_by_what_counts_for_nothing() -> None:
+    batch = joined(made("a", [3, 4, 5], 1), made("b", [6, 8], 2, (2, 3)))
+    assert batch.names == ("a", "b")
+    assert batch.inputs["input_ids"].tolist() == [[3, 4, 5], [6, 8, 7]]
+    assert batch.inputs["attention_mask"].tolist() == [[1, 1, 1], [1, 1, 0]]
+    assert batch.labels.tolist() == [[IGNORED, IGNORED, 5], [6, 8, IGNORED]]
+    pixels = batch.inputs["pixel_values"]
+    assert pixels.shape == (2, 2, 3, 3, 3)
+    assert pixels[0].sum() == 3 * 2 * 2
+    assert pixels[0, 0, :, :2, :2].min() == 1
+    assert pixels[1].min() == 1
+    assert batch.tokens is None
+
+
+def test_tokens_of_all_pictures_stand_one_after_the_other_and_the_first_error_is_that_of_the_batch() -> None:
+    batch = joined(made("a", [3], 1, (2, 2), tokens=True), made("b", [3], 1, tokens=True))
+    assert batch.tokens is not None
+    assert batch.tokens.shape == (3, 4, 5)
+    first, second = InputError("first"), InputError("second")
+    assert join_pairs([made("a", [3], 1), first, second], padding=0) is first
+    moved = batch.to(torch.device("cpu"))
+    assert (moved.names, moved.labels.tolist()) == (batch.names, batch.labels.tolist())
+    assert moved.tokens is not None
+
+
+class Table(nn.Module):
+    """Logits that do not depend on the inputs: one row a position."""
+
+    def __init__(self, rows: torch.Tensor) -> None:
+        super().__init__()
+        self.rows = rows
+
+    def forward(self, inputs: dict[str, Any], tokens: Any = None, keep: Any = None) -> torch.Tensor:
+        return self.rows[keep].expand(len(inputs["input_ids"]), -1, -1)
+
+
+def test_the_loss_of_a_token_is_that_of_the_position_before_it() -> None:
+    rows = torch.randn(4, 10, generator=torch.Generator().manual_seed(0))
+    batch = joined(made("a", [3, 4, 5, 6], 2), made("b", [8, 9], 1))
+    objective = AnswerObjective(Table(rows))
+    # 5 and 6 after positions 1 and 2, and 9 after position 0.
+    chances = rows.log_softmax(dim=1)
+    expected = -(chances[1, 5] + chances[2, 6] + chances[0, 9])
+    assert objective(batch)[TERM].item() == pytest.approx(expected.item(), rel=1e-5)
+    assert objective.divisors(batch) == {TERM: 3.0}
+    # A label at the first position has nothing before it.
+    assert objective.divisors(joined(made("a", [3, 4], 2))) == {TERM: 1.0}
+
+
+def test_pictures_come_before_words_and_an_answer_after_both() -> None:
+    asked, answered = chat("what?", ["p", "q"], "this")
+    assert [part["type"] for part in asked["content"]] == ["image", "image", "text"]
+    assert [part.get("image", part.get("text")) for part in asked["content"]] == ["p", "q", "what?"]
+    assert (asked["role"], answered["role"], answered["content"][0]["text"]) == ("user", "assistant", "this")
+    assert len(chat("what?", [])) == 1
+
+
+# Pairs
+
+
+PROMPT = StoredPrompt(text="t", pictures=("a.png",), tokens="x", space="s")
+PAIR = TuningPair(name="q", prompt=PROMPT, answers=("yes", "y"))
+
+
+def test_the_fingerprint_of_pairs_changes_with_everything_that_is_learned() -> None:
+    others = [
+        replace(PAIR, prompt=replace(PROMPT, text="u")),
+        replace(PAIR, prompt=replace(PROMPT, pictures=("b.png",))),
+        replace(PAIR, prompt=replace(PROMPT, tokens="y")),
+        replace(PAIR, answers=("y", "yes")),
+    ]
+    digests = [pairs_digest([pair]) for pair in (PAIR, *others)]
+    digests += [pairs_digest([PAIR, others[0]]), pairs_digest([others[0], PAIR])]
+    assert len(set(digests)) == 7
+    assert {len(each) for each in digests} == {16}
+    # A name is for people.
+    assert pairs_digest([replace(PAIR, name="other")]) == digests[0]
+
+
+def test_pairs_need_answers_and_one_space() -> None:
+    check_pairs([PAIR, PAIR])
+    other = replace(PAIR, name="r", prompt=replace(PROMPT, space="other"))
+    for wrong, said in (
+        ([], "there are no questions to train on"),
+        ([PAIR, replace(PAIR, answers=())], "q: there is no answer"),
+        ([replace(PAIR, answers=("a", " \n"))], "q: an answer is empty"),
+        ([PAIR, other], r"scenes have features of 2 spaces \(other; s\)"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check_pairs(wrong)
+
+
+@pytest.mark.parametrize(
+    ("changes", "taken"),
+    [
+        ({"rank": 1}, True),
+        ({"rank": 4096}, True),
+        ({"rank": 0}, False),
+        ({"rank": 4097}, False),
+        ({"alpha": 1e-9}, True),
+        ({"alpha": 0.0}, False),
+        ({"alpha": float("inf")}, False),
+        ({"alpha": float("nan")}, False),
+        ({"dropout": 0.0}, True),
+        ({"dropout": 0.999}, True),
+        ({"dropout": 1.0}, False),
+        ({"dropout": -0.1}, False),
+    ],
+)
+def test_adapters_have_their_ranges(changes: dict[str, Any], taken: bool) -> None:
+    if taken:
+        AdapterConfig(**changes)
+        return
+    with pytest.raises(InputError, match=f"{next(iter(changes))}: expected"):
+        AdapterConfig(**changes)
+
+
+def test_models_of_transformers_are_not_compiled_and_the_rate_falls_to_nothing() -> None:
+    with pytest.raises(InputError, match=r"train\.compile: expected false"):
+        TuneConfig(train=TrainerConfig(compile=True))
+    assert (tuning_training().final_rate, tuning_training().validate_every) == (0.0, 0)
+
+
+# Towers
+
+
+def idefics(kind: str = "idefics3", side: int = 90, patch: int = 14) -> tuple[Any, Any]:
+    pictures = SimpleNamespace(max_image_size={"longest_edge": side})
+    setattr(pictures, SPLIT, True)
+    tower = SimpleNamespace(patch_size=patch, hidden_size=5)
+    return SimpleNamespace(model_type=kind, vision_config=tower), SimpleNamespace(image_processor=pictures)
+
+
+def llava(**changes: Any) -> tuple[Any, Any]:
+    given = {"layer": -2, "tower": "clip_vision_model", "crop": True, "height": 42, "width": 42, "edge": 42} | changes
+    size = None if given["edge"] is None else {"shortest_edge": given["edge"]}
+    pictures = SimpleNamespace(
+        size=size, do_center_crop=given["crop"], crop_size={"height": given["height"], "width": given["width"]}
+    )
+    tower = SimpleNamespace(model_type=given["tower"], image_size=42, patch_size=14, hidden_size=5)
+    config = SimpleNamespace(model_type="llava", vision_config=tower, vision_feature_layer=given["layer"])
+    return config, SimpleNamespace(image_processor=pictures)
+
+
+def test_the_grid_is_that_of_whole_patches() -> None:
+    for kind in ("idefics3", "smolvlm"):
+        assert tower_layout(*idefics(kind)) == TowerLayout(model=kind, grid=(6, 6), channels=5, fit="stretch")
+    expected = TowerLayout(model="llava", grid=(3, 3), channels=5, fit="crop", layer=-2, skipped=1)
+    assert tower_layout(*llava()) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"layer": [-2, -1]}, r"vision_feature_layer=\[-2, -1\]"),
+        ({"tower": "siglip_vision_model"}, "this one has siglip_vision_model"),
+        ({"crop": False}, "cuts out the middle"),
+        ({"height": 40}, "resizes the shorter edge to 42 pixels"),
+        ({"width": 40}, "resizes the shorter edge to 42 pixels"),
+        ({"edge": 44}, "got shortest_edge=44"),
+        ({"edge": None}, "got shortest_edge=None"),
+    ],
+)
+def test_a_llava_whose_grid_is_not_known_is_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        tower_layout(*llava(**changes))
+
+
+def test_models_of_other_kinds_are_refused() -> None:
+    config, processor = idefics("qwen2_vl")
+    with pytest.raises(InputError, match="given to idefics3, smolvlm, llava, and not to qwen2_vl"):
+        tower_layout(config, processor)
+
+
+class Tower(nn.Module):
+    """Two pictures of a summary token and three patches, and two layers."""
+
+    def forward(self) -> Any:
+        layers = tuple(torch.full((2, 4, 5), float(number)) for number in range(3))
+        return SimpleNamespace(last_hidden_state=layers[-1], hidden_states=layers)
+
+
+def test_tokens_take_the_place_of_patches_of_one_layer_while_they_are_set() -> None:
+    tower = Tower()
+    hook = TokenHook(tower, TowerLayout(model="llava", grid=(1, 3), channels=5, fit="crop", layer=-2, skipped=1))
+    hook.tokens = torch.arange(30.0, dtype=torch.float64).reshape(2, 3, 5)
+    output = tower()
+    assert torch.equal(output.hidden_states[1][:, 1:], hook.tokens.float())
+    # The summary and the other layers stay.
+    assert output.hidden_states[1][:, 0].tolist() == [[1.0] * 5] * 2
+    assert (output.hidden_states[0].unique().tolist(), output.hidden_states[2].unique().tolist()) == ([0.0], [2.0])
+    assert output.last_hidden_state.unique().tolist() == [2.0]
+    assert output.hidden_states[1].dtype == torch.float32
+    hook.tokens = None
+    assert tower().hidden_states[1].unique().tolist() == [1.0]
+
+
+def test_tokens_take_the_place_of_the_last_state_where_no_layer_is_named() -> None:
+    tower = Tower()
+    hook = TokenHook(tower, TowerLayout(model="idefics3", grid=(2, 2), channels=5, fit="stretch"))
+    hook.tokens = torch.arange(40.0).reshape(2, 4, 5)
+    output = tower()
+    assert torch.equal(output.last_hidden_state, hook.tokens)
+    assert output.hidden_states[2].unique().tolist() == [2.0]
+    for wrong in ((2, 3, 5), (1, 4, 5), (2, 4, 6)):
+        hook.tokens = torch.zeros(wrong)
+        with pytest.raises(
+            InputError, match=f"2 pictures of 4 patches with 5 channels, .* {list(wrong)}".replace("[", r"\[")
+        ):
+            tower()
