@@ -9,6 +9,7 @@ from splats import random_gaussians
 from gsencoder.core.errors import InputError
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.labeled_points import LabeledPoints, labeled_points
+from gsencoder.evaluate.protocols.instances import true_instances
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, predict_semantics, semantic_truth
 from gsencoder.text.table import make_text_table
 from gsencoder.types import GaussianFeatures, Gaussians, MeshLabels, Scene
@@ -84,3 +85,16 @@ def test_vertices_lie_in_the_frame_of_the_gaussians_and_take_masks_from_the_near
     assert points.gaussians.tolist() == [0, 1, -1]
     assert points.positions == pytest.approx(mesh.vertices - origin)
     assert semantic_truth(points, CLASSES).tolist() == [4, 0, 0]
+
+
+def test_a_class_of_id_0_is_refused_since_points_of_no_class_have_it() -> None:
+    classes = ClassTable(names=("bed", "chair"), ids=(0, 5))
+    gaussians, features = line_of([BED, UNSEEN])
+    points = points_at(None, 2)
+    for call in (
+        lambda: semantic_truth(points, classes),
+        lambda: predict_semantics(points, gaussians, features, classes, WORDS),
+        lambda: true_instances(points, classes),
+    ):
+        with pytest.raises(InputError, match="classes: 'bed' has the id 0, which stands for no class"):
+            call()

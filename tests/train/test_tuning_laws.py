@@ -1,6 +1,7 @@
 """Pairs, batches, losses and towers of tuning, on stand-ins for a model: shapes, padding, and what is refused."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,8 +12,9 @@ from torch import nn
 from gsencoder.core.errors import InputError
 from gsencoder.data.prompt_store import StoredPrompt
 from gsencoder.train.trainer import TrainerConfig
+from gsencoder.train.tuning import run, vlm
 from gsencoder.train.tuning.network import TERM, AnswerObjective
-from gsencoder.train.tuning.run import TuneConfig, check_pairs, pairs_digest, tuning_training
+from gsencoder.train.tuning.run import TuneConfig, check_pairs, open_processor, pairs_digest, tuning_training
 from gsencoder.train.tuning.samples import IGNORED, TuningBatch, TuningPair, TuningSample, chat, join_pairs
 from gsencoder.train.tuning.towers import SPLIT, TokenHook, TowerLayout, tower_layout
 from gsencoder.train.tuning.vlm import AdapterConfig
@@ -161,6 +163,30 @@ def test_models_of_transformers_are_not_compiled_and_the_rate_falls_to_nothing()
     assert (tuning_training().final_rate, tuning_training().validate_every) == (0.0, 0)
 
 
+@pytest.mark.parametrize(
+    ("lacking", "said"),
+    [
+        ("image_processor", "has no processor of pictures and text"),
+        ("tokenizer", "has no processor of pictures and text"),
+        ("chat_template", "its processor has no chat template"),
+        ("", ""),
+    ],
+)
+def test_a_processor_has_pictures_text_and_a_template(monkeypatch: pytest.MonkeyPatch, lacking: str, said: str) -> None:
+    transformers = pytest.importorskip("transformers")
+    parts = {"image_processor": 1, "tokenizer": 2, "chat_template": "x"}
+    processor = SimpleNamespace(**{name: value for name, value in parts.items() if name != lacking})
+    config = transformers.Idefics3Config()
+    monkeypatch.setattr(vlm, "read_config", lambda folder, what: config)
+    monkeypatch.setattr(vlm, "weight_files", lambda folder, what: [])
+    monkeypatch.setattr(vlm, "load_companion", lambda *given: processor)
+    if not lacking:
+        assert vlm.load_processor(Path("model")) == (config, processor)
+        return
+    with pytest.raises(InputError, match=f"tune: model: {said}"):
+        vlm.load_processor(Path("model"))
+
+
 # Towers
 
 
@@ -210,6 +236,17 @@ def test_models_of_other_kinds_are_refused() -> None:
     config, processor = idefics("qwen2_vl")
     with pytest.raises(InputError, match="given to idefics3, smolvlm, llava, and not to qwen2_vl"):
         tower_layout(config, processor)
+
+
+def test_pictures_are_split_as_the_processor_does_unless_features_replace_the_towers_output(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config, processor = idefics()
+    monkeypatch.setattr(run, "load_processor", lambda folder: (config, processor))
+    assert open_processor(Path("model")) == (config, processor, None)
+    assert getattr(processor.image_processor, SPLIT) is True
+    assert open_processor(Path("model"), with_tokens=True)[2] == tower_layout(config, processor)
+    assert getattr(processor.image_processor, SPLIT) is False
 
 
 class Tower(nn.Module):
