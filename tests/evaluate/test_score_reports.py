@@ -101,7 +101,7 @@ def test_average_precision_is_reported_by_threshold_class_group_and_scene(tmp_pa
     }
     assert (classes["bed"]["ap_50"], classes["chair"]["ap_50"], classes["chair"]["ap_25"]) == (1, 0, 1)
     assert math.isnan(classes["wall"]["ap"])
-    assert report.table.notes == ("1 masks have a class id that is none of the 3 that are scored.",)
+    assert report.table.notes == ("Not counted: 1 mask with a class id that is none of the 3 that are scored.",)
     assert report.line == "3 objects in 2 scenes: AP 0.278, AP50 0.500, AP25 1.000"
 
 
@@ -111,10 +111,10 @@ def test_equal_scores_masks_over_several_objects_and_smaller_regions_are_told(tm
     report = score_instances(*folders, CLASSES, class_agnostic=True)
     assert report.table.notes[0] == EQUAL_SCORES
     assert report.table.notes[1].startswith(
-        "1 masks overlap several true objects by more than 0.25; AP at 0.25 depends"
+        "Of the masks 1 overlap several true objects by more than 0.25; AP at 0.25 depends"
     )
     assert report.line.endswith(" without classes")
-    with pytest.raises(InputError, match="no object of the 3 classes has 101 vertices or more in 1 scenes"):
+    with pytest.raises(InputError, match="no object of the 3 classes has 101 vertices or more in 1 scene"):
         score_instances(*folders, CLASSES, min_region=101)
 
 
@@ -248,7 +248,7 @@ def test_boxes_of_sentences_are_reported_by_kind_threshold_and_number(tmp_path: 
     second, last = report.rows["sentences"][1], report.rows["sentences"][3]
     assert (second["iou"], second["best_iou"], second["multiple"]) == (pytest.approx(0.3), pytest.approx(0.7), True)
     assert (last["iou"], last["best_iou"], last["multiple"]) == (0.0, 0.0, None)
-    assert report.table.notes[0].startswith("1 sentences count in the overall columns alone")
+    assert report.table.notes[0].startswith("1 sentence in the overall columns alone")
     assert report.line == (
         "4 sentences: Acc@0.25 0.500, Acc@0.5 0.250; 1 without a box; of all boxes the best: 0.500, 0.500"
     )
@@ -274,7 +274,7 @@ def test_what_is_scored_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="sentence 0 about object 1 of s has no prediction"):
         score_referring(none, said)
     asked = written(tmp_path / "q.json", [{"scene_id": "s", "question_id": "q", "question": "x", "answers": ["a"]}])
-    with pytest.raises(InputError, match="1 question\\(s\\) without a prediction, first q; allow_missing=true counts"):
+    with pytest.raises(InputError, match="1 question without a prediction, first q; allow_missing=true counts"):
         score_answer_files(none, asked, java=False)
     with pytest.raises(InputError, match="1 object\\(s\\) without a prediction, first 1 of s"):
         score_caption_files(written(tmp_path / "c.json", {}), said, java=False)

@@ -47,7 +47,7 @@ def test_answers_are_reported_by_kind_and_scene_with_what_is_absent(tmp_path: Pa
     assert results["spread"]["em_10"] == {"scenes": 2, "mean": 0.5, "std": pytest.approx(math.sqrt(0.5))}
     assert math.isnan(results["meteor (Python tokens)"])
     assert "METEOR is absent: Java was not asked for (java=false)." in report.table.notes
-    assert "1 answers are empty when cleaned, and count as right in the refined match." in report.table.notes
+    assert "1 answer without a word once cleaned: right in the refined match." in report.table.notes
     assert len(report.rows["questions"]) == 4
     single = score_answer_files(written(tmp_path / "p.json", [rows[0]]), truth, java=False, allow_missing=True)
     assert math.isnan(single.results["em_10"])

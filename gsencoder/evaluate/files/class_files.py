@@ -45,8 +45,7 @@ def _table(classes: str, instances: bool) -> ClassTable:
     if not path.is_file():
         raise InputError(
             f"classes: {classes} is no file; expected {', '.join(COLUMNS)}, a CSV file with the columns id and name, "
-            f"or "
-            "a list of names (.txt)"
+            "or a list of names (.txt)"
         )
     if path.suffix.lower() == ".txt":
         return read_instance_classes(path) if instances else read_class_list(path)

@@ -31,8 +31,9 @@ def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTa
         classes: that are scored; objects of others do not count.
 
     Raises:
-        InputError: label files that are missing or wrong, or a class with the id 0, which is that of no class here.
+        InputError: label files that are missing or wrong, or a class with the id 0.
     """
+    classes.check_instance_ids()
     labels = _labels(folder, raw_ids)
     names = dict(labels.objects)
     class_of = ids_of_names(names.values(), raw_ids, classes)

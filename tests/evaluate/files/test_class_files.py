@@ -31,10 +31,10 @@ def test_a_table_is_read_as_it_was_written_with_groups_and_classes_of_none(tmp_p
 
 
 def test_columns_may_come_in_any_order_and_names_lose_blanks_at_their_ends(tmp_path: Path) -> None:
-    path = written(tmp_path / "c.csv", '\ufeffname,color,id\n" wall, white ",x,1\nfloor ,,0\n')
+    path = written(tmp_path / "c.csv", '\ufeffname,color,id\n" wall, white ",x,1\nfloor ,,2\n')
     table = load_classes(path, instances=True)
     # Those of a file are all scored as instances, walls and floors too.
-    assert (table.names, table.ids, table.groups) == (("wall, white", "floor"), (1, 0), {})
+    assert (table.names, table.ids, table.groups) == (("wall, white", "floor"), (1, 2), {})
 
 
 def test_the_benchmarks_leave_out_wall_and_floor_where_instances_are_scored() -> None:
@@ -70,7 +70,7 @@ def test_a_wrong_table_is_refused_with_its_line(tmp_path: Path, text: str, said:
 
 
 def test_what_is_no_table_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="scannet40 is no file; expected scannet20, scannet200, or a CSV"):
+    with pytest.raises(InputError, match="scannet40 is no file; expected scannet20, scannet200, a CSV"):
         load_classes("scannet40")
     with (tmp_path / "large.csv").open("wb") as stream:
         stream.truncate((4 << 20) + 1)
@@ -106,14 +106,15 @@ def test_vertices_of_a_scan_have_class_and_objectId_plus_one(scan: Path) -> None
     # A wall has an id of the map that is not scored: it is no class, as the beanbag is.
     assert truth.ids.tolist() == [5, 5001, 5001, 6010, 8, 0, 5]
     with pytest.warns(SceneWarning):
-        assert classes_of_scan(scan, RAW, CLASSES).tolist() == [0, 5, 5, 6, 0, 0, 0]
+        assert classes_of_scan(scan, RAW, CLASSES).tolist() == [-1, 5, 5, 6, -1, -1, -1]
 
 
-def test_a_class_of_id_0_is_refused_where_0_stands_for_no_class(scan: Path) -> None:
-    zero = ClassTable(names=("chair", "wall"), ids=(5, 0))
-    for read in (instances_of_scan, classes_of_scan):
-        with pytest.raises(InputError, match="classes: 'wall' has the id 0, which stands for no class"):
-            read(scan, RAW, zero)
+def test_a_class_may_have_the_id_0_among_labels_and_not_among_instances(scan: Path) -> None:
+    zero, raw = ClassTable(names=("chair", "wall"), ids=(5, 0)), {**RAW, "wall": 0}
+    with pytest.raises(InputError, match="classes: 'wall' has the id 0, which files of instances cannot hold"):
+        instances_of_scan(scan, raw, zero)
+    with pytest.warns(SceneWarning):
+        assert classes_of_scan(scan, raw, zero).tolist() == [0, 5, 5, -1, -1, -1, 0]
 
 
 # Folders
