@@ -87,7 +87,7 @@ def run_benchmark(
         for scene in every:
             summary.add_seconds(scene.seconds)
         report = score_written(folder, protocol, classes, method_name(config))
-        write_report(folder, report, summary)
+        write_report(folder, report, summary, page=config.report)
         if others:
             summary.results["other_scenes"] = others
         summary.results["gaussians"] = {scene.scene: scene.gaussians for scene in every}

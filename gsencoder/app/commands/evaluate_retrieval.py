@@ -93,6 +93,6 @@ def run_retrieval(
         report = score_retrieval(
             folder / PREDICTIONS, folder / TRUTH, method=method_name(config), count=protocol.count, seed=protocol.seed
         )
-        write_report(folder, report, summary)
+        write_report(folder, report, summary, page=config.report)
         summary.results["gaussians"] = {scene.scene: scene.gaussians for scene in scenes}
     print_report(out, report, quiet=config.quiet)

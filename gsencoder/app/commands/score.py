@@ -121,6 +121,8 @@ class ScoreConfig(CommonConfig):
         },
     )
 
+    report: bool = field(default=False, metadata={"help": "write report.html, a page with tables"})
+
     def __post_init__(self) -> None:
         if not self.paths:
             return
@@ -148,12 +150,13 @@ def run(config: ScoreConfig, summary: Summary) -> None:
         report = PROTOCOLS[protocol](config)
     out = config.out or Path("outputs") / "score" / protocol
     with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-        write_report(folder, report, summary)
+        write_report(folder, report, summary, page=config.report)
     print_report(out, report, quiet=config.quiet)
 
 
-def write_report(folder: Path, report: ScoreReport, summary: Summary) -> None:
-    """Writes the table as Markdown and CSV, and the rows by scene and class, and adds the results to the summary."""
+def write_report(folder: Path, report: ScoreReport, summary: Summary, *, page: bool) -> None:
+    """Writes the table as Markdown and CSV, the rows by scene and class, and a page where it is asked for, and adds the
+    results to the summary."""
     write_bytes(folder / TABLE, report.table.markdown().encode())
     # What is 0 but for rounding reads 0; the summary has all digits.
     tables = {"table": report.table.csv_rows(), **report.rows}
@@ -164,6 +167,10 @@ def write_report(folder: Path, report: ScoreReport, summary: Summary) -> None:
         ]
         write_bytes(folder / f"{name}.csv", csv_text(rounded).encode())
     summary.results.update(report.results)
+    if page:
+        from gsencoder.app.reports.results import report_benchmark
+
+        report_benchmark(folder, report, summary)
 
 
 def print_report(out: Path, report: ScoreReport, *, quiet: bool) -> None:

@@ -1,4 +1,4 @@
-"""Pages about the results of `fuse`, `localize` and `evaluate` (report=true)."""
+"""Pages about the results of `fuse`, `localize`, `evaluate` and `score` (report=true)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Any
 
 from gsencoder.app.reports.parts import add_features, add_views, add_words
 from gsencoder.app.runs.summary import Summary, peak_memory_mb
+from gsencoder.evaluate.score_report import ScoreReport
 from gsencoder.infer.draw.report import HtmlReport
 from gsencoder.types import GaussianFeatures, Localization, Scene
 
@@ -77,6 +78,37 @@ def report_scores(folder: Path, summary: Summary) -> None:
         report.table(("scene", *columns), rows)
     _timings(report, summary)
     report.write(folder / REPORT)
+
+
+def report_benchmark(folder: Path, scores: ScoreReport, summary: Summary) -> None:
+    """Writes the page of a benchmark: measured rows above those of papers, and the rows by scene and class.
+
+    Args:
+        folder: of the results.
+        scores: of one protocol.
+        summary: of the command.
+    """
+    table = scores.table.without_classes()
+    report = HtmlReport(table.title, scores.line)
+    _facts(report, {name: value for name, value in scores.results.items() if _is_figure(value)}, summary)
+    report.section("Percent", "Rows of papers are of other scenes.")
+    report.table(
+        ("method", "source", *table.columns),
+        [(row.method, row.source, *(_cell(row.values.get(name)) for name in table.columns)) for row in table.rows],
+    )
+    for note in table.notes:
+        report.paragraph(note)
+    for title, rows in scores.rows.items():
+        if rows:
+            report.section(title.capitalize())
+            columns = list(dict.fromkeys(name for row in rows for name in row))
+            report.table(columns, [[_cell(row.get(name)) for name in columns] for row in rows])
+    _timings(report, summary)
+    report.write(folder / REPORT)
+
+
+def _cell(value: Any) -> Any:
+    return "–" if value is None or value != value else value
 
 
 def _facts(report: HtmlReport, facts: Mapping[str, object], summary: Summary) -> None:

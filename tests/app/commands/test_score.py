@@ -47,8 +47,20 @@ def evaluated(rooms: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     words = f"teacher.words={rooms / 'words.safetensors'}"
     for name, options in PROTOCOLS.items():
         out = f"out={folder / name}"
-        assert cli.main(["evaluate", *scenes, f"protocol={name}", words, *options, out, "quiet=true"]) == 0
+        assert (
+            cli.main(["evaluate", *scenes, f"protocol={name}", words, *options, "report=true", out, "quiet=true"]) == 0
+        )
     return {name: folder / name for name in PROTOCOLS}
+
+
+def as_evaluated(protocol: str, evaluated: dict[str, Path]) -> tuple[str, ...]:
+    """The options with which `score` takes the files as `evaluate` did."""
+    return {
+        "recognition": ("ks=1,5",),
+        "instances": (f"classes={evaluated['instances'] / 'class_ids.csv'}", "min_region=20"),
+        "semantics": (f"classes={evaluated['semantics'] / 'class_ids.csv'}",),
+        "referring": ("ks=5",),
+    }[protocol]
 
 
 def scored(protocol: str, evaluated: Path, out: Path, *options: str) -> dict[str, Any]:
@@ -60,16 +72,23 @@ def scored(protocol: str, evaluated: Path, out: Path, *options: str) -> dict[str
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_page_shows_what_the_table_holds_and_the_scenes(
+    protocol: str, evaluated: dict[str, Path], tmp_path: Path
+) -> None:
+    scored(protocol, evaluated[protocol], tmp_path / "scored", *as_evaluated(protocol, evaluated), "report=true")
+    for folder in (evaluated[protocol], tmp_path / "scored"):
+        page = (folder / "report.html").read_text()
+        with (folder / "table.csv").open() as stream:
+            rows = list(csv.DictReader(stream))
+        assert all(f"<td>{row['method']}</td>" in page for row in rows)
+        assert ">room_0<" in page or not (folder / "scenes.csv").exists()
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_the_files_that_evaluate_writes_have_the_scores_that_it_reports(
     protocol: str, evaluated: dict[str, Path], tmp_path: Path
 ) -> None:
-    options = {
-        "recognition": ("ks=1,5",),
-        "instances": (f"classes={evaluated['instances'] / 'class_ids.csv'}", "min_region=20"),
-        "semantics": (f"classes={evaluated['semantics'] / 'class_ids.csv'}",),
-        "referring": ("ks=5",),
-    }[protocol]
-    again = scored(protocol, evaluated[protocol], tmp_path / "score", *options)
+    again = scored(protocol, evaluated[protocol], tmp_path / "score", *as_evaluated(protocol, evaluated))
     first = results_of(evaluated[protocol])
     del first["gaussians"]
     assert again == first
