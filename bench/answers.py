@@ -115,7 +115,7 @@ def share(good: Sequence[bool]) -> float | None:
 
 
 def send(question: Question, asker: Asker, server: VlmServer, register: Register, tally: Tally) -> tuple[str, Prompt]:
-    """Asks one question, and adds seconds and bytes to the tally; the truth of its pictures is told in between."""
+    """Asks one question, and adds seconds and bytes to the tally; the truth of its pictures is registered in between."""
     begun, used = time.perf_counter(), time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)
@@ -205,7 +205,7 @@ def labeled(paths: Sequence[str], settings: argparse.Namespace, vlm: VlmConfig) 
                 described = [each for each in expressions if each.scene == scene.name]
                 tally = tallies[f"{method} {count}"]
                 measure(asker, server, register, own, described, tally)
-                print(f"{scene.name} {method} {count}: {told(tally.figures())}", flush=True)
+                print(f"{scene.name} {method} {count}: {one_line(tally.figures())}", flush=True)
         assert answerer.unknown_pictures == answerer.unknown_questions == 0
     return {name: tally.figures() for name, tally in tallies.items()}
 
@@ -243,11 +243,11 @@ def unlabeled(settings: argparse.Namespace, vlm: VlmConfig) -> dict[str, dict[st
                 sheet.facts[scene.name, text] = Fact(answer="shown", needed=(1,))
                 answer, _ = send(Question(text=text, query=(word,)), asker, server, register, tally)
                 tally.right["shown"].append(answer == "shown")
-            print(f"{scene.name} {method} {count}: {told(tally.figures())}", flush=True)
+            print(f"{scene.name} {method} {count}: {one_line(tally.figures())}", flush=True)
     return {name: tally.figures() for name, tally in tallies.items()}
 
 
-def told(figures: Mapping[str, Any]) -> str:
+def one_line(figures: Mapping[str, Any]) -> str:
     """Figures on one line."""
     return ", ".join(
         f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
@@ -275,7 +275,7 @@ def main() -> None:
     table = unlabeled(settings, vlm) if settings.unlabeled else labeled(settings.scenes, settings, vlm)
     print(f"seen: an object of {MIN_PIXELS} pixels or more; {time.process_time() - begun:.0f} s of one core")
     for name, figures in table.items():
-        print(f"{name}: {told(figures)}")
+        print(f"{name}: {one_line(figures)}")
     if settings.out:
         write_json(settings.out, table)
 

@@ -47,8 +47,7 @@ def run_retrieval(
     if len(captions) < len(given):
         warnings.warn(
             f"{len(given) - len(captions)} of {counted(len(given), 'caption')} do not count: they are about scenes "
-            f"that "
-            "are not evaluated",
+            "that are not evaluated",
             SceneWarning,
             stacklevel=2,
         )
