@@ -115,7 +115,7 @@ def share(good: Sequence[bool]) -> float | None:
 
 
 def send(question: Question, asker: Asker, server: VlmServer, register: Register, tally: Tally) -> tuple[str, Prompt]:
-    """Asks one question, and adds seconds and bytes to the tally; the truth of its pictures is registered in between."""
+    """Asks one question, and adds seconds and bytes to the tally; the truth of its pictures is registered between."""
     begun, used = time.perf_counter(), time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)

@@ -145,6 +145,13 @@ class SampleRecipe:
     seed: int
     step_samples: int = 1
 
+    def uses_classes(self, teacher: TeacherRecipe) -> bool:
+        """Whether samples depend on the classes of a teacher's targets: by the centers of crops, by weights of rare
+        classes, or by L_contrast."""
+        by_center = self.sampling.rare_centers > 0 and self.sampling.gaussians > 0
+        by_contrast = teacher.contrast and teacher.weight > 0 and self.losses.contrast_weight > 0
+        return by_center or by_contrast or self.losses.rarity != 0
+
 
 Codes = tuple[Int32[np.ndarray, " N"] | None, ...]
 """For each teacher the class of each Gaussian's target, −1 without a target; None in a scene that lacks the teacher."""
@@ -195,7 +202,7 @@ class SampleDataset(Dataset[Sample]):
         The number of open scenes is limited, since each holds a file descriptor.
         """
         if scene_index not in self._codes:
-            self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe.teachers)
+            self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe)
         self._codes.move_to_end(scene_index)
         if len(self._codes) > max(1, MAX_OPEN_FILES // len(self.recipe.teachers)):
             oldest, _ = self._codes.popitem(last=False)
@@ -232,21 +239,26 @@ class StepSampler(Sampler[list[int]]):
                 yield list(range(start, start + self.batch))
 
 
-def target_codes(scene: TrainingScene, teachers: Sequence[TeacherRecipe]) -> Codes:
+def target_codes(scene: TrainingScene, recipe: SampleRecipe) -> Codes:
     """The class of each Gaussian's target, a row of each teacher's codebook.
+
+    Finding classes reads all targets of a scene, which may be a gigabyte. Where nothing depends on them, every target
+    is of class 0.
 
     Raises:
         InputError: the scene was not prepared for the same Gaussians and views by all teachers.
     """
     scene.check_consistent()
     result: list[np.ndarray | None] = []
-    for part, teacher in zip(scene.parts, teachers, strict=True):
+    for part, teacher in zip(scene.parts, recipe.teachers, strict=True):
         if part is None:
             result.append(None)
             continue
         codes = np.full(len(part), -1, np.int32)
         seen = np.flatnonzero(part.weights)
-        codes[seen] = nearest_codes(teacher.class_balance.codebook, part.targets(seen))
+        codes[seen] = (
+            nearest_codes(teacher.class_balance.codebook, part.targets(seen)) if recipe.uses_classes(teacher) else 0
+        )
         result.append(codes)
     return tuple(result)
 
