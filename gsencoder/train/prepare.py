@@ -17,6 +17,7 @@ from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised, listed
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import FuseConfig, fuse
@@ -28,6 +29,7 @@ from gsencoder.models.output_space import OutputSpace, output_space_parts, read_
 from gsencoder.render import blend
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets
 from gsencoder.train.dataset_space import dataset_space
+from gsencoder.train.distributed import fail_together, summed_array, value_of_first
 from gsencoder.train.prepared_scene import PreparedScene, ViewRows, write_prepared
 from gsencoder.types import FeatureMap, Scene
 
@@ -249,28 +251,43 @@ class PreparedDataset:
             if time.time() - path.stat().st_mtime > MAX_MAPS_AGE:
                 shutil.rmtree(path, ignore_errors=True)
 
-    def count_classes(self, names: Sequence[str], track: Track) -> None:
+    def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:
         """Counts the target classes of the training scenes and stores the counts, unless those of these scenes are
-        stored already; scenes that are not prepared are left out."""
-        prepared = [scene.name for scene in self.scenes(names)]
-        counted = self._counted_scenes()
-        if counted is None or (counted and set(prepared) <= set(counted)):
+        stored already; scenes that are not prepared are left out.
+
+        All processes of a training call this: the first one clusters the classes of a dense teacher from a sample of
+        the targets and writes the file, and each counts the targets of its share of the scenes.
+
+        Raises:
+            InputError: in any process, a scene is damaged, or the disk is full.
+        """
+        codebook = None
+        with fail_together():
+            if process.is_first:
+                codebook = self._classes_to_count(names)
+        codebook = value_of_first(codebook)
+        if codebook is None:
             return
-        _, codebook = self.load_space()
         scenes = self.scenes(names)
+        with fail_together():
+            share = track(scenes[process.rank :: process.world_size], "counting targets")
+            counts = count_targets((_seen_targets(scene) for scene in share), codebook).counts
+        with fail_together():
+            counts = summed_array(counts)
+            if process.is_first:
+                arrays = {"codebook": codebook, "counts": counts}
+                write_archive(self.folder / CLASS_BALANCE_FILE, arrays, {"scenes": [scene.name for scene in scenes]})
 
-        def seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
-            rows = np.flatnonzero(scene.weights)
-            targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
-            scene.close()
-            return targets
-
+    def _classes_to_count(self, names: Sequence[str]) -> Float32[np.ndarray, "C channels"] | None:
+        """The codebook of the classes; None if the targets of these scenes have been counted."""
+        scenes, counted = self.scenes(names), self._counted_scenes()
+        if counted is None or (counted and {scene.name for scene in scenes} <= set(counted)):
+            return None
+        _, codebook = self.load_space()
         if codebook is None:
             scene_share = max(1, CLUSTERED_TARGETS // len(scenes))
-            codebook = cluster_targets(np.concatenate([seen_targets(scene, scene_share) for scene in scenes]))
-        balance = count_targets((seen_targets(scene) for scene in track(scenes, "counting targets")), codebook)
-        arrays = {"codebook": balance.codebook, "counts": balance.counts}
-        write_archive(self.folder / CLASS_BALANCE_FILE, arrays, {"scenes": prepared})
+            codebook = cluster_targets(np.concatenate([_seen_targets(scene, scene_share) for scene in scenes]))
+        return codebook
 
     def _counted_scenes(self) -> list[str] | None:
         """The scenes whose targets were counted, none at first; None for a file of earlier versions."""
@@ -303,6 +320,14 @@ class PreparedDataset:
     def scenes(self, names: Sequence[str]) -> list[PreparedScene]:
         """Opens prepared scenes by name; those that are not prepared are left out."""
         return [scene for name in names if (scene := self.find_scene(name)) is not None]
+
+
+def _seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
+    """The targets of the seen Gaussians of a scene, or at most so many of them, evenly spaced; the scene is closed."""
+    rows = np.flatnonzero(scene.weights)
+    targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
+    scene.close()
+    return targets
 
 
 def prepare_scene(

@@ -13,6 +13,7 @@ from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files.json_values import plain
+from gsencoder.core.first_repeated import first_repeated
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
@@ -94,17 +95,17 @@ def split_scenes(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[P
         InputError: a pattern matches no scene, all scenes are held out, or two scenes have the same name.
     """
     names = [path.name for path in paths]
-    if len(set(names)) < len(names):
-        duplicate = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"paths: two scenes are called {duplicate!r}; prepared scenes need distinct names")
+    if (repeated := first_repeated(names)) is not None:
+        raise InputError(f"paths: two scenes are called {repeated[0]!r}; prepared scenes need distinct names")
     for pattern in patterns:
         if not any(fnmatch(name, pattern) for name in names):
             raise InputError(
                 f"holdout: no scene is called {pattern!r}; the scenes are {listed(names, 5)}; give names of these, or "
                 "holdout=[] for none (experiments hold out scenes of the data that they are made for)"
             )
-    held_out = [path for path in paths if any(fnmatch(path.name, pattern) for pattern in patterns)]
-    training = [path for path in paths if path not in held_out]
+    is_held_out = [any(fnmatch(name, pattern) for pattern in patterns) for name in names]
+    held_out = [path for path, held in zip(paths, is_held_out, strict=True) if held]
+    training = [path for path, held in zip(paths, is_held_out, strict=True) if not held]
     if not training:
         raise InputError("holdout: matches every scene; at least one must remain for training")
     return training, held_out
@@ -195,8 +196,8 @@ def prepare_scenes(
     with fail_together():
         if process.is_first:
             _check_teachers(datasets, training, held_out)
-            for dataset in datasets.values():
-                dataset.count_classes([path.name for path in training], track)
+    for dataset in datasets.values():
+        dataset.count_classes([path.name for path in training], track, process)
     return datasets
 
 

@@ -21,6 +21,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.runtime.threads import threads_of_torch
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit
@@ -34,7 +35,7 @@ from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.train.adapter_heads import asked_heads, dataset_heads, teacher_of_heads
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, check_same_teachers
-from gsencoder.train.distributed import fail_together, join_processes
+from gsencoder.train.distributed import cpu_share, fail_together, join_processes
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.run import TrainConfig, Training, fit
@@ -89,7 +90,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
                 if config.resume:
                     check_same_teachers(state.path / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
-        with summary.step("prepare"):
+        with summary.step("prepare"), threads_of_torch(cpu_share(process, config.prepare_threads)):
             heads_asked = asked_heads(config.heads, config.teachers_by_name)
             datasets = prepare_scenes(
                 training,
