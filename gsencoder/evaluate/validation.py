@@ -98,13 +98,13 @@ def validate_encoder(
     Returns:
         The accuracy for each teacher; teachers that all scenes lack are left out.
     """
-    tallies = {
-        teacher: _Tally(outputs[teacher], codebook, pictured=pictured) for teacher, codebook in codebooks.items()
-    }
     process = current_process()
     # The first process takes the scenes that are drawn, and all take turns with the others.
     drawn = scenes[:pictured] if process.is_first else []
     share = [*drawn, *scenes[pictured:][process.rank :: process.world_size]]
+    tallies = {
+        teacher: _Tally(outputs[teacher], codebook, pictured=len(drawn)) for teacher, codebook in codebooks.items()
+    }
     for scene in track(share, "validation"):
         gaussians = scene.gaussians(np.arange(len(scene)))
         with about(f"scene {scene.name}"):
