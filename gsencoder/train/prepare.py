@@ -30,7 +30,7 @@ from gsencoder.render import blend
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.distributed import fail_together, summed_array, value_of_first
-from gsencoder.train.prepared_scene import PreparedScene, ViewRows, write_prepared
+from gsencoder.train.prepared_scene import PreparedScene, ViewRows, digest_of_files, write_prepared
 from gsencoder.types import FeatureMap, Scene
 
 SPACE_FILE, DATASET_SETTINGS_FILE, CLASS_BALANCE_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
@@ -193,7 +193,7 @@ class PreparedDataset:
         return self.folder / "scenes" / f"{name}.safetensors"
 
     def has_scene(self, source: Path) -> bool:
-        """Whether the scene at this path is prepared.
+        """Whether the scene at this path is prepared, from this path or from another one with the same files.
 
         Raises:
             InputError: another scene with the same name is.
@@ -203,7 +203,9 @@ class PreparedDataset:
             return False
         with advised("remove the file to prepare the scene again"), open_archive(path) as file:
             made_from = file.value("source", str)
-        if made_from != str(source.resolve()):
+            files = file.value("source_files", str) if "source_files" in file else ""
+        # A data set that was moved, or is mounted elsewhere on another machine, holds the same files.
+        if made_from != str(source.resolve()) and not (files and files == digest_of_files(source)):
             raise InputError(
                 f"{path}: was prepared from {made_from}, but this run uses {source.resolve()}; prepared scenes need "
                 "distinct names: rename one, or give another folder as prepared="

@@ -4,7 +4,9 @@ The file is memory-mapped: a sample reads only its Gaussians and views, and data
 cache. Data is verified against checksums when it is first read.
 """
 
+import hashlib
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -178,6 +180,19 @@ class PreparedScene:
         return view_rows
 
 
+def digest_of_files(source: Path) -> str:
+    """A hash of the names and sizes of the files of a scene, by which it is recognized where it was moved to.
+
+    Contents are not read: thousands of scenes are looked at before a training begins.
+    """
+    if source.is_dir():
+        found = (Path(folder) / name for folder, _, names in os.walk(source) for name in names)
+        rows = sorted(f"{path.relative_to(source).as_posix()} {path.stat().st_size}" for path in found)
+    else:
+        rows = [str(source.stat().st_size)] if source.exists() else []
+    return hashlib.sha256("\n".join(rows).encode()).hexdigest()[:16] if rows else ""
+
+
 def _check_arrays(arrays: MappedArrays, views: int) -> None:
     """Checks the shapes of all arrays, and the values of those that are read for all Gaussians.
 
@@ -264,6 +279,7 @@ def write_prepared(
     }
     header = {
         "source": str(source.resolve()),
+        "source_files": digest_of_files(source),
         "views": list(scene.views.names),
         "metres_per_unit": scene.metres_per_unit,
         "up": None if scene.up is None else scene.up.tolist(),

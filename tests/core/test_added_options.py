@@ -1,6 +1,6 @@
 """Settings of older files are completed by what was done before an option existed."""
 
-from gsencoder.core.added_options import ADDED_OPTIONS, with_added_options
+from gsencoder.core.added_options import ADDED_OPTIONS, TRAINED, with_added_options
 
 
 def test_sections_get_the_options_that_they_lack_and_keep_those_that_they_have() -> None:
@@ -47,3 +47,8 @@ def test_settings_of_scenes_that_were_prepared_for_several_teachers_are_complete
         "labels": {"prepare": {"center": False, "scale": True}},
         "dino": {"prepare": {"center": True, "scale": True}},
     }
+
+
+def test_paths_of_scenes_do_not_count_and_scenes_of_teachers_do() -> None:
+    completed = with_added_options({"scenes": {"dino": ["a"]}, "prepared": {"scenes": {"a": "/old/a", "b": "/b"}}})
+    assert completed == {"scenes": {"dino": ["a"]}, "prepared": {"scenes": {"a": TRAINED, "b": TRAINED}}}

@@ -1,6 +1,7 @@
 """Preparation: one space for all scenes, whole files, and no mixing of two datasets."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -77,6 +78,25 @@ def test_another_scene_of_a_prepared_name_is_refused(tmp_path: Path) -> None:
     dataset, names = prepared(tmp_path / "prepared", count=1)
     with pytest.raises(InputError, match=f"was prepared from .*{names[0]}, but this run uses .*elsewhere.*{names[0]}"):
         dataset.has_scene(tmp_path / "elsewhere" / names[0])
+
+
+def test_a_scene_that_was_moved_is_recognized_by_its_files(tmp_path: Path) -> None:
+    dataset, _ = prepared(tmp_path / "prepared", count=1)
+    source = tmp_path / "data" / "wall_0"
+    (source / "color").mkdir(parents=True)
+    for name, size in {"poses.txt": 5, "color/0.jpg": 9}.items():
+        (source / name).write_bytes(bytes(size))
+    dataset.scene_path("wall_0").unlink()
+    dataset.prepare(scene(0), SideTeacher(), PREPARE, source=source)
+    moved = Path(shutil.move(source, tmp_path / "elsewhere" / "wall_0"))
+    assert dataset.has_scene(moved)
+    (moved / "color" / "0.jpg").write_bytes(bytes(10))
+    with pytest.raises(InputError, match="was prepared from"):
+        dataset.has_scene(moved)
+    (moved / "color" / "0.jpg").write_bytes(bytes(9))
+    (moved / "more.jpg").touch()
+    with pytest.raises(InputError, match="was prepared from"):
+        dataset.has_scene(moved)
 
 
 def test_what_is_there_is_opened_without_settings_and_nothing_is_made(tmp_path: Path) -> None:
