@@ -18,6 +18,7 @@ ADDED_OPTIONS: Mapping[str, Any] = {
     "loss.teacher_weights": [],
     "prepare.center": True,
     "prepare.scale": True,
+    "prepare.render_views": 0,
 }
 
 

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised, listed
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.runtime.process_rank import ProcessRank
@@ -53,6 +54,13 @@ class PrepareConfig:
     render_min_weight: float = field(
         default=1e-3, metadata={"help": "smallest blending weight in the matrices of the render loss"}
     )
+    render_views: int = field(
+        default=0,
+        metadata={
+            "help": "views of a scene, evenly spaced, whose matrices are stored and from which samples draw theirs; "
+            "0 = all. Targets are fused from all views in any case"
+        },
+    )
     basis_views: int = field(
         default=256, metadata={"help": "number of maps from which the basis of a dense teacher is computed"}
     )
@@ -74,6 +82,8 @@ class PrepareConfig:
             raise InputError(
                 f"render_cell and basis_views: expected 1 or more, got {self.render_cell} and {self.basis_views}"
             )
+        if self.render_views < 0:
+            raise InputError(f"render_views: expected 0 (all) or more, got {self.render_views}")
         if not 0 <= self.render_min_weight < 1:
             raise InputError(f"render_min_weight: expected a number in [0, 1), got {self.render_min_weight}")
 
@@ -341,7 +351,7 @@ def prepare_scene(
     *,
     source: Path = Path(),
 ) -> None:
-    """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of every view.
+    """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of `config.render_views`.
 
     Args:
         path: the file.
@@ -358,18 +368,22 @@ def prepare_scene(
     assert scene.views is not None
     fusion = replace(config.fusion, basis=outputs.basis is not None)
     fused = fuse(scene, teacher, fusion, basis=outputs.basis)
-    rows = view_rows(scene, teacher, outputs, config)
-    write_prepared(path, scene, fused.features, outputs, rows, source=source, projections=fused.projections)
+    chosen = even_indices(len(scene.views), config.render_views or len(scene.views))
+    rows = view_rows(scene, teacher, outputs, config, chosen)
+    with_rows = replace(scene, views=scene.views.select(chosen))
+    write_prepared(path, with_rows, fused.features, outputs, rows, source=source, projections=fused.projections)
 
 
-def view_rows(scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig) -> list[ViewRows]:
-    """The matrix B of every view on the teacher's grid, pooled to cells of `config.render_cell` pixels, with the
-    teacher's vectors; arguments are those of `prepare_scene`."""
+def view_rows(
+    scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig, views: Int64[np.ndarray, " v"]
+) -> list[ViewRows]:
+    """The matrices B of some views on the teacher's grid, pooled to cells of `config.render_cell` pixels, with the
+    teacher's vectors; the other arguments are those of `prepare_scene`."""
     assert scene.gaussians is not None
     assert scene.views is not None
     blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
     rows = []
-    for view in range(len(scene.views)):
+    for view in views.tolist():
         targets, valid, grid = _pool_map(teacher.feature_map(scene.views, view), outputs, config.render_cell)
         b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid))
         if scene.views.masks is not None:

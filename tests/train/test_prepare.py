@@ -18,7 +18,14 @@ from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets, nearest_codes
 from gsencoder.train.dataset_space import dataset_space
-from gsencoder.train.prepare import CLASS_BALANCE_FILE, DATASET_SETTINGS_FILE, SPACE_FILE, PreparedDataset
+from gsencoder.train.prepare import (
+    CLASS_BALANCE_FILE,
+    DATASET_SETTINGS_FILE,
+    SPACE_FILE,
+    PrepareConfig,
+    PreparedDataset,
+    prepare_scene,
+)
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -60,6 +67,23 @@ def test_cells_of_the_render_loss_hold_the_mean_of_their_pixels(tmp_path: Path) 
     vectors = outputs.restore(view.targets).reshape(10, 12, 4)
     np.testing.assert_allclose(vectors[:, :6], np.broadcast_to(TABLE[1], (10, 6, 4)), atol=5e-3)
     np.testing.assert_allclose(vectors[:, 6:], np.broadcast_to(TABLE[2], (10, 6, 4)), atol=5e-3)
+
+
+def test_rows_of_some_views_are_stored_as_those_of_all_would_be_and_targets_are_of_all(tmp_path: Path) -> None:
+    of_all, (name,) = prepared(tmp_path / "all", count=1)
+    whole = of_all.scenes([name])[0]
+    path = tmp_path / "some.safetensors"
+    prepare_scene(path, scene(0), SideTeacher(), of_all.load_space()[0], replace(PREPARE, render_views=1))
+    some = PreparedScene(path)
+    assert (some.view_names, len(whole.view_names)) == (whole.view_names[:1], 2)
+    rows = np.arange(len(whole))
+    np.testing.assert_array_equal(some.targets(rows), whole.targets(rows))
+    for field in ("crow", "col", "weight", "targets", "valid"):
+        np.testing.assert_array_equal(getattr(some.view(0), field), getattr(whole.view(0), field))
+    assert len(some.cameras) == 1
+    np.testing.assert_array_equal(some.cameras.Ks[0], whole.cameras.Ks[0])
+    with pytest.raises(InputError, match=r"render_views: expected 0 \(all\) or more, got -1"):
+        PrepareConfig(render_views=-1)
 
 
 def test_what_is_prepared_is_not_prepared_again(tmp_path: Path) -> None:
