@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float16, Float32, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError, about, advised
 from gsencoder.core.files.archive import open_archive, write_archive
@@ -158,8 +158,12 @@ class PreparedScene:
 
     def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
         """Reads targets of the encoder by row, standard units; zero for Gaussians without a target."""
+        return self.stored_targets(rows).astype(np.float32)
+
+    def stored_targets(self, rows: np.ndarray) -> Float16[np.ndarray, "n channels"]:
+        """The same in the type in which they are stored."""
         with self._error_context():
-            return self._arrays.rows("targets", rows).astype(np.float32)
+            return self._arrays.rows("targets", rows)
 
     def view(self, view: int) -> ViewRows:
         """Reads the blending matrix and the teacher's vectors of one view."""

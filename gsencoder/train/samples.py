@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int32, Int64
+from jaxtyping import Float, Float16, Float32, Int32, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
@@ -36,13 +36,14 @@ class TeacherTargets(NamedTuple):
     """What one teacher says of the Gaussians and views of a sample or a batch.
 
     Attributes:
-        targets: targets of the Gaussians, standard units.
+        targets: targets of the Gaussians, standard units; in float16, as they are stored, since samples that are made
+            ahead fill shared memory.
         codes: class of each Gaussian's target, a row of the teacher's codebook; −1 without a target.
         loss_weights: weight of each Gaussian in the loss; 0 without a target.
         rows: rows of the render loss.
     """
 
-    targets: Float[Tensor, "N C"]
+    targets: Float16[Tensor, "N C"]
     codes: Int64[Tensor, " N"]
     loss_weights: Float[Tensor, " N"]
     rows: RenderRows
@@ -328,7 +329,7 @@ def _targets_of(
         view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
         rows.append(make_render_rows(view_rows, balance, losses.rarity))
     return TeacherTargets(
-        targets=torch.from_numpy(scene.targets(remaining)),
+        targets=torch.from_numpy(scene.stored_targets(remaining)),
         codes=torch.from_numpy(codes[remaining].astype(np.int64)),
         loss_weights=torch.from_numpy(_weights_of(codes, balance, losses.rarity)[remaining]),
         rows=join_rows(rows, [0] * len(rows)),
@@ -338,7 +339,7 @@ def _targets_of(
 def _no_targets(gaussians: int, channels: int) -> TeacherTargets:
     """The targets of a teacher that a scene lacks: nothing that has a weight."""
     return TeacherTargets(
-        targets=torch.zeros(gaussians, channels),
+        targets=torch.zeros(gaussians, channels, dtype=torch.float16),
         codes=torch.full((gaussians,), -1),
         loss_weights=torch.zeros(gaussians),
         rows=empty_rows(channels),

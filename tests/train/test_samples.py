@@ -110,7 +110,7 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     opaque = b.alpha >= 0.5
     assert ours.rows == int(opaque.sum())
     torch.testing.assert_close(ours.alpha, b.alpha[opaque], rtol=2e-3, atol=2e-3)
-    rendered = ours.render(targets.targets) / ours.alpha[:, None]
+    rendered = ours.render(targets.targets.float()) / ours.alpha[:, None]
     assert torch.cosine_similarity(rendered, targets.rows.targets, dim=1).mean() > 0.9
 
 
