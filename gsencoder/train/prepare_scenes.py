@@ -38,7 +38,11 @@ class SourceConfig:
     """The source of a training's targets: settings of reading, seeding, the teacher and preparation."""
 
     splat: str = field(
-        default="", metadata={"help": f"file of the Gaussians of scenes with views; empty = make seeds. {READABLE}"}
+        default="",
+        metadata={
+            "help": "file of the Gaussians of scenes with views, where {scene} stands for the name of its folder; "
+            f"empty = make seeds. {READABLE}"
+        },
     )
     orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
     cameras: CamerasOfSplat = field(
