@@ -1,7 +1,8 @@
 """Options that were added after settings had been stored in files, each with the value that says what was done before.
 
 Prepared scenes and checkpoints are used only with the settings that they were made with. Files that are older than an
-option do not have it, and are compared as if they had this value.
+option do not have it, and are compared as if they had this value. Older ones also hold the path of each scene, where
+later ones say that it was trained on: a data set may have been moved since.
 """
 
 from collections.abc import Mapping
@@ -17,7 +18,12 @@ ADDED_OPTIONS: Mapping[str, Any] = {
     "loss.teacher_weights": [],
     "prepare.center": True,
     "prepare.scale": True,
+    "prepare.render_views": 0,
 }
+
+
+TRAINED = "trained on"
+"""What the settings of prepared scenes say of each scene that defines their space."""
 
 
 def with_added_options(stored: Mapping[str, Any]) -> dict[str, Any]:
@@ -38,6 +44,10 @@ def with_added_options(stored: Mapping[str, Any]) -> dict[str, Any]:
                 section = section.get(part) if isinstance(section, dict) else None
             if isinstance(section, dict):
                 section.setdefault(name, value)
+    for root in roots:
+        scenes = root.get("scenes") if isinstance(root, dict) else None
+        if isinstance(scenes, dict) and all(isinstance(path, str) for path in scenes.values()):
+            root["scenes"] = dict.fromkeys(scenes, TRAINED)
     return settings
 
 

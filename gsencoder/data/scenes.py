@@ -114,8 +114,9 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
 
     Args:
         path: a folder or file.
-        splat: the Gaussians of a scene that has views; relative to the scene or else to the current folder. They must
-            be in the world of the cameras. Without it a splat beside the views is not used.
+        splat: the Gaussians of a scene that has views; relative to the scene or else to the current folder, with
+            {scene} for the name of the scene's folder. They must be in the world of the cameras. Without it a splat
+            beside the views is not used.
         options: see SceneConfig.
 
     Returns:

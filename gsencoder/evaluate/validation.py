@@ -23,6 +23,7 @@ from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.render import blend
 from gsencoder.render.images import render_image
 from gsencoder.train.class_balance import nearest_codes
+from gsencoder.train.distributed import current_process, summed_array
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.trainer import ValidationResult
 from gsencoder.train.training_scene import TrainingScene
@@ -82,6 +83,9 @@ def validate_encoder(
 ) -> dict[str, ClassAccuracy]:
     """Encodes prepared scenes, each once, and classifies the predicted features of each teacher.
 
+    The processes of a training, all of which must call this, share the scenes. All return the accuracies over all
+    scenes, and the first one has the pictures.
+
     Args:
         scenes: prepared scenes, with a part for each of the teachers that they have.
         encoder: the encoder to validate.
@@ -94,10 +98,14 @@ def validate_encoder(
     Returns:
         The accuracy for each teacher; teachers that all scenes lack are left out.
     """
+    process = current_process()
+    # The first process takes the scenes that are drawn, and all take turns with the others.
+    drawn = scenes[:pictured] if process.is_first else []
+    share = [*drawn, *scenes[pictured:][process.rank :: process.world_size]]
     tallies = {
-        teacher: _Tally(outputs[teacher], codebook, pictured=pictured) for teacher, codebook in codebooks.items()
+        teacher: _Tally(outputs[teacher], codebook, pictured=len(drawn)) for teacher, codebook in codebooks.items()
     }
-    for scene in track(scenes, "validation"):
+    for scene in track(share, "validation"):
         gaussians = scene.gaussians(np.arange(len(scene)))
         with about(f"scene {scene.name}"):
             unit = scene.metres_per_unit or 1.0
@@ -106,6 +114,8 @@ def validate_encoder(
             if part is not None:
                 tally.add(part, encoded[teacher].features)
         scene.close()
+    for tally in tallies.values():
+        tally.sum_over_processes()
     return {teacher: tally.accuracy() for teacher, tally in tallies.items() if tally.scenes}
 
 
@@ -140,6 +150,14 @@ class _Tally:
         self._cosines += float((dots / norms).sum())
         self._named += int(named.sum())
         self.scenes += 1
+
+    def sum_over_processes(self) -> None:
+        """Adds what the other processes counted."""
+        classes = len(self._codebook)
+        counts = np.concatenate([self._correct, self._total, [self._cosines, self._named, self.scenes]])
+        counts = summed_array(counts)
+        self._correct, self._total = counts[:classes], counts[classes : 2 * classes]
+        self._cosines, self._named, self.scenes = float(counts[-3]), int(counts[-2]), int(counts[-1])
 
     def accuracy(self) -> ClassAccuracy:
         """The accuracy over the scenes added."""

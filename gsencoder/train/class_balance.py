@@ -40,7 +40,9 @@ class ClassBalance:
         return weights.astype(np.float32)
 
     def target_weights(self, targets: Float32[np.ndarray, "n channels"], power: float) -> Float32[np.ndarray, " n"]:
-        """The weight of each target's class."""
+        """The weight of each target's class; with the power 0 all are 1, and classes are not looked up."""
+        if power == 0:
+            return np.ones(len(targets), np.float32)
         return self.class_weights(power)[nearest_codes(self.codebook, targets)]
 
 

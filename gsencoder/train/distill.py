@@ -103,7 +103,7 @@ class Distillation:
         config, terms = self.config, dict[str, Tensor]()
         teacher = self._teachers[number]
         if config.field_weight:
-            terms["field"] = field_loss(predicted, targets.targets, targets.loss_weights, config)
+            terms["field"] = field_loss(predicted, targets.targets.float(), targets.loss_weights, config)
         if config.render_weight:
             rows, heads = targets.rows, self._heads.get(teacher.name, ())
             b = rows.blend(len(predicted))

@@ -5,14 +5,20 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from typing import TypeVar
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 from torch import Tensor, distributed
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.process_rank import ProcessRank, rank_from_environment
+from gsencoder.core.runtime.threads import available_cores
+
+T = TypeVar("T")
 
 MAX_VALUE = 64
 """Largest number of characters of a value that processes compare."""
@@ -83,6 +89,51 @@ def sum_over_processes(values: Tensor) -> Tensor:
     return values
 
 
+def summed_array(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """The sum of each entry over all processes."""
+    tensor = torch.from_numpy(values.copy())
+    if _is_nccl():
+        tensor = tensor.cuda()
+    return np.asarray(sum_over_processes(tensor).cpu().numpy())
+
+
+def value_of_first(value: T) -> T:
+    """The value of the first process, in all of them; with one process its own."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return value
+    values = [value]
+    distributed.broadcast_object_list(values, src=0)
+    return values[0]
+
+
+def values_of_all(value: T) -> list[T]:
+    """The values of all processes, by rank, in all of them; with one process its own."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return [value]
+    values: list[T | None] = [None] * distributed.get_world_size()
+    distributed.all_gather_object(values, value)
+    return values  # type: ignore[return-value]
+
+
+def current_process() -> ProcessRank:
+    """The rank of this process in the group that it has joined; the only one without a group."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return ProcessRank()
+    return ProcessRank(rank=distributed.get_rank(), world_size=distributed.get_world_size())
+
+
+def cpu_share(process: ProcessRank, threads: int = 0) -> int:
+    """The number of threads with which a process computes on the CPU: `threads`, or where that is 0 what torch has in a
+    process that was started alone, else the cores of the machine divided among its processes."""
+    if threads:
+        return threads
+    return torch.get_num_threads() if process.world_size == 1 else max(1, available_cores() // process.local_world_size)
+
+
+def _is_nccl() -> bool:
+    return distributed.is_available() and distributed.is_initialized() and distributed.get_backend() == "nccl"
+
+
 def check_agreement(what: str, value: str) -> None:
     """Checks that all processes have the same value of something, such as the digest of a teacher's weights.
 
@@ -97,7 +148,7 @@ def check_agreement(what: str, value: str) -> None:
         return
     own = torch.zeros(MAX_VALUE, dtype=torch.uint8)
     own[: len(value)] = torch.frombuffer(bytearray(value.encode("ascii")), dtype=torch.uint8) if value else own[:0]
-    if distributed.get_backend() == "nccl":
+    if _is_nccl():
         own = own.cuda()
     gathered = [torch.zeros_like(own) for _ in range(distributed.get_world_size())]
     distributed.all_gather(gathered, own)
@@ -128,7 +179,7 @@ def fail_together() -> Iterator[None]:
     except Exception as error:
         failure = error
     failed = torch.tensor([float(failure is not None)])
-    if distributed.is_available() and distributed.is_initialized() and distributed.get_backend() == "nccl":
+    if _is_nccl():
         failed = failed.cuda()
     count = int(sum_over_processes(failed).item())
     if failure is not None:

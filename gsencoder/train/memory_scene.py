@@ -97,6 +97,8 @@ def prepare_memory(
     """
     if not (prepare.center and prepare.scale):
         raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
+    if prepare.render_views:
+        raise InputError("prepare.render_views: expected 0: a memory is trained on all views of its scene")
     if predicted is not None and predicted.space != teacher.space:
         raise InputError(
             f"memory: the predicted features are of ({predicted.space.describe()}), and the teacher's of "
@@ -115,7 +117,8 @@ def prepare_memory(
     source = _source(teacher, folder)
     maps.mkdir(parents=True, exist_ok=True)
     components = build_bank(stream, features.space, features.mean, bank)
-    rows = view_rows(scene, source, outputs, prepare)
+    assert scene.views is not None
+    rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)))
     folder.mkdir(parents=True, exist_ok=True)
     _sample_raw(folder, stream, features.space, sample)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())

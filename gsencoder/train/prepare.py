@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised, listed
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import FuseConfig, fuse
@@ -28,7 +30,8 @@ from gsencoder.models.output_space import OutputSpace, output_space_parts, read_
 from gsencoder.render import blend
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets
 from gsencoder.train.dataset_space import dataset_space
-from gsencoder.train.prepared_scene import PreparedScene, ViewRows, write_prepared
+from gsencoder.train.distributed import fail_together, summed_array, value_of_first
+from gsencoder.train.prepared_scene import PreparedScene, ViewRows, digest_of_files, write_prepared
 from gsencoder.types import FeatureMap, Scene
 
 SPACE_FILE, DATASET_SETTINGS_FILE, CLASS_BALANCE_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
@@ -51,6 +54,13 @@ class PrepareConfig:
     render_min_weight: float = field(
         default=1e-3, metadata={"help": "smallest blending weight in the matrices of the render loss"}
     )
+    render_views: int = field(
+        default=0,
+        metadata={
+            "help": "views of a scene, evenly spaced, whose matrices are stored and from which samples draw theirs; "
+            "0 = all. Targets are fused from all views in any case"
+        },
+    )
     basis_views: int = field(
         default=256, metadata={"help": "number of maps from which the basis of a dense teacher is computed"}
     )
@@ -72,6 +82,8 @@ class PrepareConfig:
             raise InputError(
                 f"render_cell and basis_views: expected 1 or more, got {self.render_cell} and {self.basis_views}"
             )
+        if self.render_views < 0:
+            raise InputError(f"render_views: expected 0 (all) or more, got {self.render_views}")
         if not 0 <= self.render_min_weight < 1:
             raise InputError(f"render_min_weight: expected a number in [0, 1), got {self.render_min_weight}")
 
@@ -191,7 +203,7 @@ class PreparedDataset:
         return self.folder / "scenes" / f"{name}.safetensors"
 
     def has_scene(self, source: Path) -> bool:
-        """Whether the scene at this path is prepared.
+        """Whether the scene at this path is prepared, from this path or from another one with the same files.
 
         Raises:
             InputError: another scene with the same name is.
@@ -201,7 +213,9 @@ class PreparedDataset:
             return False
         with advised("remove the file to prepare the scene again"), open_archive(path) as file:
             made_from = file.value("source", str)
-        if made_from != str(source.resolve()):
+            files = file.value("source_files", str) if "source_files" in file else ""
+        # A data set that was moved, or is mounted elsewhere on another machine, holds the same files.
+        if made_from != str(source.resolve()) and not (files and files == digest_of_files(source)):
             raise InputError(
                 f"{path}: was prepared from {made_from}, but this run uses {source.resolve()}; prepared scenes need "
                 "distinct names: rename one, or give another folder as prepared="
@@ -249,28 +263,43 @@ class PreparedDataset:
             if time.time() - path.stat().st_mtime > MAX_MAPS_AGE:
                 shutil.rmtree(path, ignore_errors=True)
 
-    def count_classes(self, names: Sequence[str], track: Track) -> None:
+    def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:
         """Counts the target classes of the training scenes and stores the counts, unless those of these scenes are
-        stored already; scenes that are not prepared are left out."""
-        prepared = [scene.name for scene in self.scenes(names)]
-        counted = self._counted_scenes()
-        if counted is None or (counted and set(prepared) <= set(counted)):
+        stored already; scenes that are not prepared are left out.
+
+        All processes of a training call this: the first one clusters the classes of a dense teacher from a sample of
+        the targets and writes the file, and each counts the targets of its share of the scenes.
+
+        Raises:
+            InputError: in any process, a scene is damaged, or the disk is full.
+        """
+        codebook = None
+        with fail_together():
+            if process.is_first:
+                codebook = self._classes_to_count(names)
+        codebook = value_of_first(codebook)
+        if codebook is None:
             return
-        _, codebook = self.load_space()
         scenes = self.scenes(names)
+        with fail_together():
+            share = track(scenes[process.rank :: process.world_size], "counting targets")
+            counts = count_targets((_seen_targets(scene) for scene in share), codebook).counts
+        with fail_together():
+            counts = summed_array(counts)
+            if process.is_first:
+                arrays = {"codebook": codebook, "counts": counts}
+                write_archive(self.folder / CLASS_BALANCE_FILE, arrays, {"scenes": [scene.name for scene in scenes]})
 
-        def seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
-            rows = np.flatnonzero(scene.weights)
-            targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
-            scene.close()
-            return targets
-
+    def _classes_to_count(self, names: Sequence[str]) -> Float32[np.ndarray, "C channels"] | None:
+        """The codebook of the classes; None if the targets of these scenes have been counted."""
+        scenes, counted = self.scenes(names), self._counted_scenes()
+        if counted is None or (counted and {scene.name for scene in scenes} <= set(counted)):
+            return None
+        _, codebook = self.load_space()
         if codebook is None:
             scene_share = max(1, CLUSTERED_TARGETS // len(scenes))
-            codebook = cluster_targets(np.concatenate([seen_targets(scene, scene_share) for scene in scenes]))
-        balance = count_targets((seen_targets(scene) for scene in track(scenes, "counting targets")), codebook)
-        arrays = {"codebook": balance.codebook, "counts": balance.counts}
-        write_archive(self.folder / CLASS_BALANCE_FILE, arrays, {"scenes": prepared})
+            codebook = cluster_targets(np.concatenate([_seen_targets(scene, scene_share) for scene in scenes]))
+        return codebook
 
     def _counted_scenes(self) -> list[str] | None:
         """The scenes whose targets were counted, none at first; None for a file of earlier versions."""
@@ -305,6 +334,14 @@ class PreparedDataset:
         return [scene for name in names if (scene := self.find_scene(name)) is not None]
 
 
+def _seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
+    """The targets of the seen Gaussians of a scene, or at most so many of them, evenly spaced; the scene is closed."""
+    rows = np.flatnonzero(scene.weights)
+    targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
+    scene.close()
+    return targets
+
+
 def prepare_scene(
     path: Path,
     scene: Scene,
@@ -314,7 +351,7 @@ def prepare_scene(
     *,
     source: Path = Path(),
 ) -> None:
-    """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of every view.
+    """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of `config.render_views`.
 
     Args:
         path: the file.
@@ -331,18 +368,22 @@ def prepare_scene(
     assert scene.views is not None
     fusion = replace(config.fusion, basis=outputs.basis is not None)
     fused = fuse(scene, teacher, fusion, basis=outputs.basis)
-    rows = view_rows(scene, teacher, outputs, config)
-    write_prepared(path, scene, fused.features, outputs, rows, source=source, projections=fused.projections)
+    chosen = even_indices(len(scene.views), config.render_views or len(scene.views))
+    rows = view_rows(scene, teacher, outputs, config, chosen)
+    with_rows = replace(scene, views=scene.views.select(chosen))
+    write_prepared(path, with_rows, fused.features, outputs, rows, source=source, projections=fused.projections)
 
 
-def view_rows(scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig) -> list[ViewRows]:
-    """The matrix B of every view on the teacher's grid, pooled to cells of `config.render_cell` pixels, with the
-    teacher's vectors; arguments are those of `prepare_scene`."""
+def view_rows(
+    scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig, views: Int64[np.ndarray, " v"]
+) -> list[ViewRows]:
+    """The matrices B of some views on the teacher's grid, pooled to cells of `config.render_cell` pixels, with the
+    teacher's vectors; the other arguments are those of `prepare_scene`."""
     assert scene.gaussians is not None
     assert scene.views is not None
     blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
     rows = []
-    for view in range(len(scene.views)):
+    for view in views.tolist():
         targets, valid, grid = _pool_map(teacher.feature_map(scene.views, view), outputs, config.render_cell)
         b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid))
         if scene.views.masks is not None:

@@ -6,11 +6,11 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from gsencoder.core.added_options import TRAINED
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.runtime.process_rank import ProcessRank
@@ -38,7 +38,11 @@ class SourceConfig:
     """The source of a training's targets: settings of reading, seeding, the teacher and preparation."""
 
     splat: str = field(
-        default="", metadata={"help": f"file of the Gaussians of scenes with views; empty = make seeds. {READABLE}"}
+        default="",
+        metadata={
+            "help": "file of the Gaussians of scenes with views, where {scene} stands for the name of its folder; "
+            f"empty = make seeds. {READABLE}"
+        },
     )
     orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
     cameras: CamerasOfSplat = field(
@@ -81,33 +85,6 @@ class SourceConfig:
     def typed_options(self, name: str) -> AbstractContextManager[None]:
         """Names options of a teacher in errors by the keys that are typed: teachers.NAME.OPTION with `teachers`."""
         return options_of_member(name, self.teachers[name]) if name in self.teachers else nullcontext()
-
-
-def split_scenes(paths: Sequence[Path], patterns: Sequence[str]) -> tuple[list[Path], list[Path]]:
-    """Splits scenes into those to train on and those held out for validation.
-
-    Args:
-        paths: all scenes.
-        patterns: names of scenes to hold out, with * and ? as in file names.
-
-    Raises:
-        InputError: a pattern matches no scene, all scenes are held out, or two scenes have the same name.
-    """
-    names = [path.name for path in paths]
-    if len(set(names)) < len(names):
-        duplicate = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"paths: two scenes are called {duplicate!r}; prepared scenes need distinct names")
-    for pattern in patterns:
-        if not any(fnmatch(name, pattern) for name in names):
-            raise InputError(
-                f"holdout: no scene is called {pattern!r}; the scenes are {listed(names, 5)}; give names of these, or "
-                "holdout=[] for none (experiments hold out scenes of the data that they are made for)"
-            )
-    held_out = [path for path in paths if any(fnmatch(path.name, pattern) for pattern in patterns)]
-    training = [path for path in paths if path not in held_out]
-    if not training:
-        raise InputError("holdout: matches every scene; at least one must remain for training")
-    return training, held_out
 
 
 def prepare_scenes(
@@ -195,8 +172,8 @@ def prepare_scenes(
     with fail_together():
         if process.is_first:
             _check_teachers(datasets, training, held_out)
-            for dataset in datasets.values():
-                dataset.count_classes([path.name for path in training], track)
+    for dataset in datasets.values():
+        dataset.count_classes([path.name for path in training], track, process)
     return datasets
 
 
@@ -230,7 +207,7 @@ def _made_with(
     # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.
     of_teacher = {name: value for name, value in plain(teacher).items() if name != "heads"}
     return {
-        "scenes": {path.name: str(path.resolve()) for path in training},
+        "scenes": dict.fromkeys((path.name for path in training), TRAINED),
         "words": _words_digest(words),
         **{name: plain(getattr(config, name)) for name in ("data", "seeds")},
         "teacher": of_teacher,

@@ -4,7 +4,9 @@ The file is memory-mapped: a sample reads only its Gaussians and views, and data
 cache. Data is verified against checksums when it is first read.
 """
 
+import hashlib
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float16, Float32, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError, about, advised
 from gsencoder.core.files.archive import open_archive, write_archive
@@ -156,8 +158,12 @@ class PreparedScene:
 
     def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
         """Reads targets of the encoder by row, standard units; zero for Gaussians without a target."""
+        return self.stored_targets(rows).astype(np.float32)
+
+    def stored_targets(self, rows: np.ndarray) -> Float16[np.ndarray, "n channels"]:
+        """The same in the type in which they are stored."""
         with self._error_context():
-            return self._arrays.rows("targets", rows).astype(np.float32)
+            return self._arrays.rows("targets", rows)
 
     def view(self, view: int) -> ViewRows:
         """Reads the blending matrix and the teacher's vectors of one view."""
@@ -176,6 +182,19 @@ class PreparedScene:
             if not in_range.all() or not (view_rows.weight >= 0).all() or not np.isfinite(view_rows.targets).all():
                 raise InputError(f"view {self.view_names[view]!r}: its columns, weights or targets are out of range")
         return view_rows
+
+
+def digest_of_files(source: Path) -> str:
+    """A hash of the names and sizes of the files of a scene, by which it is recognized where it was moved to.
+
+    Contents are not read: thousands of scenes are looked at before a training begins.
+    """
+    if source.is_dir():
+        found = (Path(folder) / name for folder, _, names in os.walk(source) for name in names)
+        rows = sorted(f"{path.relative_to(source).as_posix()} {path.stat().st_size}" for path in found)
+    else:
+        rows = [str(source.stat().st_size)] if source.exists() else []
+    return hashlib.sha256("\n".join(rows).encode()).hexdigest()[:16] if rows else ""
 
 
 def _check_arrays(arrays: MappedArrays, views: int) -> None:
@@ -264,6 +283,7 @@ def write_prepared(
     }
     header = {
         "source": str(source.resolve()),
+        "source_files": digest_of_files(source),
         "views": list(scene.views.names),
         "metres_per_unit": scene.metres_per_unit,
         "up": None if scene.up is None else scene.up.tolist(),

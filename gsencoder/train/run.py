@@ -14,6 +14,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.process_rank import ProcessRank
+from gsencoder.core.runtime.threads import threads_of_torch
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.heads.store import heads_digest
 from gsencoder.fusion.teachers.build import words_by_teacher
@@ -26,7 +27,7 @@ from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, check_same_teachers
 from gsencoder.train.crops import SamplingConfig
 from gsencoder.train.distill import encoder_trainer
-from gsencoder.train.distributed import check_agreement, fail_together, join_processes
+from gsencoder.train.distributed import check_agreement, cpu_share, fail_together, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
@@ -40,7 +41,7 @@ SceneValidator = Callable[
     ValidationResult,
 ]
 """Scores an encoder on held-out scenes, given these, the encoder, its output spaces, and the codebook of each teacher's
-target classes."""
+target classes. It is called in all processes, and what it returns in the first one is logged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,9 +62,18 @@ class TrainConfig(SourceConfig):
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     train: TrainerConfig = field(default_factory=TrainerConfig)
+    prepare_threads: int = field(
+        default=0,
+        metadata={
+            "help": "threads of each process while scenes are prepared; 0 = the machine's cores, divided among its "
+            "processes"
+        },
+    )
 
     def __post_init__(self) -> None:
         SourceConfig.__post_init__(self)
+        if self.prepare_threads < 0:
+            raise InputError(f"prepare_threads: expected 0 or more, got {self.prepare_threads}")
         if self.loss.confidence and not (self.prepare.center and self.prepare.scale):
             raise InputError(
                 "loss.confidence: weights by distances from the mean in typical ones; give loss.confidence=false with "
@@ -141,17 +151,18 @@ def train(
                 check_same_teachers(folder / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
         prepared_folder = Path(prepared) if prepared is not None else folder / "prepared"
         voxel = config.model.voxel
-        datasets = prepare_scenes(
-            training,
-            validation,
-            words,
-            config,
-            prepared_folder,
-            voxel=voxel,
-            heads=asked_heads(config.heads, config.teachers_by_name),
-            process=process,
-            track=track,
-        )
+        with threads_of_torch(cpu_share(process, config.prepare_threads)):
+            datasets = prepare_scenes(
+                training,
+                validation,
+                words,
+                config,
+                prepared_folder,
+                voxel=voxel,
+                heads=asked_heads(config.heads, config.teachers_by_name),
+                process=process,
+                track=track,
+            )
         return fit(
             datasets,
             [path.name for path in training],
@@ -246,7 +257,7 @@ def fit(
     )
     state = trainer.run(track)
     # A run that is resumed after its last step and validation has not validated in this process.
-    if trainer.last_validation is None and process.is_first:
+    if trainer.last_validation is None:
         trainer.last_validation = score_encoder(encoder)
     scores = dict(trainer.last_validation.scores) if trainer.last_validation is not None else {}
     tables = {name: _table_of(each, datasets[name]) for name, each in words.items()}

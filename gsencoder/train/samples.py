@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int32, Int64
+from jaxtyping import Float, Float16, Float32, Int32, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
@@ -36,13 +36,14 @@ class TeacherTargets(NamedTuple):
     """What one teacher says of the Gaussians and views of a sample or a batch.
 
     Attributes:
-        targets: targets of the Gaussians, standard units.
+        targets: targets of the Gaussians, standard units; in float16, as they are stored, since samples that are made
+            ahead fill shared memory.
         codes: class of each Gaussian's target, a row of the teacher's codebook; −1 without a target.
         loss_weights: weight of each Gaussian in the loss; 0 without a target.
         rows: rows of the render loss.
     """
 
-    targets: Float[Tensor, "N C"]
+    targets: Float16[Tensor, "N C"]
     codes: Int64[Tensor, " N"]
     loss_weights: Float[Tensor, " N"]
     rows: RenderRows
@@ -145,6 +146,13 @@ class SampleRecipe:
     seed: int
     step_samples: int = 1
 
+    def uses_classes(self, teacher: TeacherRecipe) -> bool:
+        """Whether samples depend on the classes of a teacher's targets: by the centers of crops, by weights of rare
+        classes, or by L_contrast."""
+        by_center = self.sampling.rare_centers > 0 and self.sampling.gaussians > 0
+        by_contrast = teacher.contrast and teacher.weight > 0 and self.losses.contrast_weight > 0
+        return by_center or by_contrast or self.losses.rarity != 0
+
 
 Codes = tuple[Int32[np.ndarray, " N"] | None, ...]
 """For each teacher the class of each Gaussian's target, −1 without a target; None in a scene that lacks the teacher."""
@@ -195,7 +203,7 @@ class SampleDataset(Dataset[Sample]):
         The number of open scenes is limited, since each holds a file descriptor.
         """
         if scene_index not in self._codes:
-            self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe.teachers)
+            self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe)
         self._codes.move_to_end(scene_index)
         if len(self._codes) > max(1, MAX_OPEN_FILES // len(self.recipe.teachers)):
             oldest, _ = self._codes.popitem(last=False)
@@ -232,21 +240,26 @@ class StepSampler(Sampler[list[int]]):
                 yield list(range(start, start + self.batch))
 
 
-def target_codes(scene: TrainingScene, teachers: Sequence[TeacherRecipe]) -> Codes:
+def target_codes(scene: TrainingScene, recipe: SampleRecipe) -> Codes:
     """The class of each Gaussian's target, a row of each teacher's codebook.
+
+    Finding classes reads all targets of a scene, which may be a gigabyte. Where nothing depends on them, every target
+    is of class 0.
 
     Raises:
         InputError: the scene was not prepared for the same Gaussians and views by all teachers.
     """
     scene.check_consistent()
     result: list[np.ndarray | None] = []
-    for part, teacher in zip(scene.parts, teachers, strict=True):
+    for part, teacher in zip(scene.parts, recipe.teachers, strict=True):
         if part is None:
             result.append(None)
             continue
         codes = np.full(len(part), -1, np.int32)
         seen = np.flatnonzero(part.weights)
-        codes[seen] = nearest_codes(teacher.class_balance.codebook, part.targets(seen))
+        codes[seen] = (
+            nearest_codes(teacher.class_balance.codebook, part.targets(seen)) if recipe.uses_classes(teacher) else 0
+        )
         result.append(codes)
     return tuple(result)
 
@@ -316,7 +329,7 @@ def _targets_of(
         view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
         rows.append(make_render_rows(view_rows, balance, losses.rarity))
     return TeacherTargets(
-        targets=torch.from_numpy(scene.targets(remaining)),
+        targets=torch.from_numpy(scene.stored_targets(remaining)),
         codes=torch.from_numpy(codes[remaining].astype(np.int64)),
         loss_weights=torch.from_numpy(_weights_of(codes, balance, losses.rarity)[remaining]),
         rows=join_rows(rows, [0] * len(rows)),
@@ -326,7 +339,7 @@ def _targets_of(
 def _no_targets(gaussians: int, channels: int) -> TeacherTargets:
     """The targets of a teacher that a scene lacks: nothing that has a weight."""
     return TeacherTargets(
-        targets=torch.zeros(gaussians, channels),
+        targets=torch.zeros(gaussians, channels, dtype=torch.float16),
         codes=torch.full((gaussians,), -1),
         loss_weights=torch.zeros(gaussians),
         rows=empty_rows(channels),

@@ -28,7 +28,15 @@ from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, 
 from gsencoder.train.distributed import STOPPED_ELSEWHERE, fail_together, sum_over_processes
 from gsencoder.train.samples import StepSampler
 
-CHANGEABLE_ON_RESUME = ("workers", "log_every", "validate_every", "checkpoint_every", "compile", "accumulate")
+CHANGEABLE_ON_RESUME = (
+    "workers",
+    "prefetch",
+    "log_every",
+    "validate_every",
+    "checkpoint_every",
+    "compile",
+    "accumulate",
+)
 """Settings of the loop that a resumed run may change, since they do not change the result of a step."""
 NO_WEIGHT = 1e-12
 """Divisor of a term that nothing in a step has a weight for."""
@@ -55,6 +63,10 @@ class TrainerConfig:
     workers: int = field(
         default=0, metadata={"help": "number of processes that make samples; 0 = make them in the training process"}
     )
+    prefetch: int = field(
+        default=2,
+        metadata={"help": "batches that each of these processes makes ahead; each is held in shared memory (/dev/shm)"},
+    )
     seed: int = field(default=0, metadata={"help": "seed of all random numbers"})
     log_every: int = field(default=10, metadata={"help": "steps per row of the log, over which losses are averaged"})
     validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = only at the end"})
@@ -62,7 +74,7 @@ class TrainerConfig:
     compile: bool = field(default=False, metadata={"help": "compile the network with torch.compile"})
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "accumulate", "log_every"):
+        for name in ("steps", "batch", "accumulate", "log_every", "prefetch"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         for name in ("warmup", "weight_decay", "clip", "workers", "seed", "validate_every", "checkpoint_every"):
@@ -165,7 +177,8 @@ class Trainer:
             process: rank of this process.
             device: device of this process.
             tensorboard: whether to write TensorBoard events.
-            validate: validates the network, which is given in evaluation mode; called on the first process only.
+            validate: validates the network, which is given in evaluation mode; called in all processes, which may
+                share the work, and the result of the first one is logged.
 
         Raises:
             InputError: the folder holds a run with other settings.
@@ -285,7 +298,7 @@ class Trainer:
             num_workers=config.workers,
             multiprocessing_context="spawn" if config.workers else None,
             worker_init_fn=_init_worker if config.workers else None,
-            prefetch_factor=4 if config.workers else None,
+            prefetch_factor=config.prefetch if config.workers else None,
         )
 
     def _gradients(self, step: int, items: list[Any]) -> dict[str, float]:
@@ -392,15 +405,14 @@ class Trainer:
         return config.learning_rate * (final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress)))
 
     def _run_validation(self, step: int) -> dict[str, float]:
-        """Validates on the first process; returns the columns of the log, which are empty on the others."""
-        scores: dict[str, float] = {}
-        if self._log is not None:
-            self.network.eval()
-            self.last_validation = result = self.validate(self.network)
-            scores = {f"validation/{name}": float(value) for name, value in result.scores.items()}
-            for name, pixels in result.pictures.items():
-                self._log.picture(step, f"validation/{name}", pixels)
-        return scores
+        """Validates in all processes; returns the columns of the log, which are empty on all but the first."""
+        self.network.eval()
+        self.last_validation = result = self.validate(self.network)
+        if self._log is None:
+            return {}
+        for name, pixels in result.pictures.items():
+            self._log.picture(step, f"validation/{name}", pixels)
+        return {f"validation/{name}": float(value) for name, value in result.scores.items()}
 
 
 def _parameter_groups(network: nn.Module, config: TrainerConfig) -> list[dict[str, Any]]:

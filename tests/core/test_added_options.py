@@ -1,6 +1,6 @@
 """Settings of older files are completed by what was done before an option existed."""
 
-from gsencoder.core.added_options import ADDED_OPTIONS, with_added_options
+from gsencoder.core.added_options import ADDED_OPTIONS, TRAINED, with_added_options
 
 
 def test_sections_get_the_options_that_they_lack_and_keep_those_that_they_have() -> None:
@@ -18,7 +18,10 @@ def test_sections_get_the_options_that_they_lack_and_keep_those_that_they_have()
 
 def test_settings_of_prepared_scenes_inside_those_of_a_training_are_completed_too() -> None:
     completed = with_added_options({"prepared": {"prepare": {"render_cell": 8}}, "run": 1})
-    assert completed == {"prepared": {"prepare": {"render_cell": 8, "center": True, "scale": True}}, "run": 1}
+    assert completed == {
+        "prepared": {"prepare": {"render_cell": 8, "center": True, "scale": True, "render_views": 0}},
+        "run": 1,
+    }
 
 
 def test_sections_that_are_missing_are_not_made_up() -> None:
@@ -44,6 +47,11 @@ def test_each_added_option_exists_and_its_default_is_what_was_done_before_unless
 def test_settings_of_scenes_that_were_prepared_for_several_teachers_are_completed() -> None:
     completed = with_added_options({"prepared": {"labels": {"prepare": {"center": False}}, "dino": {"prepare": {}}}})
     assert completed["prepared"] == {
-        "labels": {"prepare": {"center": False, "scale": True}},
-        "dino": {"prepare": {"center": True, "scale": True}},
+        "labels": {"prepare": {"center": False, "scale": True, "render_views": 0}},
+        "dino": {"prepare": {"center": True, "scale": True, "render_views": 0}},
     }
+
+
+def test_paths_of_scenes_do_not_count_and_scenes_of_teachers_do() -> None:
+    completed = with_added_options({"scenes": {"dino": ["a"]}, "prepared": {"scenes": {"a": "/old/a", "b": "/b"}}})
+    assert completed == {"scenes": {"dino": ["a"]}, "prepared": {"scenes": {"a": TRAINED, "b": TRAINED}}}

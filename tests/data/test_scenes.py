@@ -283,6 +283,11 @@ def test_each_scene_has_its_own_splat_and_mesh_before_those_from_here(
         assert scene.gaussians.means[0, 0] == pytest.approx(x)
         absolute = replace(config, mesh=str(tmp_path / "b" / "mesh.ply"))
         assert seed(load_scene(name), absolute).means[:, 0].mean() == pytest.approx(2.0, abs=0.02)
+        (tmp_path / "splats" / name).mkdir(parents=True)
+        save_splat(tmp_path / "splats" / name / "its.ply", some_gaussians(np.array([[2 * x, 0, 0]], np.float32)))
+        named = load_scene(name, splat="splats/{scene}/its.ply")
+        assert named.gaussians is not None
+        assert named.gaussians.means[0, 0] == pytest.approx(2 * x)
     with pytest.raises(InputError, match=r"seeds\.mesh=none\.ply: no such file .looked in .*a and from here"):
         seed(load_scene("a"), replace(config, mesh="none.ply"))
 

@@ -1,6 +1,7 @@
 """Preparation: one space for all scenes, whole files, and no mixing of two datasets."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,14 @@ from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets, nearest_codes
 from gsencoder.train.dataset_space import dataset_space
-from gsencoder.train.prepare import CLASS_BALANCE_FILE, DATASET_SETTINGS_FILE, SPACE_FILE, PreparedDataset
+from gsencoder.train.prepare import (
+    CLASS_BALANCE_FILE,
+    DATASET_SETTINGS_FILE,
+    SPACE_FILE,
+    PrepareConfig,
+    PreparedDataset,
+    prepare_scene,
+)
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -61,6 +69,23 @@ def test_cells_of_the_render_loss_hold_the_mean_of_their_pixels(tmp_path: Path) 
     np.testing.assert_allclose(vectors[:, 6:], np.broadcast_to(TABLE[2], (10, 6, 4)), atol=5e-3)
 
 
+def test_rows_of_some_views_are_stored_as_those_of_all_would_be_and_targets_are_of_all(tmp_path: Path) -> None:
+    of_all, (name,) = prepared(tmp_path / "all", count=1)
+    whole = of_all.scenes([name])[0]
+    path = tmp_path / "some.safetensors"
+    prepare_scene(path, scene(0), SideTeacher(), of_all.load_space()[0], replace(PREPARE, render_views=1))
+    some = PreparedScene(path)
+    assert (some.view_names, len(whole.view_names)) == (whole.view_names[:1], 2)
+    rows = np.arange(len(whole))
+    np.testing.assert_array_equal(some.targets(rows), whole.targets(rows))
+    for field in ("crow", "col", "weight", "targets", "valid"):
+        np.testing.assert_array_equal(getattr(some.view(0), field), getattr(whole.view(0), field))
+    assert len(some.cameras) == 1
+    np.testing.assert_array_equal(some.cameras.Ks[0], whole.cameras.Ks[0])
+    with pytest.raises(InputError, match=r"render_views: expected 0 \(all\) or more, got -1"):
+        PrepareConfig(render_views=-1)
+
+
 def test_what_is_prepared_is_not_prepared_again(tmp_path: Path) -> None:
     _, names = prepared(tmp_path, count=2)
     files = (tmp_path / SPACE_FILE, tmp_path / CLASS_BALANCE_FILE)
@@ -77,6 +102,25 @@ def test_another_scene_of_a_prepared_name_is_refused(tmp_path: Path) -> None:
     dataset, names = prepared(tmp_path / "prepared", count=1)
     with pytest.raises(InputError, match=f"was prepared from .*{names[0]}, but this run uses .*elsewhere.*{names[0]}"):
         dataset.has_scene(tmp_path / "elsewhere" / names[0])
+
+
+def test_a_scene_that_was_moved_is_recognized_by_its_files(tmp_path: Path) -> None:
+    dataset, _ = prepared(tmp_path / "prepared", count=1)
+    source = tmp_path / "data" / "wall_0"
+    (source / "color").mkdir(parents=True)
+    for name, size in {"poses.txt": 5, "color/0.jpg": 9}.items():
+        (source / name).write_bytes(bytes(size))
+    dataset.scene_path("wall_0").unlink()
+    dataset.prepare(scene(0), SideTeacher(), PREPARE, source=source)
+    moved = Path(shutil.move(source, tmp_path / "elsewhere" / "wall_0"))
+    assert dataset.has_scene(moved)
+    (moved / "color" / "0.jpg").write_bytes(bytes(10))
+    with pytest.raises(InputError, match="was prepared from"):
+        dataset.has_scene(moved)
+    (moved / "color" / "0.jpg").write_bytes(bytes(9))
+    (moved / "more.jpg").touch()
+    with pytest.raises(InputError, match="was prepared from"):
+        dataset.has_scene(moved)
 
 
 def test_what_is_there_is_opened_without_settings_and_nothing_is_made(tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     opaque = b.alpha >= 0.5
     assert ours.rows == int(opaque.sum())
     torch.testing.assert_close(ours.alpha, b.alpha[opaque], rtol=2e-3, atol=2e-3)
-    rendered = ours.render(targets.targets) / ours.alpha[:, None]
+    rendered = ours.render(targets.targets.float()) / ours.alpha[:, None]
     assert torch.cosine_similarity(rendered, targets.rows.targets, dim=1).mean() > 0.9
 
 
@@ -167,13 +167,50 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
     balance, power = recipe.teachers[0].class_balance, recipe.losses.rarity
     squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - balance.codebook).sum(axis=2)
     expected = np.where(scene.weights > 0, squares.argmin(axis=1), -1)
-    (codes,) = target_codes(TrainingScene([scene]), recipe.teachers)
+    (codes,) = target_codes(TrainingScene([scene]), recipe)
     np.testing.assert_array_equal(codes, expected)
     (found,) = SampleDataset([TrainingScene([scene])], recipe)[0].teachers
     np.testing.assert_array_equal(found.codes.numpy(), expected)
     np.testing.assert_array_equal(
         found.loss_weights.numpy(), np.where(expected < 0, 0, balance.class_weights(power)[expected])
     )
+
+
+@pytest.mark.parametrize(
+    "sampling", [SamplingConfig(views=2, gaussians=200, rare_centers=0.0), SamplingConfig(gaussians=0)]
+)
+def test_where_all_weights_are_1_samples_are_the_same_without_looking_up_classes(
+    dataset: tuple[PreparedDataset, list[str]], sampling: SamplingConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = samples(*dataset, sampling=sampling, losses=LossConfig(rarity=0.0, contrast_weight=0.0))
+    assert not data.recipe.uses_classes(data.recipe.teachers[0])
+    without = [data.make(number) for number in range(4)]
+    data._codes.clear()
+    monkeypatch.setattr(type(data.recipe), "uses_classes", lambda *_: True)
+    for number, sample in enumerate(without):
+        looked_up = data.make(number)
+        for one, other in zip(sample.teachers, looked_up.teachers, strict=True):
+            assert same(one._replace(codes=other.codes), other)
+        assert same(sample._replace(teachers=()), looked_up._replace(teachers=()))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sampling": SamplingConfig(views=2, gaussians=200)},
+        {"losses": LossConfig(rarity=0.0, contrast_weight=0.3)},
+        {"losses": LossConfig(rarity=0.5, contrast_weight=0.0)},
+    ],
+)
+def test_classes_are_looked_up_for_rare_centers_contrast_or_weights_of_rare_classes(
+    dataset: tuple[PreparedDataset, list[str]], changes: dict[str, Any]
+) -> None:
+    nothing = {
+        "sampling": SamplingConfig(views=2, gaussians=200, rare_centers=0.0),
+        "losses": LossConfig(rarity=0.0, contrast_weight=0.0),
+    }
+    recipe = samples(*dataset, **{**nothing, **changes}).recipe
+    assert recipe.uses_classes(recipe.teachers[0])
 
 
 def test_all_kinds_are_equally_often_the_center_of_a_sample(
@@ -190,7 +227,7 @@ def test_all_kinds_are_equally_often_the_center_of_a_sample(
     sums = np.zeros(len(counts))
     for part in dataset[0].scenes(dataset[1]):
         scene = TrainingScene([part])
-        (codes,) = target_codes(scene, recipe.teachers)
+        (codes,) = target_codes(scene, recipe)
         assert codes is not None
         make_sample(scene, (codes,), recipe, 200, np.random.default_rng(0))
         assert (drawn[-1][codes < 0] == 0).all()

@@ -8,22 +8,18 @@ from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
 
-from torch import distributed
-
 from gsencoder.app.commands.evaluate_settings import EvaluateConfig
 from gsencoder.app.commands.evaluate_sources import method_name, scenes_of
 from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError, SceneWarning, about, advised, listed
-from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.data.scenes import find_scenes, scene_name
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.data.truth.scannetpp_classes import ids_of_benchmark
 from gsencoder.evaluate.benchmark_files import (
     BenchmarkProtocol,
-    PredictedScene,
     merge_lists,
     score_written,
     write_predictions,
@@ -36,7 +32,7 @@ from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
 from gsencoder.evaluate.scores.semantics import check_excluded
 from gsencoder.evaluate.sources import FeatureSource
 from gsencoder.text.build import Words, check_known
-from gsencoder.train.distributed import fail_together, join_processes
+from gsencoder.train.distributed import fail_together, join_processes, value_of_first, values_of_all
 
 CLASS_IDS = "class_ids.csv"
 """The classes of a benchmark, as `score` takes them."""
@@ -63,7 +59,7 @@ def run_benchmark(
             raw_ids = None
             if isinstance(protocol, ReferringProtocol) and config.label_map:
                 raw_ids = read_label_map(Path(config.label_map), COLUMNS["scannet20"])
-        shared = _from_first(folder, process)
+        shared = Path(value_of_first(str(folder)))
         with fail_together():
             done = write_predictions(
                 scenes_of(config, part=(process.rank, process.world_size)),
@@ -79,7 +75,7 @@ def run_benchmark(
                 seeds=config.seeds,
                 localization=config.localize,
             )
-        every = _from_all(done, process)
+        every = sorted((scene for part in values_of_all(done) for scene in part), key=lambda scene: scene.scene)
         if folder is None:
             return
         merge_lists(folder, protocol, parts=process.world_size)
@@ -134,23 +130,6 @@ def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str], *, wa
             stacklevel=2,
         )
     return len(others)
-
-
-def _from_first(folder: Path | None, process: ProcessRank) -> Path:
-    """The folder that the first process opened, in every process."""
-    held = [str(folder)]
-    if process.world_size > 1:
-        distributed.broadcast_object_list(held, src=0)
-    return Path(held[0])
-
-
-def _from_all(done: list[PredictedScene], process: ProcessRank) -> list[PredictedScene]:
-    """What all processes did, by the name of the scene."""
-    if process.world_size == 1:
-        return done
-    parts: list[list[PredictedScene]] = [[] for _ in range(process.world_size)]
-    distributed.all_gather_object(parts, done)
-    return sorted((scene for part in parts for scene in part), key=lambda scene: scene.scene)
 
 
 def _classes(config: EvaluateConfig) -> tuple[ClassTable, dict[str, str] | None, Collection[str] | None]:

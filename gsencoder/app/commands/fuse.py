@@ -45,7 +45,13 @@ class FuseCommandConfig(CommonConfig):
         default=(),
         metadata={"help": "scenes, or folders of scenes: views, or a bare splat", "metavar": "SCENE", "required": True},
     )
-    splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
+    splat: str = field(
+        default="",
+        metadata={
+            "help": f"Gaussians of a scene with views, where {{scene}} stands for the name of its folder; "
+            f"empty = seeds. {READABLE}"
+        },
+    )
     orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
     cameras: CamerasOfSplat = field(
         default="auto",

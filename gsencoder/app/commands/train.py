@@ -21,6 +21,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.runtime.threads import threads_of_torch
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit
@@ -34,10 +35,11 @@ from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.train.adapter_heads import asked_heads, dataset_heads, teacher_of_heads
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, check_same_teachers
-from gsencoder.train.distributed import fail_together, join_processes
-from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
+from gsencoder.train.distributed import cpu_share, fail_together, join_processes
+from gsencoder.train.prepare_scenes import prepare_scenes
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.run import TrainConfig, Training, fit
+from gsencoder.train.split_scenes import split_scenes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,6 +58,18 @@ class TrainCommandConfig(TrainConfig, CommonConfig):
             "help": "names of scenes for validation, with * and ? as in file names; [] = none, where an experiment has "
             "some",
         },
+    )
+    split: Path | None = field(
+        default=None,
+        metadata={
+            "help": "file of the names of the scenes to train on, one a line, such as scannetv2_train.txt; empty = all "
+            "that are not held out",
+            "metavar": "PATH",
+        },
+    )
+    holdout_split: Path | None = field(
+        default=None,
+        metadata={"help": "file of the names of scenes for validation, in place of holdout=", "metavar": "PATH"},
     )
     prepared: Path | None = field(
         default=None,
@@ -78,7 +92,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
     for name, taken in (("out", real), ("the state of the run", work)):
         if lies_in(prepared, taken):
             raise InputError(f"prepared={prepared}: is in the folder of {name}, {taken}; give another folder")
-    training, held_out = split_scenes(find_scenes(config.paths), config.holdout)
+    training, held_out = split_scenes(find_scenes(config.paths), config.holdout, config.split, config.holdout_split)
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
     with WorkFolder(work) as state, join_processes(config.device) as (process, device), ExitStack() as results:
         track = Progress(quiet=config.quiet or not process.is_first)
@@ -89,7 +103,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
                 if config.resume:
                     check_same_teachers(state.path / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
-        with summary.step("prepare"):
+        with summary.step("prepare"), threads_of_torch(cpu_share(process, config.prepare_threads)):
             heads_asked = asked_heads(config.heads, config.teachers_by_name)
             datasets = prepare_scenes(
                 training,

@@ -1,7 +1,6 @@
 """The record of a run in summary.json."""
 
 import math
-import os
 import platform
 import sys
 import time
@@ -13,6 +12,7 @@ from typing import Any
 
 import gsencoder
 from gsencoder.core.files.json_values import plain
+from gsencoder.core.runtime.threads import available_cores
 
 SUMMARY_NAME = "summary.json"
 
@@ -101,14 +101,10 @@ class Summary:
             "platform": {
                 "system": platform.system(),
                 "machine": platform.machine(),
-                "processors": _processors(),
+                "processors": available_cores(),
             },
         }
         return record | ({"non_finite": lost} if lost else {})
-
-
-def _processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _versions() -> dict[str, str]:

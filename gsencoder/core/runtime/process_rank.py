@@ -20,11 +20,13 @@ class ProcessRank:
         rank: its number among all processes, from 0.
         world_size: number of processes.
         local_rank: its number among the processes of its machine.
+        local_world_size: number of processes of its machine; 1 where the launcher does not state it.
     """
 
     rank: int = 0
     world_size: int = 1
     local_rank: int = 0
+    local_world_size: int = 1
 
     @property
     def is_first(self) -> bool:
@@ -44,11 +46,13 @@ def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, 
     if "RANK" in environment and "WORLD_SIZE" in environment:
         names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
         rank, size, local = (_read_number(environment, name, "0") for name in names)
+        local_size = _read_number(environment, "LOCAL_WORLD_SIZE", "1")
         init_method = "env://"
     elif "SLURM_STEP_ID" in environment and _read_number(environment, "SLURM_NTASKS", "1") > 1:
         # Without a step this is the batch script itself, which runs once for any number of tasks.
         names = ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_LOCALID")
         rank, size, local = (_read_number(environment, name, "0") for name in names)
+        local_size = _local_tasks(environment)
         nodes = environment.get("SLURM_STEP_NODELIST") or environment.get("SLURM_JOB_NODELIST", "")
         host = environment.get("MASTER_ADDR") or first_host(nodes)
         # Jobs that share a machine need different ports; their job ids differ.
@@ -58,7 +62,10 @@ def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, 
         return ProcessRank(), ""
     if not 0 <= rank < size:
         raise InputError(f"{names[0]}={rank} is not below {names[1]}={size}; start all processes with one launcher")
-    return ProcessRank(rank=rank, world_size=size, local_rank=local), init_method
+    return (
+        ProcessRank(rank=rank, world_size=size, local_rank=local, local_world_size=max(1, min(local_size, size))),
+        init_method,
+    )
 
 
 def refuse_several(what: str, advice: str) -> None:
@@ -90,6 +97,14 @@ def first_host(nodes: str) -> str:
         raise InputError("SLURM: the node list (SLURM_STEP_NODELIST) is empty; set MASTER_ADDR")
     prefix, numbers, suffix = match.groups()
     return prefix + (re.split(r"[-,]", numbers)[0] if numbers else "") + suffix
+
+
+def _local_tasks(environment: Mapping[str, str]) -> int:
+    """The number of tasks on this node, the first of a list such as `8(x3),4`: a step's nodes rarely differ, and fewer
+    threads than cores are no error."""
+    tasks = environment.get("SLURM_STEP_TASKS_PER_NODE") or environment.get("SLURM_TASKS_PER_NODE", "1")
+    match = re.match(r"\d+", tasks)
+    return int(match[0]) if match else 1
 
 
 def _read_number(environment: Mapping[str, str], name: str, default: str) -> int:

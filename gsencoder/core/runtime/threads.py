@@ -47,6 +47,26 @@ def thread_count() -> int:
     return min(max(int(stated), 1), cores) if stated.isdecimal() else cores
 
 
+def available_cores() -> int:
+    """The cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def threads_of_torch(count: int) -> Iterator[None]:
+    """Lets torch and the kernels use so many threads within the block. torchrun starts each of several processes with
+    one thread, which suits a training on GPUs and leaves most cores idle where a CPU computes."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def parallel(work: Callable[[int], Any], pieces: Iterable[int]) -> list[Any]:
     """Runs `work` for each piece in `thread_count` threads, and returns the results in order. A nested call runs its
     pieces one after the other, since all threads are busy."""

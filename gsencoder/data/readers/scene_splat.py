@@ -41,11 +41,13 @@ def find_splat(root: Path) -> Path:
 
 
 def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:
-    """The file that an option of several scenes names: in each scene's own folder, or else from here.
+    """The file that an option of several scenes names: in each scene's own folder, or else from here. `{scene}` in it
+    stands for the name of the scene's folder, as in splats/{scene}/splat.ply.
 
     Raises:
         InputError: neither exists.
     """
+    name = str(name).replace("{scene}", folder.name)
     try:
         # An absolute path stays itself.
         for path in (folder / name, Path(name)):
