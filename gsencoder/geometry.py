@@ -41,8 +41,9 @@ class Projected(NamedTuple):
     valid: Bool[Tensor, " N"]
 
 
-def normalize_quats(quats: Float[Tensor, "*n 4"], eps: float = 1e-12) -> Float[Tensor, "*n 4"]:
-    """Unit quaternions; the eps stands inside the root, so a zero quaternion has a finite gradient."""
+def normalize_quats(quats: Float[Tensor, "*n 4"], eps: float = 1e-18) -> Float[Tensor, "*n 4"]:
+    """Unit quaternions of those of any length from 1e-14 to 1e18; the eps stands inside the root, so that a zero
+    quaternion has a finite gradient."""
     return quats / torch.sqrt((quats * quats).sum(dim=-1, keepdim=True) + eps * eps)
 
 
@@ -64,8 +65,19 @@ def covariances(quats: Float[Tensor, "*n 4"], scales: Float[Tensor, "*n 3"]) -> 
 
 
 def transform(target_from_source: Float[Tensor, "4 4"], points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Rigid motion of points, R x + t."""
-    return points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
+    """Rigid motion of points, R x + t.
+
+    In float32 a scene that is 10⁵ times as far from the origin as it is wide would lose its shape in the sum. What is
+    rotated is therefore x − c, where c is the point that comes to the target's origin (the center of a camera), and
+    what rounding c leaves of R c + t is added in float64's precision.
+    """
+    rotation, translation = target_from_source[:3, :3], target_from_source[:3, 3]
+    if points.dtype == torch.float64:
+        return points @ rotation.T + translation
+    wide = rotation.double()
+    center = -(wide.T @ translation.double()).detach().to(points.dtype)
+    rest = (wide @ center.double() + translation.double()).to(points.dtype)
+    return (points - center) @ rotation.T + rest
 
 
 def invert_rigid(target_from_source: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
