@@ -65,19 +65,10 @@ def covariances(quats: Float[Tensor, "*n 4"], scales: Float[Tensor, "*n 3"]) -> 
 
 
 def transform(target_from_source: Float[Tensor, "4 4"], points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Rigid motion of points, R x + t.
-
-    In float32 a scene that is 10⁵ times as far from the origin as it is wide would lose its shape in the sum. What is
-    rotated is therefore x − c, where c is the point that comes to the target's origin (the center of a camera), and
-    what rounding c leaves of R c + t is added in float64's precision.
-    """
-    rotation, translation = target_from_source[:3, :3], target_from_source[:3, 3]
-    if points.dtype == torch.float64:
-        return points @ rotation.T + translation
-    wide = rotation.double()
-    center = -(wide.T @ translation.double()).detach().to(points.dtype)
-    rest = (wide @ center.double() + translation.double()).to(points.dtype)
-    return (points - center) @ rotation.T + rest
+    """Rigid motion of points, R x + t, summed in float64: where the scene is far from the origin, or the field of view a
+    tenth of a degree, the terms are many times what is left of them."""
+    rotation, translation = target_from_source[:3, :3].double(), target_from_source[:3, 3].double()
+    return (points.double() @ rotation.T + translation).to(points.dtype)
 
 
 def invert_rigid(target_from_source: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
@@ -165,10 +156,12 @@ def project(
     xx = (row_x * row_x).sum(-1) + eps2d
     yy = (row_y * row_y).sum(-1) + eps2d
     xy = (row_x * row_y).sum(-1)
-    # |row_x × row_y|² = det without the cancellation of xx·yy − xy², which a needle of aspect 10⁶ would not survive.
-    cross = torch.linalg.cross(row_x, row_y)
-    det = (cross * cross).sum(-1) + eps2d * ((xx - eps2d) + (yy - eps2d)) + eps2d * eps2d
-    conics = torch.stack((yy / det, -xy / det, xx / det), dim=-1)
+    # |row_x × row_y|² = det without the cancellation of xx·yy − xy², which a needle of aspect 10⁶ would not survive. All
+    # is divided by the sum of the variances, since the determinant of a Gaussian of 10¹⁰ pixels is beyond float32.
+    total = xx + yy
+    cross = torch.linalg.cross(row_x, row_y / total.sqrt().unsqueeze(-1))
+    det = (cross * cross).sum(-1) + eps2d * (((xx - eps2d) + (yy - eps2d)) / total) + eps2d * eps2d / total
+    conics = torch.stack((yy / total / det, -(xy / total) / det, xx / total / det), dim=-1)
     means2d = torch.stack((fx * x * inv_z + cx, fy * y * inv_z + cy), dim=-1)
     visible = opacities > ALPHA_MIN
     mahalanobis2 = torch.where(visible, 2 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN), 0)

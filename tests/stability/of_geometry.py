@@ -53,7 +53,7 @@ def covariance_error(case: Case) -> float:
     "splat",
     "camera",
     domain="any origin that float32 resolves the scene at; scales up to 1e18 pixels; any field of view below 180°",
-    promise=1e-4,
+    promise=1e-5,
     measure="centers in pixels, relative to 1 + their distance from the first pixel; depths, extents and conics relative "
     "to the largest of their row; 1 where a Gaussian is in view on one side only",
     oracle="longdouble EWA",
@@ -77,7 +77,7 @@ def projection_error(case: Case) -> float:
         worst(got.depths.numpy()[rows], want.depths[rows], want.depths[rows]),
         worst(got.extents.numpy()[rows], want.extents[rows], 1 + want.extents[rows].max(axis=1, keepdims=True)),
         worst(got.conics.numpy()[rows], want.conics[rows], np.abs(want.conics[rows]).max(axis=1, keepdims=True)),
-        0.0 if np.isfinite(got.conics).all() and np.isfinite(got.extents).all() else np.inf,
+        0.0 if bool(got.conics.isfinite().all() and got.extents.isfinite().all()) else np.inf,
     )
 
 
@@ -86,18 +86,22 @@ def projection_error(case: Case) -> float:
     "splat",
     "camera",
     domain="any origin that float32 resolves the scene at; depths other than 0",
-    promise=1e-4,
-    measure="pixels relative to 1 + their distance from the first pixel, depths relative to themselves",
+    promise=1e-6,
+    measure="pixels relative to their distance from the first pixel and to focal length / depth × that from the camera; "
+    "depths relative to the distance from the camera",
     oracle="longdouble pinhole",
 )
 def points_error(case: Case) -> float:
     want = oracles.project(case.gaussians, case.cameras)
     front = want.depths > NEAR
     pixels, depths = case.cameras.project(case.gaussians.means, 0)
-    return max(
-        worst(pixels[front], want.means2d[front], 1 + np.abs(want.means2d[front])),
-        worst(depths[front], want.depths[front], want.depths[front]),
-    )
+    pose, focal = case.cameras.cam_from_world[0].astype(oracles.Wide), case.cameras.Ks[0, 0, 0]
+    local = case.gaussians.means.astype(oracles.Wide) @ pose[:3, :3].T + pose[:3, 3]
+    away = np.abs(local).max(axis=1)[front]
+    scale = np.abs(want.means2d[front]).max(axis=1) + focal * away / want.depths[front]
+    # A depth that is off moves the pixel as far as the point is from the axis.
+    scale = scale * (away / want.depths[front])
+    return max(worst(pixels[front], want.means2d[front], scale[:, None]), worst(depths[front], want.depths[front], away))
 
 
 @routine(

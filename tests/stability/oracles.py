@@ -67,27 +67,35 @@ def project(g: Gaussians, cameras: Cameras, view: int = 0) -> Plane:
     return Plane(means2d, np.stack([yy, -xy, xx], axis=1) / det[:, None], local[:, 2], extents, valid)
 
 
-def blend(g: Gaussians, cameras: Cameras, pixels: np.ndarray | None = None) -> np.ndarray:
-    """Weights [pixels, N] of single rays at pixel centers, row-major; dense."""
+EDGE = 1e-4
+"""Relative distance from a threshold of compositing within which float32 may fall to either side of it."""
+
+
+def blend(g: Gaussians, cameras: Cameras, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Weights [pixels, N] of single rays at pixel centers, row-major and dense; and which pixels are on no edge of a
+    threshold."""
     plane = project(g, cameras)
     width, height = int(cameras.widths[0]), int(cameras.heights[0])
     if pixels is None:
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
     weights = np.zeros((len(pixels), len(g)), Wide)
     through = np.ones(len(pixels), Wide)
-    open_ = np.ones(len(pixels), bool)
+    open_, clear = np.ones(len(pixels), bool), np.ones(len(pixels), bool)
     rows = np.flatnonzero(plane.valid)
     for i in rows[np.argsort(plane.depths[rows], kind="stable")]:
         a, b, c = plane.conics[i]
         du, dv = (pixels.astype(Wide) - plane.means2d[i]).T
-        alpha = np.minimum(g.opacities[i].astype(Wide) * np.exp(-(a * du * du + c * dv * dv) / 2 - b * du * dv), ALPHA_MAX)
+        falloff = np.exp(-(a * du * du + c * dv * dv) / 2 - b * du * dv)
+        alpha = np.minimum(g.opacities[i].astype(Wide) * falloff, ALPHA_MAX)
         met = open_ & (alpha >= ALPHA_MIN)
+        clear &= ~open_ | (np.abs(alpha / ALPHA_MIN - 1) > EDGE)
+        clear &= ~met | (np.abs(through * (1 - alpha) / STOP - 1) > EDGE)
         closes = met & (through * (1 - alpha) <= STOP)
         open_ &= ~closes
         met &= ~closes
         weights[met, i] = (alpha * through)[met]
         through[met] *= (1 - alpha)[met]
-    return weights
+    return weights, clear
 
 
 def harmonics(directions: np.ndarray) -> np.ndarray:
@@ -120,19 +128,24 @@ def softmax_mean(scores: np.ndarray, values: np.ndarray) -> np.ndarray:
     return weights @ values.astype(Wide) / weights.sum(axis=-1, keepdims=True)
 
 
+def close(points: np.ndarray, eps: float) -> np.ndarray:
+    """Which pairs of float32 points are within a distance: differences are exact in longdouble."""
+    p = points.astype(Wide)
+    return sum((p[:, None, axis] - p[None, :, axis]) ** 2 for axis in range(3)) <= Wide(eps) ** 2
+
+
 def dbscan(points: np.ndarray, eps: float, min_samples: int) -> np.ndarray:
     """Labels by comparing all pairs; clusters are numbered in the order of their first core points."""
-    p = points.astype(Wide)
-    close = ((p[:, None] - p[None]) ** 2).sum(-1) <= Wide(eps) ** 2
-    core = close.sum(1) >= min_samples
-    labels = np.full(len(p), -1)
+    near = close(points, eps)
+    core = near.sum(1) >= min_samples
+    labels = np.full(len(points), -1)
     for start in np.flatnonzero(core):
         if labels[start] >= 0:
             continue
         label, queue = labels.max(initial=-1) + 1, [start]
         labels[start] = label
         while queue:
-            for other in np.flatnonzero(close[queue.pop()]):
+            for other in np.flatnonzero(near[queue.pop()]):
                 if labels[other] < 0:
                     labels[other] = label
                     if core[other]:

@@ -1,5 +1,6 @@
 """Numeric routines with what they promise, and the error of each at each extreme."""
 
+import csv
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ class Routine:
         oracle: what it is compared with.
         error: of a case.
         exempt: extremes outside the domain, or that say nothing about the routine, with the reason.
+        limits: of fields of `random_cases.Recipe`, where the domain is narrower than what searches draw from.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Routine:
     oracle: str
     error: Callable[[Case], float]
     exempt: dict[str, str]
+    limits: dict[str, tuple[float, float]]
 
     def why_not(self, extreme: Extreme) -> str | None:
         """Why a cell does not apply; None where it does."""
@@ -61,13 +64,21 @@ ROUTINES: dict[str, Routine] = {}
 
 
 def routine(
-    name: str, *reads: str, domain: str, promise: float, measure: str, oracle: str, exempt: dict[str, str] | None = None
+    name: str,
+    *reads: str,
+    domain: str,
+    promise: float,
+    measure: str,
+    oracle: str,
+    exempt: dict[str, str] | None = None,
+    limits: dict[str, tuple[float, float]] | None = None,
 ) -> Callable[[Callable[[Case], float]], Callable[[Case], float]]:
     """Enters a function from a case to an error into the registry."""
 
     def enter(error: Callable[[Case], float]) -> Callable[[Case], float]:
         assert name not in ROUTINES, name
-        ROUTINES[name] = Routine(name, frozenset(reads), domain, promise, measure, oracle, error, exempt or {})
+        made = Routine(name, frozenset(reads), domain, promise, measure, oracle, error, exempt or {}, limits or {})
+        ROUTINES[name] = made
         return error
 
     return enter
@@ -95,3 +106,26 @@ def worst(got: object, want: np.ndarray, scale: np.ndarray | float | None = None
     if scale is None:
         scale = np.abs(want).max()
     return float((np.abs(values - want) / np.maximum(scale, np.finfo(np.float64).tiny)).max())
+
+
+def committed() -> dict[tuple[str, str], float | None]:
+    """The errors of the table, by routine and extreme; None where the cell does not apply."""
+    with TABLE.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {(row["routine"], row["extreme"]): float(row["error"]) if row["error"] else None for row in rows}
+
+
+def write_table(errors: dict[tuple[str, str], float]) -> None:
+    """Writes the errors of cells; those that do not apply get the reason."""
+    with TABLE.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["routine", "extreme", "error", "does not apply"])
+        for each in ROUTINES.values():
+            for extreme in EXTREMES:
+                error, reason = errors.get((each.name, extreme.name)), each.why_not(extreme)
+                writer.writerow([each.name, extreme.name, "" if error is None else f"{error:.1e}", reason or ""])
+
+
+def most(routine: Routine, error: float) -> float:
+    """The largest error that a cell may have, given the one in the table."""
+    return min(routine.promise, max(FACTOR * error, NEGLIGIBLE * routine.promise))

@@ -1,5 +1,5 @@
 """All routines: importing this module enters them into the registry."""
 
-from stability import of_geometry, of_rendering
+from stability import of_features, of_geometry, of_network, of_rendering, of_selection
 
-__all__ = ["of_geometry", "of_rendering"]
+__all__ = ["of_features", "of_geometry", "of_network", "of_rendering", "of_selection"]
