@@ -53,7 +53,9 @@ def document(errors: Errors) -> None:
     extremes = ["| extreme | what |\n", "|---|---|\n", *(f"| {each.name} | {each.what} |\n" for each in EXTREMES)]
     text = path.read_text()
     before, rest = text.split(BEGIN, 1)
-    path.write_text(before + BEGIN + "\n" + "".join(lines) + "\n" + "".join(extremes) + "\n" + END + rest.split(END, 1)[1])
+    path.write_text(
+        before + BEGIN + "\n" + "".join(lines) + "\n" + "".join(extremes) + "\n" + END + rest.split(END, 1)[1]
+    )
 
 
 def picture(errors: Errors) -> None:
@@ -95,7 +97,9 @@ def main() -> None:
     errors = measured()
     broken = [key for key, error in errors.items() if not error <= ROUTINES[key[0]].promise]
     cells = len(ROUTINES) * len(EXTREMES)
-    print(f"{len(ROUTINES)} routines × {len(EXTREMES)} extremes: {len(errors)} of {cells} cells apply, {len(broken)} over")
+    print(
+        f"{len(ROUTINES)} routines × {len(EXTREMES)} extremes: {len(errors)} of {cells} cells apply, {len(broken)} over"
+    )
     for name, extreme in broken:
         print(f"over its promise: {name} at {extreme}")
     if options.check:

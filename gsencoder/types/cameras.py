@@ -116,11 +116,11 @@ class Cameras:
             min_depth: see `project_points`; the depths that are returned stay as they are.
         """
         chosen = slice(None) if view is None else view
-        poses = self.cam_from_world[chosen].astype(np.float64)
-        # In float32 a scene far from the origin would lose its shape in R x + t: x counts from the cameras instead.
-        center = np.zeros(3, points.dtype)
-        if points.dtype != np.float64 and poses.size:
-            center = invert_rigid(poses)[..., :3, 3].reshape(-1, 3).mean(axis=0).astype(points.dtype)
+        poses, center = self.cam_from_world[chosen].astype(np.float64), np.zeros(3, points.dtype)
+        if points.dtype != np.float64 and len(self):
+            # In float32 a scene far from the origin would lose its shape in R x + t: x counts from the cameras instead,
+            # which are the same for one view as for all.
+            center = np.median(self.centers, axis=0).astype(points.dtype)
             points = points - center
         local = transform(move_origin(poses, center.astype(np.float64)).astype(points.dtype), points)
         K = self.Ks[chosen].astype(points.dtype, copy=False)

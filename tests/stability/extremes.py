@@ -97,9 +97,7 @@ def far(origin: float, unit: float) -> Case:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
     means = center + unit * made.gaussians.means.astype(np.float64) @ rotation
-    gaussians = replace(
-        made.gaussians, means=means.astype(np.float32), scales=made.gaussians.scales * np.float32(unit)
-    )
+    gaussians = replace(made.gaussians, means=means.astype(np.float32), scales=made.gaussians.scales * np.float32(unit))
     return replace(made, gaussians=gaussians, cameras=camera(pose=pose), voxel=0.1 * unit)
 
 
@@ -189,7 +187,9 @@ EXTREMES: tuple[Extreme, ...] = (
     Extreme(
         "narrow cone", "a mean 10³ times as long as the spread", VECTORS, with_vectors(vectors_of(100, 1.0, mean=1e3))
     ),
-    Extreme("rank 2", "feature vectors that span two directions", VECTORS, with_vectors(vectors_of(100, rank=2, mean=0))),
+    Extreme(
+        "rank 2", "feature vectors that span two directions", VECTORS, with_vectors(vectors_of(100, rank=2, mean=0))
+    ),
     Extreme("equal vectors", "one vector for all", VECTORS, with_vectors(np.tile(vectors_of(100)[:1], (100, 1)))),
     Extreme("logits 1e4", "attention scores from −10⁴ to 10⁴", LOGITS, lambda: case(logits=1e4)),
 )

@@ -1,8 +1,6 @@
-"""Bases, losses, output spaces, memory attention, relevancy, and the files and packages that features are kept in."""
+"""Bases, output spaces, memory attention, and relevancy."""
 
-import tempfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,18 +9,13 @@ from stability.extremes import CHANNELS, Case
 from stability.of_rendering import blend_of, weights_of
 from stability.registry import routine, worst
 
-from gsencoder.core.int8 import round_columns
 from gsencoder.fusion.basis import Moments, fit_basis, to_coordinates
-from gsencoder.fusion.store.folder import load_features, save_features
-from gsencoder.fusion.store.quantize import compact
-from gsencoder.fusion.teacher_maps import read_map, write_map
 from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.pixel_relevancy import BlendedFeatures
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.memory.attention import MemoryAttention
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.losses import LossConfig, contrast_loss, match_loss, render_loss
-from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, MemoryBank, QueryMemory, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory
 
 Wide = oracles.Wide
 SPACE = FeatureSpace(name="s", channels=CHANNELS)
@@ -90,101 +83,6 @@ def decode_error(case: Case) -> float:
     axes = basis.components.astype(Wide)
     want = (case.vectors.astype(Wide) - basis.mean) @ axes.T @ axes + basis.mean
     return worst(features.decode(), want, float(lengths(case.vectors).max()))
-
-
-def predicted_of(case: Case) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions and targets: the vectors, and what lies between them and their neighbors."""
-    return case.vectors, (0.8 * case.vectors + 0.2 * np.roll(case.vectors, 1, axis=0)).astype(np.float32)
-
-
-def wide_match(predicted: np.ndarray, target: np.ndarray, config: LossConfig) -> np.ndarray:
-    """Eq. 3 of the paper with the factor of `confidence`, without anything against division by zero."""
-    p, t = predicted.astype(Wide), target.astype(Wide)
-    long_t, long_p = lengths(t)[:, 0], lengths(p)[:, 0]
-    product = long_t * long_p
-    cosines = np.where(product > 0, (p * t).sum(axis=1) / np.where(product > 0, product, 1), 0)
-    confidence = np.minimum(long_t / Wide(t.shape[1]) ** Wide("0.5"), 1) if config.confidence else 1
-    away = np.abs(p - t)
-    smooth = np.where(away < 1, away * away / 2, away - Wide("0.5")).mean(axis=1)
-    return config.cosine * (1 - cosines) * confidence + config.smooth_l1 * smooth
-
-
-@routine(
-    "loss: 1 − cosine and smooth L1",
-    "vectors",
-    domain="vectors of length 1e-3 to 1e6 in standard units; shorter ones fade to having no direction",
-    promise=1e-5,
-    measure="loss, relative to 1 + itself; 1 where a gradient is not finite",
-    oracle="longdouble, from the equation",
-    limits={"norm": (-2.0, 6.0)},
-    exempt={"norm 1e-8": "below the shortest length that has a direction: the loss tends to that of a zero vector"},
-)
-def match_error(case: Case) -> float:
-    predicted, target = predicted_of(case)
-    errors = []
-    for config in (LossConfig(), LossConfig(confidence=False)):
-        leaf = torch.from_numpy(predicted).requires_grad_()
-        got = match_loss(leaf, torch.from_numpy(target), config)
-        got.sum().backward()
-        assert leaf.grad is not None
-        want = wide_match(predicted, target, config)
-        errors += [worst(got.detach(), want, 1 + want), 0.0 if bool(leaf.grad.isfinite().all()) else 1.0]
-    return max(errors)
-
-
-@routine(
-    "loss: cross-entropy among classes",
-    "vectors",
-    domain=f"{VECTORS}, in standard units",
-    promise=1e-6,
-    measure="loss of a row, relative to 1 + the largest logit",
-    oracle="longdouble log-sum-exp of the distances",
-)
-def contrast_error(case: Case) -> float:
-    config = LossConfig(contrast_weight=1.0)
-    codebook = case.vectors[: min(8, len(case.vectors))]
-    codes = torch.arange(len(case.vectors)) % len(codebook)
-    wide, centers = case.vectors.astype(Wide), codebook.astype(Wide)
-    logits = (wide @ centers.T - np.square(centers).sum(1) / 2) / (CHANNELS * Wide(config.temperature))
-    top = logits.max(axis=1)
-    want = top + np.log(np.exp(logits - top[:, None]).sum(axis=1)) - logits[np.arange(len(wide)), codes.numpy()]
-    errors = [0.0]
-    for row in range(0, len(wide), 7):
-        weights = torch.zeros(len(wide))
-        weights[row] = 1
-        got = contrast_loss(torch.from_numpy(case.vectors), codes, weights, torch.from_numpy(codebook), config)
-        errors.append(worst(got, want[row], 1 + np.abs(logits).max()))
-    return max(errors)
-
-
-@routine(
-    "loss of rendered cells",
-    "splat",
-    "camera",
-    "vectors",
-    domain="features of length 1e-3 to 1e6 in standard units; cells of any opacity above 0",
-    promise=1e-4,
-    measure="mean loss, relative to 1 + itself + 1e-3 of the longest feature; 1 where a gradient is not finite",
-    oracle="longdouble compositing and the equation",
-    limits={"norm": (-2.0, 6.0)},
-    exempt={"norm 1e-8": "below the shortest length that has a direction, as of the loss it sums"},
-)
-def render_loss_error(case: Case) -> float:
-    weights, b, config = weights_of(case), blend_of(case), LossConfig()
-    vectors = np.resize(case.vectors, (len(case.gaussians), CHANNELS))
-    alpha = weights.sum(axis=1)
-    rows = alpha > 1e-3
-    target = np.resize(vectors, (len(alpha), CHANNELS))
-    leaf = torch.from_numpy(vectors.copy()).requires_grad_()
-    counted = rows.astype(np.float32) / max(rows.sum(), 1)
-    got = render_loss(leaf, b, torch.from_numpy(target), torch.from_numpy(counted), config)
-    got.backward()
-    assert leaf.grad is not None
-    if not bool(leaf.grad.isfinite().all()):
-        return 1.0
-    rendered = (weights @ vectors.astype(Wide))[rows] / alpha[rows, None]
-    want = wide_match(rendered, target[rows], config).mean() if rows.any() else Wide(0)
-    return float(np.abs(got.item() - want) / (1 + want + Wide("1e-3") * lengths(vectors).max()))
 
 
 @routine(
@@ -358,76 +256,3 @@ def pixel_error(case: Case) -> float:
     # Vectors that cancel one another in a pixel leave a direction of rounding.
     parts = weights[rows] @ np.abs(local).max(axis=1, keepdims=True) + np.abs(features.mean).max() * alpha[rows, None]
     return worst(got[:, rows], want.T, np.maximum(parts / np.sqrt(np.where(squares > 0, squares, np.inf)), 1).T)
-
-
-@routine(
-    "package: codes of few bits",
-    "vectors",
-    domain=f"{VECTORS}; a mean of up to 1e3 spreads; refused where all are the mean",
-    promise=0.06,
-    measure="1 − mean centered cosine to what was packed, for a budget of 0.05",
-    oracle="longdouble cosines of what is read back",
-    limits={"n": (2, 60)},
-    exempt={"one Gaussian": "one vector is the mean, and is refused", "equal vectors": "all are the mean, and refused"},
-)
-def package_error(case: Case) -> float:
-    features = features_of(case)
-    back = compact(features, error=0.05).features().decode().astype(Wide) - features.mean
-    local = features.features.astype(Wide) - features.mean
-    product = lengths(local) * lengths(back)
-    cosines = (local * back).sum(axis=1, keepdims=True) / np.where(product > 0, product, 1)
-    return float(1 - cosines[product > 0].mean())
-
-
-@routine(
-    "features as float16 files",
-    "vectors",
-    domain="any finite float32; each channel is scaled by its largest magnitude",
-    promise=6e-4,
-    measure="relative to the largest magnitude of the channel",
-    oracle="what was written",
-)
-def folder_error(case: Case) -> float:
-    features = features_of(case)
-    with tempfile.TemporaryDirectory() as folder:
-        save_features(Path(folder) / "f", Scene(name="s", gaussians=_as_many(case)), features, {"teacher": "t"})
-        (back,) = load_features(Path(folder) / "f").features.values()
-        return worst(back.features.copy(), features.features, np.abs(features.features).max(axis=0))
-
-
-def _as_many(case: Case) -> Gaussians:
-    return case.gaussians.select(np.zeros(len(case.vectors), np.int64))
-
-
-@routine(
-    "maps as float16 files",
-    "vectors",
-    domain="any finite float32; each channel is scaled by its largest magnitude",
-    promise=6e-4,
-    measure="relative to the largest magnitude of the channel",
-    oracle="what was written",
-)
-def map_error(case: Case) -> float:
-    vectors = case.vectors[None]
-    with tempfile.TemporaryDirectory() as folder:
-        made = FeatureMap(features=vectors, grid_from_image=np.eye(2, 3), space=SPACE)
-        write_map(Path(folder) / "m", made)
-        back = read_map(Path(folder) / "m", SPACE)
-        assert back.features is not None
-        return worst(back.features, vectors, np.abs(vectors).max(axis=(0, 1)))
-
-
-@routine(
-    "matrices in int8",
-    "vectors",
-    domain="any finite float32; each column has its own scale",
-    promise=0.51 / 127,
-    measure="relative to the largest magnitude of the column",
-    oracle="what was rounded",
-)
-def int8_error(case: Case) -> float:
-    integers, scale = round_columns(case.vectors)
-    back = integers.astype(Wide) * scale
-    return worst(back.astype(np.float64), case.vectors, np.abs(case.vectors).max(axis=0))
-
-

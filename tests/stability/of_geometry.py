@@ -54,8 +54,8 @@ def covariance_error(case: Case) -> float:
     "camera",
     domain="any origin that float32 resolves the scene at; scales up to 1e18 pixels; any field of view below 180°",
     promise=1e-5,
-    measure="centers in pixels, relative to 1 + their distance from the first pixel; depths, extents and conics relative "
-    "to the largest of their row; 1 where a Gaussian is in view on one side only",
+    measure="centers in pixels, relative to 1 + their distance from the first pixel; depths, extents and conics "
+    "relative to the largest of their row; 1 where a Gaussian is in view on one side only",
     oracle="longdouble EWA",
 )
 def projection_error(case: Case) -> float:
@@ -87,8 +87,8 @@ def projection_error(case: Case) -> float:
     "camera",
     domain="any origin that float32 resolves the scene at; depths other than 0",
     promise=1e-6,
-    measure="pixels relative to their distance from the first pixel and to focal length / depth × that from the camera; "
-    "depths relative to the distance from the camera",
+    measure="pixels relative to their distance from the first pixel and to focal length / depth × that from the "
+    "camera; depths relative to the distance from the camera",
     oracle="longdouble pinhole",
 )
 def points_error(case: Case) -> float:
@@ -101,7 +101,9 @@ def points_error(case: Case) -> float:
     scale = np.abs(want.means2d[front]).max(axis=1) + focal * away / want.depths[front]
     # A depth that is off moves the pixel as far as the point is from the axis.
     scale = scale * (away / want.depths[front])
-    return max(worst(pixels[front], want.means2d[front], scale[:, None]), worst(depths[front], want.depths[front], away))
+    return max(
+        worst(pixels[front], want.means2d[front], scale[:, None]), worst(depths[front], want.depths[front], away)
+    )
 
 
 @routine(
@@ -146,8 +148,8 @@ def colors_error(case: Case) -> float:
     "splat",
     domain="any origin; one Gaussian or more; scales from 1e-18 to 1e18",
     promise=1e-9,
-    measure="corners relative to the box and its distance from the origin; how far a point lies outside the oriented box, "
-    "relative to its size",
+    measure="corners relative to the box and its distance from the origin; how far a point lies outside the "
+    "oriented box, relative to its size",
     oracle="longdouble bounds of ellipsoids",
 )
 def boxes_error(case: Case) -> float:

@@ -69,8 +69,8 @@ def cells_error(case: Case) -> float:
     "splat",
     domain="coordinates below 2²¹",
     promise=0.0,
-    measure="share of the cells whose Morton code is not the interleaved bits; 1 where Hilbert codes are not one a cell, or "
-    "do not share all but the last digit with those of the same coarser cell",
+    measure="share of the cells whose Morton code is not the interleaved bits; 1 where Hilbert codes are not one a "
+    "cell, or do not share all but the last digit with those of the same coarser cell",
     oracle="integers, a bit at a time",
 )
 def codes_error(case: Case) -> float:
@@ -315,5 +315,3 @@ def int8_weights_error(case: Case) -> float:
                 back = torch.from_numpy(integers * scale)
                 part.weight.copy_(back.view_as(part.weight) if isinstance(part, NeighborConv) else back.T)
     return encoder_error(case, made)
-
-

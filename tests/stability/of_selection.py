@@ -165,5 +165,3 @@ def presence_error(case: Case) -> float:
     }
     logit = WITHOUT_RIVALS["intercept"] + sum(WITHOUT_RIVALS[name] * value for name, value in evidence.items())
     return float(abs(got - 1 / (1 + np.exp(-logit))))
-
-

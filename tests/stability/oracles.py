@@ -99,7 +99,7 @@ def blend(g: Gaussians, cameras: Cameras, pixels: np.ndarray | None = None) -> t
 
 
 def harmonics(directions: np.ndarray) -> np.ndarray:
-    """Real spherical harmonics to degree 3 of directions of any length but 0, from their definition in cartesian form."""
+    """Real spherical harmonics to degree 3 of directions of any length but 0, from their cartesian definition."""
     d = directions.astype(Wide)
     x, y, z = (d / np.sqrt((d * d).sum(1, keepdims=True))).T
     pi = Wide("3.14159265358979323846")

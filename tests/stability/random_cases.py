@@ -16,7 +16,7 @@ class Recipe:
         n: Gaussians.
         origin: decades of the distance from the origin, in extents of the scene, 0 to 5.
         unit: decades of the scene's size, −6 to 6.
-        scale: decades of the Gaussians' sizes, relative to the scene.
+        scale: decades of the sizes of Gaussians, relative to the scene, −8 to 12.
         aspect: decades of the ratio of largest to smallest axis, 0 to 6.
         opacity: 0 = uniform, 1 = 0 or 1, 2 = faint, 3 = opaque.
         fov: decades of the tangent of half the field of view, −3 (0.1°) to 1.1 (170°).
@@ -85,7 +85,7 @@ class Recipe:
 
 
 LOW = Recipe(1, 0.0, -6.0, -8.0, 0.0, 0, -3.0, -2.0, 1, -8.0, -3.0, 1, 0.0, 0)
-HIGH = Recipe(60, 5.0, 6.0, 4.0, 6.0, 3, math.log10(math.tan(math.radians(85))), 2.0, 24, 6.0, 3.0, 24, 4.0, 1000)
+HIGH = Recipe(60, 5.0, 6.0, 12.0, 6.0, 3, math.log10(math.tan(math.radians(85))), 2.0, 24, 6.0, 3.0, 24, 4.0, 1000)
 """The ranges that searches draw from."""
 
 FAILED: tuple[Recipe, ...] = (
@@ -96,7 +96,7 @@ FAILED: tuple[Recipe, ...] = (
     # …, and 1e-4 of them where the camera is turned and the field of view is 0.1°.
     Recipe(fov=-3.0, seed=4),
     # The square of a determinant of 1e10 pixels was beyond float32: conics were 0 and their gradients not numbers.
-    Recipe(unit=6.0, scale=4.0, depth=-2.0, fov=-3.0, opacity=3),
+    Recipe(scale=12.0),
     # A quaternion of length 1e-9 was not brought to length 1.
     Recipe(norm=-8.0, rank=1),
 )

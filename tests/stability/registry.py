@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-
 from stability.extremes import EXTREMES, Case, Extreme
 
 TABLE = Path(__file__).with_name("errors.csv")
@@ -96,7 +95,8 @@ def error_of(routine: Routine, extreme: Extreme) -> float:
 
 
 def worst(got: object, want: np.ndarray, scale: np.ndarray | float | None = None) -> float:
-    """The largest |got − want| / scale; the scale is the largest |want| unless given. Infinite where got is not finite."""
+    """The largest |got − want| / scale, whose scale is the largest |want| unless given; infinite where got is not
+    finite."""
     values, want = np.asarray(got), np.asarray(want)
     assert values.shape == want.shape, (values.shape, want.shape)
     if not values.size:
