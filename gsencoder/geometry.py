@@ -65,8 +65,8 @@ def covariances(quats: Float[Tensor, "*n 4"], scales: Float[Tensor, "*n 3"]) -> 
 
 
 def transform(target_from_source: Float[Tensor, "4 4"], points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Rigid motion of points, R x + t, summed in float64: where the scene is far from the origin, or the field of view a
-    tenth of a degree, the terms are many times what is left of them."""
+    """Rigid motion of points, R x + t, summed in float64: where the scene is far from the origin, or the field of view
+    a tenth of a degree, the terms are many times what is left of them."""
     rotation, translation = target_from_source[:3, :3].double(), target_from_source[:3, 3].double()
     return (points.double() @ rotation.T + translation).to(points.dtype)
 
@@ -156,8 +156,8 @@ def project(
     xx = (row_x * row_x).sum(-1) + eps2d
     yy = (row_y * row_y).sum(-1) + eps2d
     xy = (row_x * row_y).sum(-1)
-    # |row_x × row_y|² = det without the cancellation of xx·yy − xy², which a needle of aspect 10⁶ would not survive. All
-    # is divided by the sum of the variances, since the determinant of a Gaussian of 10¹⁰ pixels is beyond float32.
+    # |row_x × row_y|² = det without the cancellation of xx·yy − xy², which a needle of aspect 10⁶ would not survive.
+    # All is divided by the sum of the variances: the determinant of a Gaussian of 10¹⁰ pixels is beyond float32.
     total = xx + yy
     cross = torch.linalg.cross(row_x, row_y / total.sqrt().unsqueeze(-1))
     det = (cross * cross).sum(-1) + eps2d * (((xx - eps2d) + (yy - eps2d)) / total) + eps2d * eps2d / total
