@@ -20,6 +20,7 @@ from gsencoder.data.splats import RawSplat
 from gsencoder.data.truth.expressions import read_nr3d
 from gsencoder.data.truth.number_files import read_whole_numbers
 from gsencoder.evaluate.files.instances import read_instance_prediction
+from gsencoder.infer.ask.questions import read_questions
 
 BENCH = Path(__file__).parents[1] / "bench"
 LEFT_OUT = ("prepared scene", "space of prepared", "counts of prepared", "encoder", "training")
@@ -153,3 +154,18 @@ def test_a_stimulus_of_nr3d_with_thousands_of_digits_is_refused(tmp_path: Path) 
     (tmp_path / "nr3d.csv").write_text(NR3D.replace("-2-3-4", f"-{'2' * 5000}-3-4"))
     with pytest.raises(InputError, match="stimulus_id must be"):
         read_nr3d(tmp_path / "nr3d.csv")
+
+
+def test_a_mask_with_a_null_in_its_name_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_bytes(b"masks\0/a.txt 4 0.5\n")
+    with pytest.raises(InputError, match="line 1: the mask .* cannot be read"):
+        read_instance_prediction(tmp_path / "a.txt", num_vertices=4)
+
+
+@pytest.mark.parametrize("name", ["q" * 5000, "que\nry"])
+def test_an_unknown_field_of_a_question_is_named_on_one_short_line(tmp_path: Path, name: str) -> None:
+    (tmp_path / "q.jsonl").write_text(json.dumps({"question": "What?", name: "x"}) + "\n")
+    with pytest.raises(InputError, match="line 1: 'qu?e?.*': no such field") as refused:
+        read_questions(tmp_path / "q.jsonl")
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 300

@@ -106,7 +106,7 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
         file = PurePosixPath(words[0])
         try:
             mask_path = (path.parent / file).resolve()
-        except (OSError, RuntimeError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             raise InputError(f"{where}: the mask {words[0][:80]!r} cannot be read: {error}") from error
         if file.is_absolute() or not mask_path.is_relative_to(path.parent.resolve()):
             raise InputError(f"{where}: the mask {words[0][:80]!r} is not below {path.parent}")
