@@ -14,7 +14,7 @@ from stability.random_cases import FAILED, HIGH, LOW, Recipe
 from stability.registry import ROUTINES, Routine
 
 assert routines
-EXAMPLES = int(os.environ.get("GSENCODER_STABILITY_EXAMPLES", "4"))
+EXAMPLES = int(os.environ.get("GSENCODER_STABILITY_EXAMPLES", "3"))
 SEARCH = settings(
     max_examples=EXAMPLES,
     deadline=None,
