@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Processes that tests run in, each on one thread.
 PROCESSES ?= 2
+# Cases that `make stability` tries for each routine.
+EXAMPLES ?= 500
 # Files with tests that run alone, which are all that the second run collects, and files with slow tests only.
 ALONE = $(shell grep -rl --include='*.py' 'mark\.alone' tests)
 SLOW = $(shell grep -rl --include='*.py' '^pytestmark = pytest.mark.slow' tests)
@@ -14,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 VIEWER := gsencoder/infer/viewer/static/viewer.js
 VIEWER_SOURCES := $(wildcard viewer/src/* viewer/*.json viewer/*.mjs viewer/*.py)
 
-.PHONY: help setup viewer demo test test-fast lint check clean
+.PHONY: help setup viewer demo test test-fast stability lint check clean
 help:            ## what can be made
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
 
@@ -48,6 +50,9 @@ test: setup      ## all tests; those that need real data look for it in GSENCODE
 
 test-fast: setup ## the tests that take a second at most
 	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone and not slow" $(SLOW:%=--ignore=%)
+
+stability: setup ## searches for cases that break a promise of docs/numerics.md, for some minutes
+	GSENCODER_STABILITY_EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q -n $(PROCESSES) tests/stability
 
 check: lint test ## what continuous integration runs
 

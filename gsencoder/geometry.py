@@ -41,8 +41,9 @@ class Projected(NamedTuple):
     valid: Bool[Tensor, " N"]
 
 
-def normalize_quats(quats: Float[Tensor, "*n 4"], eps: float = 1e-12) -> Float[Tensor, "*n 4"]:
-    """Unit quaternions; the eps stands inside the root, so a zero quaternion has a finite gradient."""
+def normalize_quats(quats: Float[Tensor, "*n 4"], eps: float = 1e-18) -> Float[Tensor, "*n 4"]:
+    """Unit quaternions of those of any length from 1e-14 to 1e18; the eps stands inside the root, so that a zero
+    quaternion has a finite gradient."""
     return quats / torch.sqrt((quats * quats).sum(dim=-1, keepdim=True) + eps * eps)
 
 
@@ -64,8 +65,10 @@ def covariances(quats: Float[Tensor, "*n 4"], scales: Float[Tensor, "*n 3"]) -> 
 
 
 def transform(target_from_source: Float[Tensor, "4 4"], points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Rigid motion of points, R x + t."""
-    return points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
+    """Rigid motion of points, R x + t, summed in float64: where the scene is far from the origin, or the field of view
+    a tenth of a degree, the terms are many times what is left of them."""
+    rotation, translation = target_from_source[:3, :3].double(), target_from_source[:3, 3].double()
+    return (points.double() @ rotation.T + translation).to(points.dtype)
 
 
 def invert_rigid(target_from_source: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
@@ -154,9 +157,11 @@ def project(
     yy = (row_y * row_y).sum(-1) + eps2d
     xy = (row_x * row_y).sum(-1)
     # |row_x × row_y|² = det without the cancellation of xx·yy − xy², which a needle of aspect 10⁶ would not survive.
-    cross = torch.linalg.cross(row_x, row_y)
-    det = (cross * cross).sum(-1) + eps2d * ((xx - eps2d) + (yy - eps2d)) + eps2d * eps2d
-    conics = torch.stack((yy / det, -xy / det, xx / det), dim=-1)
+    # All is divided by the sum of the variances: the determinant of a Gaussian of 10¹⁰ pixels is beyond float32.
+    total = xx + yy
+    cross = torch.linalg.cross(row_x, row_y / total.sqrt().unsqueeze(-1))
+    det = (cross * cross).sum(-1) + eps2d * (((xx - eps2d) + (yy - eps2d)) / total) + eps2d * eps2d / total
+    conics = torch.stack((yy / total / det, -(xy / total) / det, xx / total / det), dim=-1)
     means2d = torch.stack((fx * x * inv_z + cx, fy * y * inv_z + cy), dim=-1)
     visible = opacities > ALPHA_MIN
     mahalanobis2 = torch.where(visible, 2 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN), 0)

@@ -40,7 +40,7 @@ def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d,
         ty = min(max(y / z, -(cy / fy + slack_y)), (height - cy) / fy + slack_y)
         w, qx = np.float64(quats[i, 0]), np.float64(quats[i, 1])
         qy, qz = np.float64(quats[i, 2]), np.float64(quats[i, 3])
-        n = 1.0 / math.sqrt(w * w + qx * qx + qy * qy + qz * qz + 1e-24)
+        n = 1.0 / math.sqrt(w * w + qx * qx + qy * qy + qz * qz + 1e-36)
         w, qx, qy, qz = w * n, qx * n, qy * n, qz * n
         for k in range(3):
             if k == 0:

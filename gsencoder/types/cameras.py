@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
 
 from gsencoder.types.checks import UNIT_TOLERANCE, check_array, check_finite, check_rows
-from gsencoder.types.poses import invert_rigid, transform
+from gsencoder.types.poses import invert_rigid, move_origin, transform
 
 
 def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64[np.ndarray, "3 3"]:
@@ -116,7 +116,13 @@ class Cameras:
             min_depth: see `project_points`; the depths that are returned stay as they are.
         """
         chosen = slice(None) if view is None else view
-        local = transform(self.cam_from_world[chosen].astype(points.dtype, copy=False), points)
+        poses, center = self.cam_from_world[chosen].astype(np.float64), np.zeros(3, points.dtype)
+        if points.dtype != np.float64 and len(self):
+            # In float32 a scene far from the origin would lose its shape in R x + t: x counts from the cameras instead,
+            # which are the same for one view as for all.
+            center = np.median(self.centers, axis=0).astype(points.dtype)
+            points = points - center
+        local = transform(move_origin(poses, center.astype(np.float64)).astype(points.dtype), points)
         K = self.Ks[chosen].astype(points.dtype, copy=False)
         return project_points(local, K, min_depth=min_depth), local[..., 2]
 

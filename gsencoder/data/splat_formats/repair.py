@@ -51,7 +51,7 @@ class SplatReport:
         sh_degree: 0 to 3.
         extent_min, extent_max: bounding box of the means; None where no row is finite.
         robust_min, robust_max: the box between the 1st and 99th percentile of each axis.
-        median_scale: median over all axes of all Gaussians, None where there is none.
+        median_scale: median over all axes of all Gaussians, None where there is none or it is infinite.
         opacity_quantiles: opacity by quantile, "0.0" to "1.0".
         defects: every kind that occurs, in the order of `FIXES`.
     """
@@ -113,6 +113,7 @@ def inspect_splat(raw: RawSplat) -> SplatReport:
     if len(means):
         robust = _robust_box(means)
         box = [tuple(map(float, corner)) for corner in (means.min(axis=0), means.max(axis=0), *robust)]
+    median_scale = float(np.exp(np.float64(np.median(scales)))) if scales.size else np.inf
     quantiles = np.quantile(opacities, _QUANTILES) if len(opacities) else ()
     defects = []
     for name in FIXES:
@@ -128,7 +129,7 @@ def inspect_splat(raw: RawSplat) -> SplatReport:
         extent_max=box[1],
         robust_min=box[2],
         robust_max=box[3],
-        median_scale=float(np.exp(np.float64(np.median(scales)))) if scales.size else None,
+        median_scale=median_scale if np.isfinite(median_scale) else None,
         opacity_quantiles={str(q): float(value) for q, value in zip(_QUANTILES, quantiles, strict=False)},
         defects=tuple(defects),
     )

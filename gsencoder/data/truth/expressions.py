@@ -218,7 +218,7 @@ def _stimulus_count(stimulus: str | None, where: str) -> int | None:
     if stimulus is None:
         return None
     parts = stimulus.split("-")
-    if len(parts) < 4 or not parts[2].isdecimal() or len(parts) != int(parts[2]) + 3:
+    if len(parts) < 4 or not parts[2].isdecimal() or len(parts[2]) > 9 or len(parts) != int(parts[2]) + 3:
         raise InputError(
             f"{where}: stimulus_id must be scene-class-count-target and count - 1 other objects, got {shown(stimulus)}"
         )

@@ -76,7 +76,9 @@ def _parsed(path: Path, data: bytes, hint: str) -> Int64[np.ndarray, " n"]:
     for number, line in enumerate(data.splitlines(), start=1):
         word = line.strip()
         digits = word[1:] if word[:1] in (b"-", b"+") else word
-        if not digits.isdigit() or int(digits) > LARGEST:
+        # Of thousands of digits Python makes no number.
+        short = digits.lstrip(b"0") or b"0"
+        if not digits.isdigit() or len(short) > 10 or int(short) > LARGEST:
             start = word[:40].decode("utf-8", "replace")
             raise InputError(f"{path}: line {number}: expected one whole number, got {start!r}{hint}")
     raise InputError(f"{path}: expected one whole number a line")

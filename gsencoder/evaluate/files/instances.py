@@ -26,6 +26,8 @@ from gsencoder.evaluate.scores.instance_matches import MIN_REGION, SceneMatches,
 
 MASK_FOLDER = "predicted_masks"
 MAX_LIST_BYTES = 64 << 20
+MAX_PATH = 1000
+"""Largest number of characters of the path of a mask."""
 """Largest size of the list of a scene's masks."""
 MAX_ID = 2**31 - 1
 
@@ -99,10 +101,12 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
         if len(words) != 3:
             hint = "; predictions and truth may be swapped" if len(words) == 1 else ""
             raise InputError(f"{where}: expected a mask file, a class id and a score, got {line[:60]!r}{hint}")
+        if len(words[0]) > MAX_PATH:
+            raise InputError(f"{where}: expected a mask file, got a name of {len(words[0]):,} characters")
         file = PurePosixPath(words[0])
         try:
             mask_path = (path.parent / file).resolve()
-        except (OSError, RuntimeError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             raise InputError(f"{where}: the mask {words[0][:80]!r} cannot be read: {error}") from error
         if file.is_absolute() or not mask_path.is_relative_to(path.parent.resolve()):
             raise InputError(f"{where}: the mask {words[0][:80]!r} is not below {path.parent}")

@@ -70,7 +70,8 @@ def _parse_line(line: str, number: str, task: Task) -> BatchQuestion:
         raise InputError(f"expected an object, got {type(row).__name__}")
     unknown = sorted(set(row) - set(FIELDS))
     if unknown:
-        raise InputError(f"{unknown[0]}: no such field; there are {', '.join(FIELDS)}")
+        field = unknown[0] if unknown[0].isprintable() and len(unknown[0]) <= 40 else repr(unknown[0][:40])
+        raise InputError(f"{field}: no such field; there are {', '.join(FIELDS)}")
     name, text, query = row.get("id", number), row.get("question", ""), row.get("query", [])
     if not isinstance(name, (str, int)) or isinstance(name, bool):
         raise InputError(f"id: expected text or a number, got {str(name)[:40]!r}")

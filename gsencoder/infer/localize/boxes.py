@@ -197,7 +197,8 @@ def oriented_axes(
     if spans.max(initial=0) == 0:
         return np.eye(3)
     if not empty[2]:
-        return _smallest_box_axes(centered, axes)
+        # In units of its size: trimesh has no box for a volume of 1e-12.
+        return _smallest_box_axes(centered / spans.max(), axes)
     if empty[1]:
         return _right_handed(axes)
     return _axes_about(axes[:, 2], _smallest_rectangle(centered @ _plane_axes(axes[:, 2])))
