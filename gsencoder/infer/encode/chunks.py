@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device_names import Device, Precision
+from gsencoder.core.runtime.threads import ahead
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.models.grid.curves import SceneCurves
 from gsencoder.types import Gaussians
@@ -85,9 +86,16 @@ def encode_by_chunks(
     bad = 0
     chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
     scene_curves = curves() if len(chunks) > 1 else None
-    for chunk in track(chunks, "encoding"):
+
+    def run_chunk(number: int) -> Float32[np.ndarray, "n channels"]:
+        chunk = chunks[number]
         subset = gaussians if len(chunks) == 1 else gaussians.select(chunk.rows)
-        features = run(subset, scene_curves, len(chunk.core_rows))
+        return run(subset, scene_curves, len(chunk.core_rows))
+
+    # Checking and storing a chunk takes one thread, while the next one is computed.
+    numbers = range(len(chunks))
+    computed = ahead(run_chunk, numbers) if len(chunks) > 1 else map(run_chunk, numbers)
+    for chunk, features in zip(track(chunks, "encoding"), computed, strict=True):
         bad += int((~np.isfinite(features).all(axis=1)).sum())
         for space, part in columns.items():
             results[space][chunk.core_rows] = features[:, part]
