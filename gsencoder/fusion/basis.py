@@ -83,7 +83,19 @@ def fit_basis(
     if max_rank < 0:
         raise InputError(f"max_rank: expected 0 (no limit) or more, got {max_rank}")
     values, vectors = np.linalg.eigh(covariance)
-    values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
+    return _leading(mean, np.maximum(values[::-1], 0), vectors[:, ::-1].T, space, energy=energy, max_rank=max_rank)
+
+
+def _leading(
+    mean: Float64[np.ndarray, " D"],
+    values: Float64[np.ndarray, " E"],
+    vectors: Float64[np.ndarray, "E D"],
+    space: FeatureSpace,
+    *,
+    energy: float,
+    max_rank: int,
+) -> FeatureBasis:
+    """The basis of the first eigenvectors, which come in descending order of their eigenvalues."""
     total = values.sum()
     if total == 0:
         rank = 1
@@ -94,7 +106,7 @@ def fit_basis(
     if max_rank:
         rank = min(rank, max_rank)
     energy_kept = float(values[:rank].sum() / total) if total else 1.0
-    components = vectors[:, :rank].T
+    components = vectors[:rank]
     # The sign of an eigenvector is arbitrary; its largest entry is made positive so that reruns agree.
     largest = np.abs(components).argmax(axis=1)
     components = components * np.sign(components[np.arange(rank), largest])[:, None]
@@ -110,8 +122,12 @@ def table_basis(
     table: Float32[np.ndarray, "C D"], mean: Float32[np.ndarray, " D"], space: FeatureSpace, *, energy: float
 ) -> FeatureBasis:
     """A basis for coded maps. Every row of the table counts once: a name matters however few pixels it has."""
-    centered = table.astype(np.float64) - mean
-    return fit_basis(mean.astype(np.float64), centered.T @ centered / len(table), space, energy=energy)
+    wide, centered = mean.astype(np.float64), table.astype(np.float64) - mean
+    if len(table) >= space.channels:
+        return fit_basis(wide, centered.T @ centered / len(table), space, energy=energy)
+    # The same without a matrix of all channels, whose eigenvectors would take longer than lifting a view.
+    _, lengths, vectors = np.linalg.svd(centered / np.sqrt(len(table)), full_matrices=False)
+    return _leading(wide, lengths**2, vectors, space, energy=energy, max_rank=0)
 
 
 def to_coordinates(basis: FeatureBasis, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:

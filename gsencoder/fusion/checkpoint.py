@@ -3,7 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,7 +13,6 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.runtime.tracking import Track
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
@@ -73,6 +72,20 @@ class FusionCheckpoint:
         with atomic_file(self.folder / SETTINGS_FILE) as stream:
             stream.write(json.dumps(self._settings).encode())
         self._exists = True
+
+    def resume(self, sums: RunningSums) -> None:
+        """Puts the sums of an interrupted run into new ones.
+
+        Raises:
+            InputError: the checkpoint is damaged, or of other sizes.
+        """
+        if (earlier := self.load_sums(*sums.sums.shape)) is not None:
+            sums.views, sums.sums, sums.weights = earlier
+
+    def save_if_due(self, sums: RunningSums) -> None:
+        """Saves the sums from time to time; to be called after each view."""
+        if self.due():
+            self.save_sums(sums.views, sums.sums, sums.weights)
 
     def due(self) -> bool:
         """Whether the sums should be saved again."""
@@ -138,28 +151,6 @@ def open_checkpoint(
         digest.update(np.ascontiguousarray(getattr(views.cameras, name)).tobytes())
     settings["scene"] = {"gaussians": fingerprint(gaussians)[:16], "views": digest.hexdigest()[:16]}
     return FusionCheckpoint(folder, settings)
-
-
-def remaining_views(
-    rows: Sequence[int], sums: RunningSums, checkpoint: FusionCheckpoint | None, track: Track
-) -> Iterator[int]:
-    """The views that are not in the sums yet. Between two of them the sums are saved, when that is due.
-
-    Args:
-        rows: of all views, in the order in which they are added.
-        sums: to which the caller adds each view before it takes the next; those of an interrupted run are put in first.
-        checkpoint: where sums are saved; None = nowhere.
-        track: wraps the loop to show progress.
-
-    Raises:
-        InputError: the checkpoint is damaged.
-    """
-    if checkpoint is not None and (earlier := checkpoint.load_sums(*sums.sums.shape)) is not None:
-        sums.views, sums.sums, sums.weights = earlier
-    for view in track(rows[sums.views :], "lifting views"):
-        yield view
-        if checkpoint is not None and checkpoint.due():
-            checkpoint.save_sums(sums.views, sums.sums, sums.weights)
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

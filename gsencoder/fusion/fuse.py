@@ -2,11 +2,12 @@
 
     sums = Σ_views Bᵀ @ maps,   weights = Σ_views Bᵀ @ 1,   features = sums / weights, divided once at the end.
 
-Views stream one at a time; sums are kept in the coordinates of a basis, so that memory does not grow with the number
-of views or with the teacher's width.
+Views stream a few at a time, and are added in their order; sums are kept in the coordinates of a basis, so that memory
+does not grow with the number of views or with the teacher's width.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -18,16 +19,21 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.clock import Clock, timed
+from gsencoder.core.runtime.threads import ahead, thread_count
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.fusion.cell_sample import CellSample
-from gsencoder.fusion.checkpoint import open_checkpoint, remaining_views
+from gsencoder.fusion.checkpoint import open_checkpoint
 from gsencoder.fusion.lift import FeatureSums, distinct_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
-from gsencoder.render import BlendConfig
+from gsencoder.render import Blend, BlendConfig
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Scene, Views
+
+VIEWS_AT_ONCE = 4
+"""Largest number of views whose matrices are made at the same time, each on threads of its own: steps that have one
+thread, such as sorting, run side by side. Each holds a matrix in memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +74,7 @@ class Fusion:
         features: on the scene's Gaussians.
         views: row numbers of the views that were used.
         tested: the depth maps that visibility was tested against.
-        seconds: by step.
+        seconds: of the wall clock by step; where steps ran at the same time, each has its share.
         truncation: 1 − centered cosine between teacher vectors and their projections on the basis, averaged over the
             cells of all views with each cell weighted by its distance from the mean; 0 without a basis.
         projections: how well a basis that was given represents the teacher's vectors in the views that this call added;
@@ -135,24 +141,41 @@ def fuse(
         projections = ProjectionSums() if basis is not None else None
         columns = subspace.basis.rank if subspace.basis is not None else teacher.space.channels
         sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table)
-        for view in remaining_views(rows, sums, checkpoint, track):
-            feature_map = maps(view)
-            matrix = view_matrix(
-                gaussians,
-                views,
-                view,
-                feature_map,
-                lift=config.lift,
-                visibility=config.visibility,
-                config=config.blend,
-            )
-            sums.add(matrix, feature_map, views.masks[view] if views.masks is not None else None)
-            if moments is not None:
-                _add_cells(moments, feature_map)
-            if projections is not None and basis is not None:
-                timed("basis")(projections.add_map)(basis, feature_map)
-            if sample_cells and checkpoint is None:
-                sample.add(feature_map)
+        if checkpoint is not None:
+            checkpoint.resume(sums)
+        remaining = rows[sums.views :]
+
+        def prepare(view: int) -> tuple[FeatureMap, Blend, Mapping[str, float]]:
+            with Clock().running() as of_view:
+                feature_map = maps(view)
+                matrix = view_matrix(
+                    gaussians,
+                    views,
+                    view,
+                    feature_map,
+                    lift=config.lift,
+                    visibility=config.visibility,
+                    config=config.blend,
+                )
+            return feature_map, matrix, of_view.seconds
+
+        # A costly teacher has threads of its own, and its maps may be large: one view after the other.
+        workers = min(thread_count(), VIEWS_AT_ONCE)
+        prepared = ahead(prepare, remaining, workers) if teacher.cheap else map(prepare, remaining)
+        start, parts = time.perf_counter(), []
+        with Clock().running() as of_sums:
+            for view, (feature_map, matrix, seconds) in zip(track(remaining, "lifting views"), prepared, strict=True):
+                parts.append(seconds)
+                sums.add(matrix, feature_map, views.masks[view] if views.masks is not None else None)
+                if moments is not None:
+                    _add_cells(moments, feature_map)
+                if projections is not None and basis is not None:
+                    timed("basis")(projections.add_map)(basis, feature_map)
+                if sample_cells and checkpoint is None:
+                    sample.add(feature_map)
+                if checkpoint is not None:
+                    checkpoint.save_if_due(sums)
+        clock.share_out(time.perf_counter() - start, [*parts, of_sums.seconds])
         if sample_cells and checkpoint is not None:
             # A run that was continued has lifted some views before; their maps are read from their files.
             for view in rows:
@@ -234,7 +257,7 @@ def find_subspace(
         mean = teacher.mean if teacher.mean is not None else teacher.table.mean(axis=0)
         if not needs_basis:
             return Subspace(mean=mean)
-        basis = table_basis(teacher.table, mean, space, energy=config.table_energy)
+        basis = timed("basis")(table_basis)(teacher.table, mean, space, energy=config.table_energy)
         return Subspace(basis=basis, mean=mean, truncation=_truncation(basis, teacher.table))
     if not needs_basis and (teacher.mean is not None or one_pass):
         return Subspace(mean=teacher.mean)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Int32
 
 from gsencoder.core.runtime.clock import timed
 from gsencoder.fusion.basis import to_coordinates
-from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_points
+from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_depths, visible_points
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import depth_image
 from gsencoder.render.rays import grid_lattice
@@ -209,8 +209,22 @@ def view_matrix(
     if lift == "center":
         depths = timed("blend")(_depth_maps)(gaussians, views, view, visibility, config, None)
         return timed("lift")(center_matrix)(gaussians, views, view, feature_map, depths, visibility, config)
-    b = timed("blend")(blend)(gaussians, views.cameras, view, like=feature_map, config=capped(config, feature_map))
+    rays = capped(config, feature_map)
+    if visibility.against == ("sensor",):
+        between = timed("visibility")(_between)(views, view, feature_map, visibility, rays)
+        return timed("blend")(blend)(gaussians, views.cameras, view, like=feature_map, between=between, config=rays)
+    b = timed("blend")(blend)(gaussians, views.cameras, view, like=feature_map, config=rays)
     return _without_hidden(b, gaussians, views, view, visibility, config)
+
+
+def _between(
+    views: Views, view: int, feature_map: FeatureMap, visibility: VisibilityConfig, rays: BlendConfig
+) -> tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
+    """The depths that sensor depth lets through in each row of a map."""
+    assert views.depths is not None
+    size = feature_map.width, feature_map.height
+    lattice = grid_lattice(feature_map.grid_from_image, *size, rays.rays_per_patch)
+    return visible_depths(views.depths[view], lattice, visibility)
 
 
 @timed("visibility")

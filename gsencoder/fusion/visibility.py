@@ -78,10 +78,17 @@ def visible_points(
     return (z >= least) & (z <= most)
 
 
+def visible_depths(
+    depth: Float32[np.ndarray, "H W"], lattice: Lattice, config: VisibilityConfig
+) -> tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
+    """The smallest and the largest depth that pass in each row: entries are held against the depths that the row's rays
+    meet, from the nearest to the farthest of them."""
+    return _interval(*_row_range(depth, lattice), config)
+
+
 def keep_visible(b: Blend, depth: Float32[np.ndarray, "H W"], config: VisibilityConfig) -> Blend:
-    """B without the entries that fail: each is held against the depths that its row's rays meet, from the nearest to
-    the farthest of them."""
-    least, most = _interval(*_row_range(depth, b.lattice), config)
+    """B without the entries that fail (`visible_depths`)."""
+    least, most = visible_depths(depth, b.lattice, config)
     return b.keep_between(torch.from_numpy(least), torch.from_numpy(most))
 
 

@@ -164,7 +164,9 @@ class OutputSpaces:
 
     def restore(self, outputs: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
         """Converts outputs to coordinates or vectors, each space in its columns."""
-        return np.asarray(outputs * self.unit + self.offset, dtype=np.float32)
+        restored = np.asarray(outputs * self.unit, dtype=np.float32)
+        restored += self.offset
+        return restored
 
     def select(self, name: str | None = None) -> OutputSpace:
         """One of the spaces; `name` and errors are those of `resolve`."""
@@ -173,15 +175,6 @@ class OutputSpaces:
     def resolve(self, name: str | None = None) -> str:
         """The teacher that `name` stands for; see `teacher_of_space`."""
         return teacher_of_space({teacher: each.space for teacher, each in self.by_teacher.items()}, name)
-
-    def features(self, restored: Float32[np.ndarray, "N channels"], name: str | None = None) -> GaussianFeatures:
-        """Wraps the columns of one space, restored, as features; see `OutputSpace.features`.
-
-        Raises:
-            InputError: see `resolve`.
-        """
-        teacher = self.resolve(name)
-        return self[teacher].features(np.ascontiguousarray(restored[:, self.columns[teacher]]))
 
 
 def teacher_of_space(spaces: Mapping[str, FeatureSpace], name: str | None = None, *, option: str = "space") -> str:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Float32, Int32, Int64
 from torch import Tensor
 
 from gsencoder import geometry
@@ -157,11 +157,10 @@ class Blend:
 
         Rows of code −1 give nothing. By linearity `sums @ table` is what lifting `table[codes]` would have given.
         """
-        columns, crow, row, weight = self.transposed
         if codes.device.type == "cpu":
             from gsencoder.render import sparse_cpu as products
 
-            products.count_codes(*(part.numpy() for part in (crow, row, weight, codes, columns, sums)))
+            products.add_codes(*(part.numpy() for part in (self.crow, self.col, self.weight, codes, sums)))
         else:
             one_hot = torch.nn.functional.one_hot(codes.long() + 1, sums.shape[1] + 1)[:, 1:].to(sums.dtype)
             self.lift_into(one_hot, sums)
@@ -232,6 +231,7 @@ def blend(
     patch: int | None = None,
     like: FeatureMap | None = None,
     stride: int = 1,
+    between: tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]] | None = None,
     config: BlendConfig = BlendConfig(),
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float32,
@@ -245,6 +245,8 @@ def blend(
         patch: pixels along the side of a square patch; None for one row a pixel.
         like: a feature map whose grid the rows follow, in place of `patch`.
         stride: where the rows are pixels, only every so many of them, in both directions.
+        between: smallest and largest depth of the entries of each row, as `Blend.keep_between` takes them: it gives the
+            same, and what lies behind is not composited at all.
         config: accuracy knobs.
         device: where the result lives; other than "cpu" needs the torch backend.
         dtype: float type of the reference backend; the numba backend computes in float64 and stores float32.
@@ -265,13 +267,16 @@ def blend(
     if backend == "auto":
         backend = "cpu" if torch.device(device).type == "cpu" and dtype == torch.float32 else "reference"
     if backend == "cpu":
-        return _blend_cpu(gaussians, cameras, view, lattice, config)
+        return _blend_cpu(gaussians, cameras, view, lattice, between, config)
     projected = _project(gaussians, cameras, view, config, device, dtype)
     opacities = torch.as_tensor(gaussians.opacities, device=device, dtype=dtype)
     crow, col, weight = reference.blend_weights(
         projected, opacities, lattice, stop=config.stop_transmittance, keep=config.min_weight
     )
-    return Blend(crow, col, weight, projected.depths, lattice, config)
+    b = Blend(crow, col, weight, projected.depths, lattice, config)
+    if between is None:
+        return b
+    return b.keep_between(*(torch.from_numpy(depths).to(b.depths) for depths in between))
 
 
 def _project(
@@ -294,15 +299,25 @@ def _project(
     )
 
 
-def _blend_cpu(gaussians: Gaussians, cameras: Cameras, view: int, lattice: Lattice, config: BlendConfig) -> Blend:
+def _blend_cpu(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    view: int,
+    lattice: Lattice,
+    between: tuple[np.ndarray, np.ndarray] | None,
+    config: BlendConfig,
+) -> Blend:
     from gsencoder.render import blend_cpu as cpu
 
     size = int(cameras.widths[view]), int(cameras.heights[view])
     projected, index, z = cpu.project(
         gaussians, cameras.cam_from_world[view], cameras.Ks[view], *size, lattice, eps2d=config.eps2d, near=config.near
     )
-    keep, stop = config.min_weight, config.stop_transmittance
-    crow, col, weight = map(torch.from_numpy, cpu.blend_weights(lattice, projected, index, z, stop=stop, keep=keep))
     depths = np.zeros(len(gaussians), np.float32)
     depths[index] = z
+    if between is None:
+        between = np.full(lattice.rows, -np.inf, np.float32), np.full(lattice.rows, np.inf, np.float32)
+    keep, stop = config.min_weight, config.stop_transmittance
+    arrays = cpu.blend_weights(lattice, projected, index, z, depths, between, stop=stop, keep=keep)
+    crow, col, weight = map(torch.from_numpy, arrays)
     return Blend(crow, col, weight, torch.from_numpy(depths), lattice, config)

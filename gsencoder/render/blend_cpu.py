@@ -144,9 +144,12 @@ def _bin_tiles(gaussians, index, order, tile, tiles_x, tiles_y):
 
 @kernel
 @no_type_check
-def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, counts, rows, cols, weights):
+def _blend_tiles(
+    first, last, starts, members, gaussians, depths, least, most, shape, stop, keep, counts, rows, cols, weights
+):
     """Front-to-back compositing of tiles [first, last): entries (row, Gaussian, weight), depth-ordered in a row, and
-    the number of entries of each row.
+    the number of entries of each row. Entries nearer than `least` of their row are composited but not stored, and a ray
+    ends behind `most` of its row.
 
     Gaussians are the outer loop, so that one that several rays of a patch meet becomes a single entry at once. Along
     a line of rays exp(−quadratic) is a product of two geometric sequences: g(u+1) = g(u)·r(u), r(u+1) = r(u)·q.
@@ -164,6 +167,10 @@ def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, cou
         tile_u, tile_v = (t % tiles_x) * tile, (t // tiles_x) * tile
         end_u, end_v = min(tile, width * side - tile_u), min(tile, height * side - tile_v)
         transmittance[:] = 1.0
+        tile_most = np.float32(-np.inf)
+        for cj in range(end_v // side):
+            for ci in range(end_u // side):
+                tile_most = max(tile_most, most[(tile_v // side + cj) * width + tile_u // side + ci])
         open_from[:], open_to[:] = 0, end_u - 1
         open_rays = end_u * end_v
         for m in range(starts[t], starts[t + 1]):
@@ -173,6 +180,9 @@ def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, cou
                 rows, cols = np.concatenate((rows, more)), np.concatenate((cols, more))
                 weights = np.concatenate((weights, np.empty(len(more), np.float32)))
             g = members[m]
+            z = depths[g]
+            if z > tile_most:
+                break
             gu, gv, half_height = gaussians[g, 0] - tile_u, gaussians[g, 1] - tile_v, gaussians[g, 3]
             a, b, c = gaussians[g, 4], gaussians[g, 5], gaussians[g, 6]
             limit, opacity = gaussians[g, 7], gaussians[g, 8]
@@ -182,6 +192,7 @@ def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, cou
             v0, v1 = int(f0), int(f1)
             inv_a, q = 1.0 / a, math.exp(-a)
             for cj in range(cell_of[v0], cell_of[v1] + 1):
+                row = (tile_v // side + cj) * width + tile_u // side
                 low_u, high_u = tile, -1
                 for j in range(max(v0, cj * side), min(v1, cj * side + side - 1) + 1):
                     if open_from[j] > open_to[j]:
@@ -210,7 +221,7 @@ def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, cou
                         if alpha < ALPHA_MIN or before < 0:
                             continue
                         after = before * (1.0 - alpha)
-                        if after <= stop:
+                        if after <= stop or z > most[row + cell_of[i]]:
                             row_transmittance[i] = -1.0
                             open_rays -= 1
                             continue
@@ -223,11 +234,10 @@ def _blend_tiles(first, last, starts, members, gaussians, shape, stop, keep, cou
                             open_to[j] -= 1
                 if high_u < 0:
                     continue
-                row = (tile_v // side + cj) * width + tile_u // side
                 for ci in range(cell_of[low_u], cell_of[high_u] + 1):
                     weight = sums[ci] * share
                     sums[ci] = 0.0
-                    if weight > 0 and weight >= keep:
+                    if weight > 0 and weight >= keep and z >= least[row + ci]:
                         rows[count] = row + ci
                         cols[count] = g
                         weights[count] = weight
@@ -280,7 +290,9 @@ def blend_weights(
     lattice: Lattice,
     gaussians: Float64[np.ndarray, "N 9"],
     index: Int32[np.ndarray, " M"],
-    depths: Float64[np.ndarray, " M"],
+    z: Float64[np.ndarray, " M"],
+    depths: Float32[np.ndarray, " N"],
+    between: tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]],
     *,
     stop: float,
     keep: float,
@@ -291,13 +303,15 @@ def blend_weights(
         lattice: where the rays are.
         gaussians: on the image plane, from `project`.
         index: which of them touch the image.
-        depths: of those.
+        z: their depths, which order them.
+        depths: of all Gaussians, which are held against `between`.
+        between: smallest and largest depth of the entries that each row stores.
         stop: transmittance at which a ray ends.
         keep: smallest weight stored.
     """
     tile = lattice.tile
     tiles_x, tiles_y = -(-lattice.width * lattice.side // tile), -(-lattice.height * lattice.side // tile)
-    starts, members = _bin_tiles(gaussians, index, _stable_order(depths), tile, tiles_x, tiles_y)
+    starts, members = _bin_tiles(gaussians, index, _stable_order(z), tile, tiles_x, tiles_y)
     shape = (lattice.height, lattice.width, lattice.side, tile, tiles_x)
     cuts = even_cuts(starts)
     room = np.concatenate(([0], np.cumsum(_ENTRIES * (tile // lattice.side) ** 2 * np.diff(cuts))))
@@ -306,8 +320,8 @@ def blend_weights(
 
     def work(piece: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         space = (part[room[piece] : room[piece + 1]] for part in scratch)
-        bounds = (cuts[piece], cuts[piece + 1])
-        return _blend_tiles(*bounds, starts, members, gaussians, shape, stop, keep, crow[1:], *space)
+        ranges, tiles = (cuts[piece], cuts[piece + 1]), (starts, members, gaussians)
+        return _blend_tiles(*ranges, *tiles, depths, *between, shape, stop, keep, crow[1:], *space)
 
     # A row belongs to one tile, a tile to one piece: the pieces write to disjoint places.
     pieces = parallel(work, range(PIECES))

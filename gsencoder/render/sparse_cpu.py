@@ -77,24 +77,15 @@ def product(
 
 @kernel
 @no_type_check
-def _count_codes(first, last, crow, cols, weights, codes, targets, out):
-    for row in range(first, last):
-        line = out[targets[row]]
-        for e in range(crow[row], crow[row + 1]):
-            code = codes[cols[e]]
-            if code >= 0:
-                line[code] += weights[e]
-
-
-def count_codes(
-    crow: np.ndarray, cols: np.ndarray, weights: np.ndarray, codes: np.ndarray, targets: np.ndarray, out: np.ndarray
-) -> None:
-    """CSR @ one_hot(codes), added to out[targets]: the product above without the channels that are zero."""
-    cuts = even_cuts(crow)
-    parallel(
-        lambda piece: _count_codes(cuts[piece], cuts[piece + 1], crow, cols, weights, codes, targets, out),
-        range(PIECES),
-    )
+def add_codes(crow, cols, weights, codes, out):
+    """Adds the weight of each entry to out[column, code of its row]: the transposed product with one_hot(codes), in the
+    order of rows, without the transposed matrix. On one thread: so it takes a third of the time of transposing alone.
+    """
+    for row in range(len(crow) - 1):
+        code = codes[row]
+        if code >= 0:
+            for e in range(crow[row], crow[row + 1]):
+                out[cols[e], code] += weights[e]
 
 
 @kernel

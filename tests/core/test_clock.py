@@ -30,3 +30,12 @@ def test_marked_functions_count_on_the_clock_that_runs_and_on_none_elsewhere(mon
     assert double(5) == 10
     assert outer.seconds == {"lift": 5.0}
     assert inner.seconds == {"lift": 2.0}
+
+
+def test_steps_of_several_threads_share_the_seconds_of_the_wall_clock() -> None:
+    clock = Clock()
+    clock.seconds = {"lift": 1.0, "teacher": 2.0}
+    clock.share_out(4.0, [{"blend": 3.0, "lift": 1.0}, {"blend": 2.0}, {"lift": 2.0}])
+    assert clock.seconds == {"lift": 2.5, "teacher": 2.0, "blend": 2.5}
+    clock.share_out(1.0, [])
+    assert clock.seconds == {"lift": 2.5, "teacher": 2.0, "blend": 2.5}

@@ -58,6 +58,24 @@ def test_work_ahead_comes_in_order_and_one_item_before_it_is_asked_for() -> None
     assert list(ahead(work, range(0))) == []
 
 
+@pytest.mark.parametrize(("threads", "workers", "share"), [(4, 2, 2), (2, 2, 1), (1, 3, 1)])
+def test_workers_ahead_share_the_threads_and_give_results_in_order(
+    threads: int, workers: int, share: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsencoder.core.runtime.threads.thread_count", lambda: threads)
+    together = threading.Barrier(workers)
+
+    def work(item: int) -> tuple[int, set[int]]:
+        # Nobody passes before all workers are here.
+        together.wait(10)
+        gather = threading.Barrier(share)
+        return item, set(parallel(lambda _: (gather.wait(10), threading.get_ident())[1], range(share)))
+
+    results = list(ahead(work, range(6), workers))
+    assert [item for item, _ in results] == list(range(6))
+    assert all(len(of_item) == share for _, of_item in results)
+
+
 def test_errors_of_work_ahead_are_raised_where_its_result_is_due() -> None:
     results = ahead(lambda item: 1 // (2 - item), range(4))
     assert [next(results), next(results)] == [0, 1]

@@ -110,6 +110,19 @@ def test_a_table_basis_serves_every_row_alike(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(to_coordinates(basis, table) @ basis.components + basis.mean, table, atol=1e-5)
 
 
+@pytest.mark.parametrize("energy", [0.7, 0.999, 1.0])
+def test_the_basis_of_a_table_of_few_rows_is_that_of_its_covariance(rng: np.random.Generator, energy: float) -> None:
+    table = (rng.normal(size=(5, SPACE.channels)) * [[1], [2], [3], [0.1], [0]]).astype(np.float32)
+    mean = table.mean(axis=0)
+    centered = table.astype(np.float64) - mean
+    plain = fit_basis(mean.astype(np.float64), centered.T @ centered / 5, SPACE, energy=energy)
+    basis = table_basis(table, mean, SPACE, energy=energy)
+    assert len(table) < SPACE.channels
+    assert basis.rank == plain.rank
+    np.testing.assert_allclose(basis.components, plain.components, atol=1e-6)
+    assert basis.energy_kept == pytest.approx(plain.energy_kept, abs=1e-12)
+
+
 def test_bad_knobs_and_bad_vectors_are_refused() -> None:
     with pytest.raises(InputError, match="energy: expected a share"):
         fit_basis(np.zeros(24), np.eye(24), SPACE, energy=1.5)

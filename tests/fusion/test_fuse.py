@@ -1,5 +1,6 @@
 """Fusion against its definition, and what happens when it is interrupted."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,32 @@ def test_the_order_of_views_does_not_matter(rng: np.random.Generator) -> None:
     )
     one, other = fuse(scene, FixedTeacher(maps), EXACT), fuse(shuffled, FixedTeacher([maps[i] for i in order]), EXACT)
     np.testing.assert_allclose(decoded(one), decoded(other), atol=1e-4)
+
+
+@pytest.mark.parametrize("teacher", ["coded", "cheap", "costly"])
+def test_the_number_of_threads_does_not_change_a_bit(
+    teacher: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor does sensor depth, which hides some Gaussians; views of a cheap teacher are prepared side by side."""
+    depths = [rng.uniform(1.5, 3.0, (24, 32)).astype(np.float32) for _ in range(9)]
+    scene, maps = make_scene(count=9, depths=depths), random_maps(rng, 9)
+    made: FixedTeacher = FixedTeacher(maps)
+    if teacher == "coded":
+        codes = [rng.integers(-1, 4, (24, 32), dtype=np.int32) for _ in range(9)]
+        made = CodedTeacher(codes, rng.normal(size=(4, 6)).astype(np.float32))
+    made.cheap = teacher != "costly"
+    config = replace(EXACT, visibility=VisibilityConfig(relative=0.2))
+    results = []
+    for threads in (1, 3, 9):
+        # Wherever the machine has fewer cores.
+        for module in ("gsencoder.fusion.fuse", "gsencoder.core.runtime.threads"):
+            monkeypatch.setattr(sys.modules[module], "thread_count", lambda threads=threads: threads)
+        results.append(fuse(scene, made, config))
+    assert 0 < results[0].features.seen.sum() < len(results[0].features)
+    for other in results[1:]:
+        assert (other.features.features == results[0].features.features).all()
+        assert (other.features.weights == results[0].features.weights).all()
+        assert (other.features.mean == results[0].features.mean).all()
 
 
 def test_a_narrow_teacher_keeps_all_channels_and_a_wide_one_a_basis(rng: np.random.Generator) -> None:
@@ -253,8 +280,6 @@ def test_an_interrupted_run_goes_on_and_ends_with_the_same_bits(tmp_path: Path, 
 def test_sums_of_an_interrupted_lift_are_taken_up(
     tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sys
-
     scene, maps = make_scene(), random_maps(rng)
     module = sys.modules["gsencoder.fusion.fuse"]
     monkeypatch.setattr("gsencoder.fusion.checkpoint.FusionCheckpoint.due", lambda _: True)

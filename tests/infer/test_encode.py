@@ -44,6 +44,41 @@ def test_every_gaussian_is_some_chunks_own_once_and_no_chunk_is_too_large(
         assert len(np.unique(one.rows)) == len(one.rows)
 
 
+def plain_cut(means: np.ndarray, chunk: int, halo: float) -> list[tuple[list[int], list[int]]]:
+    """`cut` as it is defined: every box is compared with all rows, and halved by a stable sort."""
+    chunks = []
+    pending = [(np.arange(len(means)), np.full(3, -np.inf), np.full(3, np.inf))]
+    while pending:
+        core, low, high = pending.pop()
+        near = np.flatnonzero(((means >= low - halo) & (means <= high + halo)).all(axis=1))
+        rest = np.setdiff1d(near, core)
+        if len(core) + len(rest) <= chunk or len(core) <= max(1, chunk // 4):
+            far = np.square(means[rest] - means[rest].clip(low, high)).sum(axis=1)
+            nearest = np.sort(rest[np.argsort(far, kind="stable")[: max(0, chunk - len(core))]])
+            chunks.append((core.tolist(), [*core.tolist(), *nearest.tolist()]))
+            continue
+        axis = int(np.argmax(np.ptp(means[core], axis=0)))
+        order = core[np.argsort(means[core, axis], kind="stable")]
+        half = len(core) // 2
+        upper, lower = high.copy(), low.copy()
+        upper[axis] = lower[axis] = means[order[half], axis]
+        pending += [(np.sort(order[half:]), lower, high), (np.sort(order[:half]), low, upper)]
+    return chunks
+
+
+@pytest.mark.parametrize(("chunk", "halo"), [(200, 0.0), (200, 0.3), (300, 2.0), (50, 0.2), (2000, 0.3)])
+@pytest.mark.parametrize("ties", [False, True])
+def test_a_scene_is_cut_as_by_sorting_it_and_looking_at_all_rows_for_each_box(
+    chunk: int, halo: float, ties: bool
+) -> None:
+    means = np.random.default_rng(0).normal(size=(1500, 3)).astype(np.float32) * np.float32([3, 2, 1])
+    if ties:
+        means = np.round(means * 2) / 2
+        means[:300, 0] = 0.0
+    expected = plain_cut(means, chunk, halo)
+    assert [(one.core_rows.tolist(), one.rows.tolist()) for one in cut(means, chunk, halo)] == expected
+
+
 def test_the_halo_is_what_lies_around_a_box() -> None:
     means = np.random.default_rng(0).uniform(0, 10, (2000, 3)).astype(np.float32)
     for one in cut(means, 1500, 0.5):

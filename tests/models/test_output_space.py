@@ -94,9 +94,6 @@ def test_several_spaces_lie_side_by_side_and_are_restored_each_by_itself() -> No
     restored = spaces.restore(values)
     for name, columns in spaces.columns.items():
         np.testing.assert_allclose(restored[:, columns], spaces[name].restore(values[:, columns]), rtol=1e-6)
-        found = spaces.features(restored, name)
-        assert found.space == spaces[name].space
-        np.testing.assert_array_equal(found.features, restored[:, columns])
 
 
 def test_a_space_is_named_by_its_teacher_or_by_itself() -> None:

@@ -1,6 +1,7 @@
 """B against an implementation of its definition that shares no code with it, and the laws that make it useful."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -355,3 +356,23 @@ def test_keeping_a_range_of_depths_is_keeping_the_entries_inside_it(rng: np.rand
     nothing = b.keep_between(torch.full((b.rows,), torch.inf), torch.zeros(b.rows))
     assert len(nothing.col) == 0
     assert nothing.crow.tolist() == [0] * (b.rows + 1)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize(("patch", "rays"), [(None, 1), (4, 1), (4, 9), (7, 16)])
+def test_a_blend_of_a_range_of_depths_is_the_whole_one_with_the_entries_inside_it(
+    backend: Any, patch: int | None, rays: int, rng: np.random.Generator
+) -> None:
+    config = BlendConfig(rays_per_patch=rays, backend=backend)
+    gaussians, camera = random_gaussians(400), front_camera(61, 40)
+    whole = blend(gaussians, camera, patch=patch, config=config)
+    least = rng.uniform(1, 3, whole.rows).astype(np.float32)
+    most = least + rng.uniform(-0.5, 1.5, whole.rows).astype(np.float32)
+    # Nothing was measured in some rows, every depth passes in others, and some end exactly at a Gaussian.
+    most[::5], least[::7], most[::7] = -np.inf, -np.inf, np.inf
+    most[3::11] = whole.depths.numpy()[whole.col.numpy()][rng.integers(0, len(whole.col), len(most[3::11]))]
+    expected = whole.keep_between(torch.from_numpy(least), torch.from_numpy(most))
+    assert 0 < len(expected.col) < len(whole.col) / 2
+    b = blend(gaussians, camera, patch=patch, between=(least, most), config=config)
+    for name in ("crow", "col", "weight", "depths"):
+        assert torch.equal(getattr(b, name), getattr(expected, name))

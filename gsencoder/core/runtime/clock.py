@@ -1,7 +1,7 @@
 """Wall-clock seconds of the steps of a pipeline stage."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
@@ -40,6 +40,22 @@ class Clock:
             yield self
         finally:
             _running.reset(token)
+
+    def share_out(self, seconds: float, steps: Iterable[Mapping[str, float]]) -> None:
+        """Adds seconds of the wall clock in which several threads were at work: each step receives its share of the
+        seconds of all threads.
+
+        Args:
+            seconds: of the wall clock.
+            steps: the seconds of each thread by step, or of each piece of its work.
+        """
+        of_threads: dict[str, float] = {}
+        for each in steps:
+            for step, taken in each.items():
+                of_threads[step] = of_threads.get(step, 0.0) + taken
+        total = sum(of_threads.values())
+        for step, taken in of_threads.items():
+            self.seconds[step] = self.seconds.get(step, 0.0) + (seconds * taken / total if total else 0.0)
 
 
 def timed(step: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

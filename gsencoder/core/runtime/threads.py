@@ -9,6 +9,7 @@ import importlib
 import os
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -33,8 +34,9 @@ def kernel(function: Callable[..., Any]) -> Any:
 _here = threading.local()
 
 
-def _mark_worker() -> None:
-    _here.inside = True
+def _limit_threads(threads: int) -> None:
+    """Lets work on this thread have so many threads of its own."""
+    _here.threads = threads
 
 
 def thread_count() -> int:
@@ -70,23 +72,29 @@ def threads_of_torch(count: int) -> Iterator[None]:
 def parallel(work: Callable[[int], Any], pieces: Iterable[int]) -> list[Any]:
     """Runs `work` for each piece in `thread_count` threads, and returns the results in order. A nested call runs its
     pieces one after the other, since all threads are busy."""
-    threads = thread_count()
-    if threads == 1 or getattr(_here, "inside", False):
+    threads = getattr(_here, "threads", thread_count())
+    if threads == 1:
         return [work(piece) for piece in pieces]
-    with ThreadPoolExecutor(threads, initializer=_mark_worker) as pool:
+    with ThreadPoolExecutor(threads, initializer=_limit_threads, initargs=(1,)) as pool:
         return list(pool.map(work, pieces))
 
 
-def ahead(work: Callable[[int], Result], items: Iterable[int]) -> Iterator[Result]:
-    """`work` of each item, in order; the next one is computed in a thread while the caller uses the last."""
-    with ThreadPoolExecutor(1) as pool:
-        following: Future[Result] | None = None
-        for item in items:
-            current, following = following, pool.submit(work, item)
-            if current is not None:
-                yield current.result()
-        if following is not None:
-            yield following.result()
+def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1) -> Iterator[Result]:
+    """`work` of each item, in order; the next ones are computed in `workers` threads while the caller uses the last.
+    The threads that `parallel` has are shared out among the workers."""
+    share = max(1, thread_count() // workers)
+    pending: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(workers, initializer=_limit_threads, initargs=(share,)) as pool:
+        try:
+            for item in items:
+                pending.append(pool.submit(work, item))
+                if len(pending) > workers:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
 
 
 def import_ahead(module: str) -> None:

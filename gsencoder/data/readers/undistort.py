@@ -263,6 +263,9 @@ def build_remap(target: Pinhole, source: CameraModel) -> Remap:
     return Remap(x=np.ascontiguousarray(grid[..., 0]), y=np.ascontiguousarray(grid[..., 1]))
 
 
+_remap_lock = threading.Lock()
+
+
 class RemapCache:
     """A cache of the remaps of a scene, one for each camera, of at most `budget` bytes; the least recently used is
     dropped first."""
@@ -279,11 +282,15 @@ class RemapCache:
             and (target.fx, target.fy, target.cx, target.cy) == source.pinhole_params()
         ):
             return None
-        remap = self._remaps.pop((target, source), None)
-        if remap is None:
-            remap = build_remap(target, source)
-            size = remap.x.nbytes + remap.y.nbytes
-            while self._remaps and sum(r.x.nbytes + r.y.nbytes for r in self._remaps.values()) + size > self._budget:
-                del self._remaps[next(iter(self._remaps))]
-        self._remaps[(target, source)] = remap
-        return remap
+        # Views are read on several threads. The lock is no attribute, because scenes are sent to other processes.
+        with _remap_lock:
+            remap = self._remaps.pop((target, source), None)
+            if remap is None:
+                remap = build_remap(target, source)
+                size = remap.x.nbytes + remap.y.nbytes
+                held = sum(r.x.nbytes + r.y.nbytes for r in self._remaps.values())
+                while self._remaps and held + size > self._budget:
+                    dropped = self._remaps.pop(next(iter(self._remaps)))
+                    held -= dropped.x.nbytes + dropped.y.nbytes
+            self._remaps[(target, source)] = remap
+            return remap

@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import Archive, open_archive, write_archive
+from gsencoder.core.runtime.threads import parallel
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.store.memory_file import MEMORY_FILE, read_memory, write_memory
@@ -116,17 +118,23 @@ def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any])
     rows = np.flatnonzero(features.weights > 0)
     # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
     blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
-    largest, bad = np.zeros(features.features.shape[1], np.float32), 0
-    for block in blocks:
-        vectors = features.stored(block)
-        bad += int((~np.isfinite(vectors).all(axis=1)).sum())
-        largest = np.maximum(largest, np.abs(vectors).max(axis=0))
-    if bad:
+
+    def measure(number: int) -> tuple[int, Float32[np.ndarray, " channels"]]:
+        vectors = features.stored(blocks[number])
+        return int((~np.isfinite(vectors).all(axis=1)).sum()), np.abs(vectors).max(axis=0)
+
+    measured = parallel(measure, range(len(blocks)))
+    if bad := sum(bad for bad, _ in measured):
         raise InputError(f"save_features: {bad} of {len(rows)} rows are not finite")
+    largest = np.max([np.zeros(features.features.shape[1], np.float32), *(values for _, values in measured)], axis=0)
     channel_scale = np.where(largest > 0, largest, 1).astype(np.float32)
     halves = np.empty((len(rows), len(largest)), np.float16)
-    for number, block in enumerate(blocks):
+
+    def convert(number: int) -> None:
+        block = blocks[number]
         halves[number * BLOCK : number * BLOCK + len(block)] = features.stored(block) / channel_scale
+
+    parallel(convert, range(len(blocks)))
     arrays, header = space_parts(features.space, features.mean, features.basis)
     arrays |= {
         "rows": rows.astype(np.int32),

@@ -10,6 +10,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.teachers import MissingInput
+from gsencoder.fusion.teachers.regions.captioned import codes_of
 from gsencoder.types import FeatureMap, FeatureSpace, SceneObject, Views
 
 
@@ -111,10 +112,7 @@ class LabelsTeacher:
         if views.instances is None:
             raise MissingInput("teacher labels: the scene has no instance maps (instance_file_path in transforms.json)")
         instances = views.instances[view]
-        values, inverse = np.unique(instances, return_inverse=True)
-        codes = np.array([self._code.get(int(value), 0) for value in values], np.int32)[
-            inverse.reshape(instances.shape)
-        ]
+        codes = np.maximum(codes_of(instances, self._code), 0)
         affine = np.array([[1 / self.cell, 0, 0], [0, 1 / self.cell, 0]])
         if self.table is not None:
             return FeatureMap(codes=codes, table=self.table, grid_from_image=affine, space=self.space)

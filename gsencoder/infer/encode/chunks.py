@@ -1,14 +1,15 @@
 """Scenes of any size in chunks: boxes of Gaussians with a halo of their surroundings, which an encoder sees at once."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device_names import Device, Precision
+from gsencoder.core.runtime.threads import ahead
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.models.grid.curves import SceneCurves
 from gsencoder.types import Gaussians
@@ -55,23 +56,25 @@ class Chunk:
 
 def encode_by_chunks(
     gaussians: Gaussians,
-    run: Callable[[Gaussians, SceneCurves | None], Float32[np.ndarray, "n channels"]],
+    run: Callable[[Gaussians, SceneCurves | None, int], Float32[np.ndarray, "n channels"]],
     curves: Callable[[], SceneCurves | None],
     config: EncodeConfig,
     *,
     metres_per_unit: float,
-    channels: int,
+    columns: Mapping[str, slice],
     track: Track = untracked,
-) -> Float32[np.ndarray, "N channels"]:
-    """Features of every Gaussian, computed chunk by chunk.
+) -> dict[str, Float32[np.ndarray, "N _channels"]]:
+    """Features of every Gaussian, computed chunk by chunk, by space: an array each, since they are gigabytes, which are
+    not copied.
 
     Args:
         gaussians: the splat.
-        run: the encoder: features of a subset, given the curves of the complete scene where there are several chunks.
+        run: the encoder: features of the first n Gaussians of a subset, given the subset, the curves of the complete
+            scene where there are several chunks, and n.
         curves: computes these curves.
         config: see there.
         metres_per_unit: unit of length of the splat.
-        channels: columns of the result.
+        columns: of each space in the encoder's output.
         track: wraps the loop over chunks to show progress.
 
     Raises:
@@ -79,18 +82,26 @@ def encode_by_chunks(
     """
     if not len(gaussians):
         raise InputError("encode: the splat has no Gaussians")
-    result = np.zeros((len(gaussians), channels), np.float32)
+    results = {space: np.zeros((len(gaussians), part.stop - part.start), np.float32) for space, part in columns.items()}
     bad = 0
     chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
     scene_curves = curves() if len(chunks) > 1 else None
-    for chunk in track(chunks, "encoding"):
+
+    def run_chunk(number: int) -> Float32[np.ndarray, "n channels"]:
+        chunk = chunks[number]
         subset = gaussians if len(chunks) == 1 else gaussians.select(chunk.rows)
-        features = run(subset, scene_curves)[: len(chunk.core_rows)]
+        return run(subset, scene_curves, len(chunk.core_rows))
+
+    # Checking and storing a chunk takes one thread, while the next one is computed.
+    numbers = range(len(chunks))
+    computed = ahead(run_chunk, numbers) if len(chunks) > 1 else map(run_chunk, numbers)
+    for chunk, features in zip(track(chunks, "encoding"), computed, strict=True):
         bad += int((~np.isfinite(features).all(axis=1)).sum())
-        result[chunk.core_rows] = features
+        for space, part in columns.items():
+            results[space][chunk.core_rows] = features[:, part]
     if bad:
-        raise InputError(f"encode: {bad} of {len(result)} features are not finite; try precision=float32")
-    return result
+        raise InputError(f"encode: {bad} of {len(gaussians)} features are not finite; try precision=float32")
+    return results
 
 
 def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chunk]:
@@ -107,32 +118,49 @@ def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chun
     all_rows = np.arange(len(means))
     if chunk == 0 or len(means) <= chunk:
         return [Chunk(core_rows=all_rows, rows=all_rows)]
+    columns = np.ascontiguousarray(means.T)
     chunks: list[Chunk] = []
-    pending = [(all_rows, np.full(3, -np.inf), np.full(3, np.inf))]
+    pending = [(all_rows, all_rows, np.full(3, -np.inf), np.full(3, np.inf))]
     while pending:
-        core_rows, low, high = pending.pop()
-        halo_rows = _halo_rows(means, core_rows, low, high, halo)
-        if len(core_rows) + len(halo_rows) <= chunk or len(core_rows) <= max(1, chunk // 4):
-            if len(core_rows) + len(halo_rows) > chunk:
+        core_rows, surroundings, low, high = pending.pop()
+        # The surroundings of a box lie within those of the box that it was cut from.
+        surroundings = _rows_near(columns, surroundings, low - halo, high + halo)
+        if len(surroundings) <= chunk or len(core_rows) <= max(1, chunk // 4):
+            halo_rows = np.setdiff1d(surroundings, core_rows, assume_unique=True)
+            if len(surroundings) > chunk:
                 inside = means[halo_rows].clip(low, high)
                 far = np.square(means[halo_rows] - inside).sum(axis=1)
                 halo_rows = halo_rows[np.sort(np.argsort(far, kind="stable")[: chunk - len(core_rows)])]
             chunks.append(Chunk(core_rows=core_rows, rows=np.concatenate((core_rows, halo_rows))))
             continue
-        points = means[core_rows]
-        axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))
-        order = np.argsort(points[:, axis], kind="stable")
-        half = len(core_rows) // 2
-        middle = float(points[order[half], axis])
-        first, second = np.sort(core_rows[order[:half]]), np.sort(core_rows[order[half:]])
+        points = [column[core_rows] for column in columns]
+        axis = int(np.argmax([values.max() - values.min() for values in points]))
+        lower_half, middle = _lower_half(points[axis])
         upper, lower = high.copy(), low.copy()
         upper[axis] = lower[axis] = middle
-        pending += [(second, lower, high), (first, low, upper)]
+        pending += [
+            (core_rows[~lower_half], surroundings, lower, high),
+            (core_rows[lower_half], surroundings, low, upper),
+        ]
     return chunks
 
 
-def _halo_rows(means: np.ndarray, core_rows: np.ndarray, low: np.ndarray, high: np.ndarray, halo: float) -> np.ndarray:
-    """Rows within `halo` of a box that are not in its core."""
-    near = np.asarray(((means >= low - halo) & (means <= high + halo)).all(axis=1))
-    near[core_rows] = False
-    return np.flatnonzero(near)
+def _rows_near(
+    columns: Float32[np.ndarray, "3 N"], rows: Int64[np.ndarray, " m"], low: np.ndarray, high: np.ndarray
+) -> Int64[np.ndarray, " n"]:
+    """Those of some rows that lie in a box."""
+    for column, least, most in zip(columns, low, high, strict=True):
+        if least > -np.inf or most < np.inf:
+            values = column[rows]
+            rows = rows[(values >= least) & (values <= most)]
+    return rows
+
+
+def _lower_half(values: Float32[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], float]:
+    """Which values a stable sort would put into the lower half, and the first value of the upper one."""
+    half = len(values) // 2
+    middle = np.partition(values, half)[half]
+    lower = values < middle
+    # Of equal values the first ones are in the lower half.
+    lower[np.flatnonzero(values == middle)[: half - np.count_nonzero(lower)]] = True
+    return lower, float(middle)

@@ -1,6 +1,6 @@
 """Feed-forward inference: features of a splat in one pass, without photographs or teacher (SplatDistill, sec. 3.4)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -108,8 +108,8 @@ def encode(
         InputError: see `encode_spaces`; or there is no such space, or there are several and none is named.
     """
     teacher = outputs.resolve(space)
-    values = _restored(gaussians, encoder, outputs, config, metres_per_unit, track)
-    return outputs.features(values, teacher)
+    values = _restored(gaussians, encoder, outputs, [teacher], config, metres_per_unit, track)
+    return outputs[teacher].features(values[teacher])
 
 
 def encode_spaces(
@@ -127,31 +127,33 @@ def encode_spaces(
         InputError: no Gaussians, or they spread over too many cells, or features that are not finite, or a unit that
             is not positive.
     """
-    values = _restored(gaussians, encoder, outputs, config, metres_per_unit, track)
-    return {teacher: outputs.features(values, teacher) for teacher in outputs}
+    values = _restored(gaussians, encoder, outputs, list(outputs), config, metres_per_unit, track)
+    return {teacher: outputs[teacher].features(values[teacher]) for teacher in outputs}
 
 
 def _restored(
     gaussians: Gaussians,
     encoder: GaussianEncoder,
     outputs: OutputSpaces,
+    teachers: Sequence[str],
     config: EncodeConfig,
     metres_per_unit: float,
     track: Track,
-) -> Float32[np.ndarray, "N channels"]:
-    """The encoder's outputs for every Gaussian, restored."""
+) -> dict[str, Float32[np.ndarray, "N _channels"]]:
+    """The encoder's outputs for every Gaussian, restored, by teacher."""
     check_unit(metres_per_unit, "metres_per_unit")
     device = choose_device(config.device)
     dtype = autocast_dtype(config.precision, device)
     encoder = encoder.to(device).eval()
     shape, voxel = encoder.config.transformer, encoder.config.voxel / metres_per_unit
 
-    def run(subset: Gaussians, scene_curves: SceneCurves | None) -> Float32[np.ndarray, "n channels"]:
+    def run(subset: Gaussians, scene_curves: SceneCurves | None, count: int) -> Float32[np.ndarray, "n channels"]:
         with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype is not None):
             attributes, opacities, plan = encoder_inputs(
                 subset, encoder.config, voxel, device, scene_curves=scene_curves
             )
-            return outputs.restore(encoder(attributes, opacities, encoder.join([plan])).cpu().numpy())
+            values = encoder(attributes, opacities, encoder.join([plan]))
+            return outputs.restore(values[:count].cpu().numpy())
 
     return encode_by_chunks(
         gaussians,
@@ -159,6 +161,6 @@ def _restored(
         lambda: cut_scene_curves(gaussians.means, voxel, levels=shape.levels, orders=shape.orders, patch=shape.patch),
         config,
         metres_per_unit=metres_per_unit,
-        channels=outputs.channels,
+        columns={teacher: outputs.columns[teacher] for teacher in teachers},
         track=track,
     )

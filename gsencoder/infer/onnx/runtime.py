@@ -1,7 +1,7 @@
 """The exported encoder under onnxruntime: features of a splat, and words for them, without torch."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +120,8 @@ class OnnxEncoder:
                 that is not positive; or there is no such space, or there are several and none is named.
         """
         teacher = self.header.outputs.resolve(space)
-        return self.header.outputs.features(self._restored(gaussians, config, metres_per_unit, track), teacher)
+        values = self._restored(gaussians, [teacher], config, metres_per_unit, track)
+        return self.header.outputs[teacher].features(values[teacher])
 
     def encode_spaces(
         self,
@@ -131,13 +132,18 @@ class OnnxEncoder:
         track: Track = untracked,
     ) -> dict[str, GaussianFeatures]:
         """Features of every Gaussian in all spaces, by teacher; arguments and errors are those of `encode`."""
-        values = self._restored(gaussians, config, metres_per_unit, track)
-        return {teacher: self.header.outputs.features(values, teacher) for teacher in self.spaces}
+        values = self._restored(gaussians, list(self.spaces), config, metres_per_unit, track)
+        return {teacher: self.header.outputs[teacher].features(values[teacher]) for teacher in self.spaces}
 
     def _restored(
-        self, gaussians: Gaussians, config: EncodeConfig, metres_per_unit: float, track: Track
-    ) -> Float32[np.ndarray, "N channels"]:
-        """The graph's outputs for every Gaussian."""
+        self,
+        gaussians: Gaussians,
+        teachers: Sequence[str],
+        config: EncodeConfig,
+        metres_per_unit: float,
+        track: Track,
+    ) -> dict[str, Float32[np.ndarray, "N _channels"]]:
+        """The graph's outputs for every Gaussian, by teacher."""
         check_unit(metres_per_unit, "metres_per_unit")
         header = self.header
         if config.precision not in ("auto", header.precision):
@@ -147,8 +153,8 @@ class OnnxEncoder:
             )
         voxel = header.voxel / metres_per_unit
 
-        def run(subset: Gaussians, scene_curves: SceneCurves | None) -> Float32[np.ndarray, "n channels"]:
-            return self._run(subset, scene_curves, voxel)
+        def run(subset: Gaussians, scene_curves: SceneCurves | None, count: int) -> Float32[np.ndarray, "n channels"]:
+            return self._run(subset, scene_curves, voxel)[:count]
 
         return encode_by_chunks(
             gaussians,
@@ -158,7 +164,7 @@ class OnnxEncoder:
             ),
             config,
             metres_per_unit=metres_per_unit,
-            channels=header.outputs.channels,
+            columns={teacher: header.outputs.columns[teacher] for teacher in teachers},
             track=track,
         )
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from gsencoder.core.runtime.threads import parallel
 from gsencoder.models.grid.serialize import (
     ALIGN,
     MAX_EXTENT,
@@ -50,8 +51,13 @@ def cut_scene_curves(
     if not (high - low).max() < MAX_EXTENT - 2:
         return None
     cells = (scaled - np.floor(low / ALIGN) * ALIGN).astype(np.int64)
-    morton = np.unique(morton_codes(cells))
-    curve_codes = [np.sort(curve_from_morton(morton, order, coordinate_bits(cells))) for order in orders]
+    # Sorting is faster than the hash table of np.unique, and the codes must be in order anyway.
+    morton, bits = _unique_sorted(np.sort(morton_codes(cells))), coordinate_bits(cells)
+
+    def codes_along(order: int) -> Int64[np.ndarray, " T"]:
+        return np.sort(curve_from_morton(morton, orders[order], bits))
+
+    curve_codes = parallel(codes_along, range(len(orders)))
     starts = []
     for level in range(levels):
         if level:

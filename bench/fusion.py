@@ -1,0 +1,44 @@
+"""Seconds of a fusion and of its steps: the labels teacher onto seeds of a scene.
+
+    python bench/fusion.py SCENE [--runs 5]
+
+The first run is that of a fresh process. The digest of features and weights tells whether two versions, or two numbers
+of threads, agree to the last bit.
+"""
+
+import argparse
+import hashlib
+import os
+import time
+from pathlib import Path
+
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.fusion.fuse import fuse
+from gsencoder.fusion.teachers.build import build_teacher, words_of
+from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.text.build import TableTextConfig
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--runs", type=int, default=5)
+    options = parser.parse_args()
+    scene = with_gaussians(load_scene(options.scene), SeedConfig())
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    teacher = build_teacher(LabelsConfig(), scene, words_of(LabelsConfig(), TableTextConfig()))
+    print(f"{len(scene.gaussians):,} Gaussians, {len(scene.views)} views")
+    for _ in range(options.runs):
+        start, before = time.perf_counter(), os.times()
+        fusion = fuse(scene, teacher)
+        seconds, after = time.perf_counter() - start, os.times()
+        digest = hashlib.sha256(fusion.features.features.tobytes() + fusion.features.weights.tobytes()).hexdigest()[:12]
+        cpu = after.user - before.user + after.system - before.system
+        steps = ", ".join(f"{step} {taken:.2f}" for step, taken in fusion.seconds.items())
+        print(f"{seconds:.2f} s, {cpu:.2f} s of CPU time: {steps}; {digest}")
+
+
+if __name__ == "__main__":
+    main()
