@@ -200,7 +200,7 @@ def _sync_one(path: str | Path) -> None:
     except OSError as error:
         # Some file systems cannot sync a folder; a file that cannot be synced is an error.
         if os.path.isfile(path) or error.errno not in (errno.EINVAL, errno.ENOTSUP):
-            raise
+            raise OSError(error.errno, error.strerror, os.fspath(path)) from error
     finally:
         os.close(descriptor)
 
@@ -242,9 +242,15 @@ def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) ->
         return f"{path}: no space left on the device: no result was written"
     if isinstance(error, InputError):
         return str(error).replace(str(partial), str(path))
-    named = str(getattr(error, "filename", None) or "")
-    if isinstance(error, OSError) and named.startswith(str(partial)):
-        return f"{named.replace(str(partial), str(path))}: cannot write: {error.strerror or error}"
-    if isinstance(error, OSError) and named == str(target):
+    if not isinstance(error, OSError):
+        return None
+    # A file that is copied has the second name.
+    names = [str(each) for each in (error.filename2, error.filename) if each is not None]
+    for named in names:
+        if named.startswith(str(partial)):
+            return f"{named.replace(str(partial), str(path))}: cannot write: {error.strerror or error}"
+    if str(target) in names:
         return f"{path}: cannot be replaced by the results: {error.strerror or error}"
+    if str(target.parent) in names:
+        return f"{path}: the results are written; the system cannot sync {target.parent}: {error.strerror or error}"
     return None
