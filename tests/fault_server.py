@@ -6,6 +6,7 @@ with the shim preloaded and one thread, since a forked child has none of its par
 """
 
 import ctypes
+import gc
 import json
 import os
 import sys
@@ -20,6 +21,9 @@ def run_forked(asked: dict[str, Any]) -> dict[str, Any]:
     """Runs a command line in a child; its exit code (negative: the signal that ended it) and seconds."""
     began = time.perf_counter()
     sys.stdout.flush()
+    # What the parent has is not looked at, and so not copied, by its children.
+    gc.collect()
+    gc.freeze()
     child = os.fork()
     if child == 0:
         code = 99
@@ -83,6 +87,8 @@ def main() -> None:
             from gsencoder.app import cli
 
             answer = {"code": cli.main(asked["words"]), "seconds": time.perf_counter() - began}
+            # The folder of the run may be removed.
+            os.chdir(given)
         else:
             answer = run_forked(asked)
         print(json.dumps(answer), file=out, flush=True)

@@ -244,11 +244,15 @@ def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) ->
         return str(error).replace(str(partial), str(path))
     if not isinstance(error, OSError):
         return None
-    # A file that is copied has the second name.
-    names = [str(each) for each in (error.filename2, error.filename) if each is not None]
+    # A file that is copied has the second name; an error of copying a folder lists such errors.
+    names, said = [str(each) for each in (error.filename2, error.filename) if each is not None], error.strerror
+    if isinstance(error, shutil.Error) and error.args and error.args[0] and not isinstance(error.args[0], str):
+        source, copy, said = map(str, error.args[0][0])
+        names = [copy, source]
+        said = said.partition("] ")[2].partition(": ")[0] or said
     for named in names:
         if named.startswith(str(partial)):
-            return f"{named.replace(str(partial), str(path))}: cannot write: {error.strerror or error}"
+            return f"{named.replace(str(partial), str(path))}: cannot write: {said or error}"
     if str(target) in names:
         return f"{path}: cannot be replaced by the results: {error.strerror or error}"
     if str(target.parent) in names:
