@@ -12,10 +12,11 @@ from hashlib import sha1
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.runs.summary import SUMMARY_NAME, Summary
+from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import is_full_disk, lock_folder
 from gsencoder.core.files.json_values import json_bytes, write_bytes
+from gsencoder.core.files.written_files import SUMMARY_NAME, checksums_of
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 
@@ -32,7 +33,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         path: the folder; its parents are created. It may exist if it is empty.
         overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
             old and new are exchanged in one step.
-        summary: written into the folder at the end, as summary.json.
+        summary: written into the folder at the end, as summary.json, with the checksums of files that have none.
 
     Raises:
         InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
@@ -53,7 +54,8 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
     try:
         yield partial
         if summary is not None:
-            write_bytes(partial / SUMMARY_NAME, json_bytes(summary.to_dict())[0])
+            record = summary.to_dict() | {"files": checksums_of(partial)}
+            write_bytes(partial / SUMMARY_NAME, json_bytes(record)[0])
         _sync(partial)
         _check_target(path, target, overwrite)
         _move_into_place(partial, target)
