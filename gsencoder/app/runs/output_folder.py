@@ -44,7 +44,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
     _check_target(path, target, overwrite)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial, lock = _begin(target)
+        partial, lock = _begin(path, target, overwrite)
     except BlockingIOError:
         raise BusyError(f"{path}: another run is writing this folder now; wait for it or give another out=") from None
     except FileExistsError as error:
@@ -71,17 +71,20 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
             os.close(lock)
 
 
-def _begin(target: Path) -> tuple[Path, int | None]:
+def _begin(path: str | Path, target: Path, overwrite: bool) -> tuple[Path, int | None]:
     """Creates and locks the hidden folder. Runs that start at the same moment do so one after the other: a folder that
     is created and not yet locked would be mistaken for that of a killed run.
 
     Raises:
         BlockingIOError: another run is writing `target`.
+        InputError: earlier results are there again, and are not to be replaced.
     """
     parent_lock = lock_folder(target.parent, wait=True)
     try:
         if _remove_stale(target):
             raise BlockingIOError
+        if _put_back(target):
+            _check_target(path, target, overwrite)
         partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
         partial.mkdir()
         return partial, lock_folder(partial)
@@ -213,7 +216,8 @@ def _move_into_place(partial: Path, target: Path) -> None:
     if not old:
         os.rename(partial, target)
     elif not _exchange(partial, target):
-        aside = partial.with_name(f"{partial.name[:-8]}{secrets.token_hex(4)}")
+        # Not the name of a hidden folder that the next run removes: a kill between the two would lose the old results.
+        aside = _aside(target)
         os.rename(target, aside)
         try:
             os.rename(partial, target)
@@ -222,6 +226,24 @@ def _move_into_place(partial: Path, target: Path) -> None:
             raise
         os.rename(aside, partial)
     _sync_one(target.parent)
+
+
+def _aside(target: Path) -> Path:
+    """Where earlier results lie for a moment while new ones take their name, if the system cannot exchange names."""
+    return target.parent / f".{_short(target.name)}.earlier"
+
+
+def _put_back(target: Path) -> bool:
+    """Gives earlier results their name back that a run was replacing when it was killed; returns whether there were
+    such."""
+    aside = _aside(target)
+    if not aside.is_dir():
+        return False
+    if os.path.lexists(target):
+        shutil.rmtree(aside, ignore_errors=True)
+        return False
+    os.rename(aside, target)
+    return True
 
 
 def _exchange(first: Path, second: Path) -> bool:
