@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,7 +22,17 @@ COUNT, KILL, TEAR, FULL, IO_ERROR, SHORT, SHORT_FULL, DENY, VANISH, CUT, READ_ER
 """What `fault_shim.c` does at the call that is asked for: nothing; end the process before it, or in the middle of it;
 a disk that is full from then on; one error; a short write, alone or before a full disk; of inputs: refuse, remove or
 halve the file, and an error of reading."""
-VOLATILE = ("timings", "peak_memory_mb", "versions", "platform", "seconds", "seconds_per_step", "mib", "settings")
+VOLATILE = (
+    "timings",
+    "peak_memory_mb",
+    "versions",
+    "platform",
+    "seconds",
+    "seconds_per_step",
+    "mib",
+    "settings",
+    "files",
+)
 """Keys of JSON values in which two runs differ."""
 
 
@@ -153,6 +164,8 @@ class FaultServer:
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait(30)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
         self._log.close()
 
 
@@ -192,7 +205,13 @@ def digest_of(file: Path) -> str:
 def _digest_of(file: Path) -> str:
     data = file.read_bytes()
     if file.suffix == ".json":
-        data = json.dumps(lasting(json.loads(data)), sort_keys=True).encode()
+        value = json.loads(data)
+        data = json.dumps(lasting(value), sort_keys=True).encode()
+        if file.name == "summary.json" and isinstance(value.get("files"), dict):
+            # Some of these files differ in each run; the checksums are those of the files that are there.
+            sums = {name: hashlib.sha256((file.parent / name).read_bytes()).hexdigest() for name in value["files"]}
+            names = sorted(re.sub(r"tfevents.*", "tfevents", name) for name in sums)
+            data += json.dumps([sorted(set(names)), sums == value["files"]]).encode()
     elif file.suffix == ".jsonl":
         data = json.dumps([lasting(json.loads(line)) for line in data.splitlines()], sort_keys=True).encode()
     elif file.suffix == ".csv":

@@ -42,6 +42,8 @@ def write_room(scene: Scene, folder: str | Path) -> None:
         if target.exists():
             target.rmdir()
         os.replace(temporary, target)
+    except InputError as error:
+        raise InputError(str(error).replace(str(temporary), str(folder))) from error
     except OSError as error:
         raise InputError(f"{folder}: cannot write: {error.strerror or error}") from error
     finally:
