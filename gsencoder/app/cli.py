@@ -64,11 +64,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         _discard_stdout()
         return 1
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        line = _fault_of_system(error)
+        if line is None:
             raise
-        _report("error", f"{error.filename or 'standard output'}: no space left on the device", debug)
-        _discard_stdout()
+        _report("error", line, debug)
+        _report_notes(error)
+        if error.filename is None:
+            _discard_stdout()
         return 2
+
+
+def _fault_of_system(error: OSError) -> str | None:
+    """The line for an error of the system and not of the program: a full or broken disk, or a file that has gone or may
+    not be read since it was looked at. None for any other."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{error.filename or 'standard output'}: no space left on the device"
+    if error.filename is not None and error.strerror is not None:
+        # Of a file that is copied, both are named, since either may be to blame.
+        names = [
+            os.fsdecode(each) if isinstance(each, bytes) else str(each)
+            for each in (error.filename, error.filename2)
+            if each
+        ]
+        return f"{' to '.join(names)}: {error.strerror}"
+    return f"a file or a device failed: {error.strerror}" if error.errno in (errno.EIO, errno.EROFS) else None
 
 
 def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:

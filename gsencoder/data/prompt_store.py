@@ -20,6 +20,7 @@ from PIL import Image
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.json_values import write_bytes
+from gsencoder.core.files.sealed_rows import sealed, unsealed
 
 PROMPTS_FILE, PICTURES_FOLDER, TOKENS_FOLDER = "prompts.jsonl", "pictures", "tokens"
 
@@ -68,9 +69,11 @@ class PromptStore:
             raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
         for number, line in enumerate(lines, start=1):
             try:
-                self._take(json.loads(line))
+                self._take(unsealed(json.loads(line)))
             except (ValueError, KeyError, TypeError, RecursionError) as error:
-                raise InputError(f"{path}: line {number} is no prompt; remove the folder to prepare it anew") from error
+                raise InputError(
+                    f"{path}: line {number} is no prompt, or not as it was written; remove the folder to make it anew"
+                ) from error
 
     def _take(self, row: Mapping[str, Any]) -> None:
         text, tokens, space = row["text"], row["tokens"], row["space"]
@@ -104,7 +107,7 @@ class PromptStore:
         names = tuple(self._write_picture(each) for each in pictures)
         file = "" if tokens is None else self._write_tokens(tokens)
         prompt = StoredPrompt(text=text, pictures=names, tokens=file, space=space)
-        line = json.dumps({"key": key, **asdict(prompt)}, ensure_ascii=False).encode() + b"\n"
+        line = json.dumps(sealed({"key": key, **asdict(prompt)}), ensure_ascii=False).encode() + b"\n"
         path = self.folder / PROMPTS_FILE
         try:
             if not self.prompts:

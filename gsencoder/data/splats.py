@@ -21,6 +21,7 @@ from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.written_files import check_written
 from gsencoder.data.splat_formats.compressed_ply import is_compressed, morton_order, packed_bytes, read_compressed
 from gsencoder.data.splat_formats.dotsplat import read_dotsplat
 from gsencoder.data.splat_formats.ply import read_header, read_inria, read_property, write_inria
@@ -67,6 +68,7 @@ def load_splat(path: str | Path, *, origin: Float64[np.ndarray, "3"] | None = No
     Warns:
         SceneWarning: SH of degree 4 was cut, extensions were left out, or positions lose precision without an origin.
     """
+    check_written(path)
     return gaussians_from_raw(read_raw(path), origin=origin, where=str(path))
 
 

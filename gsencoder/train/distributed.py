@@ -1,11 +1,13 @@
 """Distributed training with torch.distributed: the process group, and sums over processes."""
 
 import gc
+import hashlib
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +25,12 @@ T = TypeVar("T")
 MAX_VALUE = 64
 """Largest number of characters of a value that processes compare."""
 STOPPED_ELSEWHERE = "another process stopped; its own message says why"
+WAIT_HOURS = 24.0
+"""Longest wait for other processes, which may be preparing scenes or validate. One that dies ends the wait at once."""
+STEP_MINUTES = 30.0
+"""Longest wait for other processes within a step of training; a step takes seconds."""
+LOST = ("timed out", "timeout", "connection closed", "connection reset", "broken pipe", "socket closed")
+"""Words of the errors of collectives whose other side died or does not answer; gloo and NCCL have no type for it."""
 
 
 def gpu_index(process: ProcessRank, init_method: str) -> int:
@@ -36,20 +44,20 @@ def gpu_index(process: ProcessRank, init_method: str) -> int:
 
 @contextmanager
 def join_processes(
-    device: Device = "auto", *, timeout_hours: float = 24.0
+    device: Device = "auto", *, asked: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[ProcessRank, torch.device]]:
     """Joins the process group for the block.
 
     Args:
         device: "auto" (one GPU per process if torch sees any, else the CPU), "cpu" or "cuda".
-        timeout_hours: longest wait for other processes, which may be preparing scenes. A process that dies is noticed
-            by the launcher, not here.
+        asked: the settings of the run, in which all processes must agree; None = they are not compared.
 
     Yields:
         The rank and the device of this process.
 
     Raises:
-        InputError: there is no such device, or the other processes cannot be reached.
+        InputError: there is no such device, the other processes cannot be reached or have other settings, or one of
+            them dies.
     """
     process, init_method = rank_from_environment(os.environ)
     chosen = choose_device(device, gpu_index(process, init_method))
@@ -69,17 +77,78 @@ def join_processes(
             init_method=init_method,
             rank=process.rank,
             world_size=process.world_size,
-            timeout=timedelta(hours=timeout_hours),
+            timeout=timedelta(hours=WAIT_HOURS),
         )
     except (RuntimeError, ValueError) as error:
         message = " ".join(str(error).split())[:200]
         ranks = f"process {process.rank} of {process.world_size}"
         raise InputError(f"training: {ranks} cannot reach the others: {message}") from error
-    yield process, chosen
+    with lost_processes(process):
+        if asked is not None:
+            shared = {name: value for name, value in asked.items() if name not in ("quiet", "device")}
+            check_agreement("the settings", digest_of(shared), advice="give all processes the same command")
+        yield process, chosen
     # Not after an error: other processes may be waiting in a reduction, and leaving the group would wait for them.
     # A wrapped network holds a reference cycle with the group, which must be collected before the group is destroyed.
     gc.collect()
     distributed.destroy_process_group()
+
+
+@contextmanager
+def lost_processes(process: ProcessRank, minutes: float | None = None) -> Iterator[None]:
+    """Turns the error of a collective operation whose other side has died, or does not answer, into one that says so.
+
+    Args:
+        process: the rank of this process.
+        minutes: longest wait for the others within the block; None = that of the group. NCCL has its own watch, which
+            ends the process.
+
+    Raises:
+        InputError: another process is lost.
+    """
+    shorter = process.world_size > 1 and minutes is not None
+    if minutes is not None and shorter:
+        _set_wait(timedelta(minutes=minutes))
+    try:
+        yield
+    except InputError:
+        raise
+    except RuntimeError as error:
+        said = " ".join(str(error).split())
+        if process.world_size == 1 or not any(words in said.lower() for words in LOST):
+            raise
+        hung = "timed out" in said.lower() or "timeout" in said.lower()
+        waited = f"has not answered for {minutes:g} minutes" if hung and minutes is not None else "has not answered"
+        raise InputError(
+            f"training: process {process.rank} of {process.world_size}: another process "
+            f"{waited if hung else 'has ended'}; its own message, if there is one, says why; start all of them again "
+            "to continue"
+        ) from error
+    finally:
+        if shorter:
+            _set_wait(timedelta(hours=WAIT_HOURS))
+
+
+def _set_wait(longest: timedelta) -> None:
+    """Sets the longest wait of the operations of the group that begin from now on."""
+    # torch has no public function for a group that exists.
+    change = getattr(distributed.distributed_c10d, "_set_pg_timeout", None)
+    if change is not None:
+        change(longest)
+
+
+def digest_of(value: Any) -> str:
+    """A digest of JSON values, for `check_agreement`."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def digest_of_weights(network: torch.nn.Module) -> str:
+    """A digest of all parameters and buffers, for `check_agreement`."""
+    digest = hashlib.sha256()
+    for name, value in network.state_dict().items():
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()[:16]
 
 
 def sum_over_processes(values: Tensor) -> Tensor:
@@ -134,12 +203,13 @@ def _is_nccl() -> bool:
     return distributed.is_available() and distributed.is_initialized() and distributed.get_backend() == "nccl"
 
 
-def check_agreement(what: str, value: str) -> None:
+def check_agreement(what: str, value: str, advice: str = "give all processes the same files") -> None:
     """Checks that all processes have the same value of something, such as the digest of a teacher's weights.
 
     Args:
         what: what it is the value of, for the error.
         value: of this process, at most `MAX_VALUE` characters of ASCII; empty = this process has none, and any fits.
+        advice: what to do where they differ.
 
     Raises:
         InputError: in every process: two processes have different values; both are named.
@@ -158,8 +228,7 @@ def check_agreement(what: str, value: str) -> None:
         if each != known[0][1]:
             raise InputError(
                 f"training: {what} differ: their digest is {known[0][1]} in process {known[0][0]} and {each} in "
-                f"process {rank}; "
-                "give all processes the same files"
+                f"process {rank}; {advice}"
             )
 
 

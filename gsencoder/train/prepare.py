@@ -4,8 +4,8 @@ import hashlib
 import json
 import shutil
 import tempfile
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised, listed
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
-from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.atomic import atomic_file, locked
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.fusion.basis import to_coordinates
@@ -35,9 +35,8 @@ from gsencoder.train.prepared_scene import PreparedScene, ViewRows, digest_of_fi
 from gsencoder.types import FeatureMap, Scene
 
 SPACE_FILE, DATASET_SETTINGS_FILE, CLASS_BALANCE_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
-MAPS_PREFIX, MAX_MAPS_AGE = ".maps.", 24 * 3600.0
-"""Prefix of the folders that cache teacher maps of scenes in preparation, and the age in seconds above which they were
-left by killed runs."""
+MAPS_PREFIX = ".maps."
+"""Prefix of the folders that cache teacher maps of scenes in preparation."""
 CLUSTERED_TARGETS = 200_000
 """Approximate number of targets, over all scenes, from which classes of a dense teacher are clustered."""
 
@@ -174,6 +173,21 @@ class PreparedDataset:
         """A hash of the output space, by which a resumed training checks that its targets are the same."""
         return hashlib.sha256((self.folder / SPACE_FILE).read_bytes()).hexdigest()[:16]
 
+    def digest_of_scenes(self, names: Sequence[str]) -> str:
+        """A hash of the headers of prepared scenes, which hold the checksums of all arrays, by which processes compare
+        what they train on.
+
+        Raises:
+            InputError: a file is damaged.
+        """
+        digest = hashlib.sha256()
+        for name in names:
+            path = self.scene_path(name)
+            if path.is_file():
+                with open_archive(path) as file:
+                    digest.update(f"{name} {file.value('digest', str) if 'digest' in file else ''}".encode())
+        return digest.hexdigest()[:16]
+
     def load_kinds(self) -> tuple[str, ...]:
         """Loads the names of the things that the teacher tells apart; none for a teacher without names, and of datasets
         of earlier versions.
@@ -237,8 +251,8 @@ class PreparedDataset:
         outputs, _ = self.load_space()
         path = self.scene_path(scene.name)
         path.parent.mkdir(exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=self.folder, prefix=MAPS_PREFIX) as maps:
-            prepare_scene(path, scene, CachedTeacher(teacher, Path(maps)), outputs, config, source=source)
+        with self._maps() as maps:
+            prepare_scene(path, scene, CachedTeacher(teacher, maps), outputs, config, source=source)
 
     def check_kinds(self, teacher: Teacher) -> None:
         """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
@@ -257,11 +271,23 @@ class PreparedDataset:
                 "another folder as prepared="
             )
 
+    @contextmanager
+    def _maps(self) -> Iterator[Path]:
+        """A folder for the teacher's maps of one scene while the block lasts. It is locked, so that others can tell it
+        from that of a killed run."""
+        with ExitStack() as held:
+            with locked(self.folder, wait=True):
+                maps = held.enter_context(tempfile.TemporaryDirectory(dir=self.folder, prefix=MAPS_PREFIX))
+                held.enter_context(locked(maps))
+            yield Path(maps)
+
     def remove_stale_maps(self) -> None:
-        """Removes caches of teacher maps that killed runs left."""
-        for path in self.folder.glob(f"{MAPS_PREFIX}*"):
-            if time.time() - path.stat().st_mtime > MAX_MAPS_AGE:
-                shutil.rmtree(path, ignore_errors=True)
+        """Removes caches of teacher maps that killed runs left; where folders cannot be locked, none."""
+        with locked(self.folder, wait=True):
+            for path in self.folder.glob(f"{MAPS_PREFIX}*"):
+                with suppress(OSError), locked(path) as known:
+                    if known:
+                        shutil.rmtree(path, ignore_errors=True)
 
     def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:
         """Counts the target classes of the training scenes and stores the counts, unless those of these scenes are

@@ -27,7 +27,7 @@ from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, check_same_teachers
 from gsencoder.train.crops import SamplingConfig
 from gsencoder.train.distill import encoder_trainer
-from gsencoder.train.distributed import check_agreement, cpu_share, fail_together, join_processes
+from gsencoder.train.distributed import check_agreement, cpu_share, digest_of, fail_together, join_processes
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
@@ -239,6 +239,9 @@ def fit(
         scenes = [TrainingScene(parts) for parts in held_out_parts if any(part is not None for part in parts)]
         codebooks = {teacher.name: teacher.class_balance.codebook for teacher in recipe.teachers}
         score_encoder = lambda encoder: validate(scenes, encoder, outputs, codebooks)  # noqa: E731
+    if process.world_size > 1:
+        digests = [dataset.digest_of_scenes(training) for dataset in datasets.values()]
+        check_agreement("the prepared scenes", digest_of(digests))
     scenes_to_train_on = [TrainingScene(_parts(datasets, name)) for name in training]
     torch.manual_seed(config.train.seed)
     encoder = GaussianEncoder(config.model, outputs.widths)

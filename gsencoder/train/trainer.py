@@ -24,8 +24,17 @@ from gsencoder.core.runtime.device_names import Precision
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.signals import defer_signals, stop_of
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.train import distributed
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.distributed import STOPPED_ELSEWHERE, fail_together, sum_over_processes
+from gsencoder.train.distributed import (
+    STOPPED_ELSEWHERE,
+    check_agreement,
+    digest_of,
+    digest_of_weights,
+    fail_together,
+    lost_processes,
+    sum_over_processes,
+)
 from gsencoder.train.samples import StepSampler
 
 CHANGEABLE_ON_RESUME = (
@@ -198,6 +207,10 @@ class Trainer:
                     f"{folder / TRAINING_CHECKPOINT_FILE}: is at step {self.state.step}, beyond the last step "
                     f"{config.steps}; give resume=false to begin anew"
                 )
+        if process.world_size > 1:
+            check_agreement("the settings of training", digest_of(self.settings))
+            state = f"{self.state.step} {digest_of_weights(network)}"
+            check_agreement("the step and the weights that training begins with", state)
         # If the run was interrupted before the last step was closed, the step's row of the log is written again.
         closed_steps = self.state.step - (not self.state.closed)
         has_log = self.state.step > len(self.state.unlogged)
@@ -231,9 +244,6 @@ class Trainer:
                 with suppress(InputError):
                     self.save()
             raise
-        finally:
-            if self._log is not None:
-                self._log.close()
         # DistributedDataParallel holds the process group, whose threads must end before the interpreter exits.
         self.objective.network, self._parallel = self.network, None
         return self.state
@@ -245,7 +255,9 @@ class Trainer:
             self._close_step()
         batches = iter(self._loader(first))
         for step in track(range(first, config.steps), "training"):
-            losses = self._gradients(step, [next(batches) for _ in range(config.accumulate)])
+            items = [next(batches) for _ in range(config.accumulate)]
+            with lost_processes(self.process, distributed.STEP_MINUTES):
+                losses = self._gradients(step, items)
             unlogged = (*self.state.unlogged, losses)
             # A signal between these lines would save a checkpoint of parameters and state of different steps.
             with defer_signals():

@@ -86,6 +86,35 @@ def test_replacing_works_where_the_system_cannot_exchange_names(
     assert names(tmp_path) == ["out"]
 
 
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_kill_between_two_renames_loses_no_earlier_results(
+    overwrite: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where names cannot be exchanged there is a moment in which no folder has the name."""
+    monkeypatch.setattr(outputs, "_exchange", lambda *_: False)
+    fill(tmp_path / "out", "old")
+    rename, calls = os.rename, []
+
+    def killed(source: str | Path, target: str | Path) -> None:
+        calls.append(target)
+        if len(calls) > 1:
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            fill(tmp_path / "out", "new", overwrite=True)
+    assert names(tmp_path) == [".out.earlier"]
+    if overwrite:
+        fill(tmp_path / "out", "new", overwrite=True)
+    else:
+        with pytest.raises(InputError, match="holds the results of an earlier run"):
+            fill(tmp_path / "out", "new")
+    assert names(tmp_path) == ["out"]
+    assert (tmp_path / "out" / "deep" / "data.txt").read_text() == ("new" if overwrite else "old")
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="renameat2 is Linux's")
 def test_linux_exchanges_the_two_folders_in_one_step(tmp_path: Path) -> None:
     for name in ("a", "b"):

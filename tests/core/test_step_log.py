@@ -1,6 +1,9 @@
 """The log: one line a row, columns that may come later, and no line twice."""
 
+import errno
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,6 +55,47 @@ def test_events_and_pictures_are_written_for_tensorboard(tmp_path: Path) -> None
     log = Log(tmp_path, done=0, events=True)
     log.add(0, {"loss": 1.0})
     log.picture(0, "validation/sheet", np.zeros((4, 4, 3), np.uint8))
-    log.close()
     assert list((tmp_path / "tensorboard").glob("events*"))
+    assert shown(tmp_path / "tensorboard") == [(0, 1.0)]
+
+
+def shown(folder: Path) -> list[tuple[int, float]]:
+    """The losses that TensorBoard reads from a folder."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    read = EventAccumulator(str(folder))
+    read.Reload()
+    return [(event.step, event.value) for event in read.Scalars("loss")]
+
+
+@pytest.mark.parametrize("hours", [0, -72, 72])
+def test_tensorboard_shows_the_steps_of_a_continued_run_once_whatever_the_clock_says(
+    hours: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("tensorboard")
+    log = Log(tmp_path, done=0, events=True)
+    for step in range(1, 5):
+        log.add(step, {"loss": float(step)})
+    monkeypatch.setattr(time, "time", lambda now=time.time(): now + 3600 * hours)
+    again = Log(tmp_path, done=2, events=True, begun=True)
+    for step in range(3, 6):
+        again.add(step, {"loss": 10.0 * step})
+    assert shown(tmp_path / "tensorboard") == [(1, 1.0), (2, 2.0), (3, 30.0), (4, 40.0), (5, 50.0)]
+
+
+def test_an_event_that_cannot_be_written_is_an_error_of_the_caller_that_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("tensorboard")
+    log = Log(tmp_path, done=0, events=True)
+    usual = Path.open
+
+    def full(self: Path, *given: Any, **more: Any) -> Any:
+        if "tfevents" in self.name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return usual(self, *given, **more)
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(InputError, match=r"tensorboard/events\.out\.tfevents\S*: cannot write: No space left"):
+        log.add(1, {"loss": 1.0})
     assert (tmp_path / "validation" / "sheet_000000.png").is_file()

@@ -208,8 +208,8 @@ def test_a_write_that_fails_leaves_nothing_behind(room, tmp_path, monkeypatch):
     def full(*_args, **_kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pathlib.Path.write_text", full)
-    with pytest.raises(InputError, match="No space left"):
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(InputError, match=r"/room/images/000\.png: no space left on the device"):
         write_room(room, tmp_path / "room")
     assert not list(tmp_path.iterdir())
 

@@ -13,6 +13,7 @@ from gsencoder.app.commands.evaluate_sources import method_name, scenes_of
 from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
+from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, SceneWarning, about, advised, listed
 from gsencoder.data.scenes import find_scenes, scene_name
 from gsencoder.data.truth.class_table import ClassTable
@@ -47,7 +48,7 @@ def run_benchmark(
     summary: Summary,
 ) -> None:
     """Predicts the scenes of this process, and in the first process scores those of all and prints the scores."""
-    with join_processes("cpu") as (process, _), ExitStack() as results:
+    with join_processes("cpu", asked=settings(config)) as (process, _), ExitStack() as results:
         folder = None
         with fail_together():
             if process.is_first:

@@ -7,11 +7,10 @@ from typing import Any
 
 from gsencoder.app.runs.output_folder import refuse_existing
 from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.json_values import write_json
 from gsencoder.core.runtime.device_names import Stored
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -165,7 +164,7 @@ def run(config: ExportConfig, summary: Summary) -> None:
         gaussians=sizes,
         **space_figures(encoder),
     )
-    write_json(f"{config.out}.summary.json", summary.to_dict())
+    write_beside(config.out, summary)
     if heads is None:
         # Those of a file that was replaced.
         heads_of_graph(config.out).unlink(missing_ok=True)
@@ -192,7 +191,7 @@ def _export_memory(config: ExportConfig, out: Path, summary: Summary) -> None:
     with summary.step("write"), atomic_file(out) as stream:
         stream.write(model)
     summary.results.update(onnx=str(out), bytes=len(model), components=len(memory.bank), space=memory.space.describe())
-    write_json(f"{out}.summary.json", summary.to_dict())
+    write_beside(out, summary)
     console(config.quiet).print(
         f"{out}: {len(model) / 1e6:.1f} MB; features of {memory.space.channels} channels from queries of "
         f"{memory.channels}, by attention to {len(memory.bank):,} components"

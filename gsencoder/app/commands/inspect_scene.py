@@ -9,6 +9,7 @@ from PIL import Image, ImageDraw
 from rich.table import Table
 
 from gsencoder.core.even_indices import even_indices
+from gsencoder.core.files.picture_file import write_picture
 from gsencoder.data.check.depth_agreement import agreement_map
 from gsencoder.data.check.epipolar import EpipolarCheck
 from gsencoder.data.check.findings import Finding
@@ -177,7 +178,7 @@ def save_check_picture(path: Path, views: Views, depth: DepthCheck | None, match
         sheet = contact_sheet(pictures, titles, columns=2, width=640)
     else:
         return False
-    Image.fromarray(sheet).save(path)
+    write_picture(path, sheet)
     return True
 
 

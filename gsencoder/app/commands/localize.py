@@ -22,6 +22,7 @@ from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files.picture_file import write_picture
 from gsencoder.core.runtime.threads import import_ahead
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.up import with_up
@@ -103,7 +104,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
 
             with summary.step("pictures"):
                 for name, picture in relevancy_pictures(scene, localization, per_word=config.pictures):
-                    picture.save(target / f"{name}.png")
+                    write_picture(target / f"{name}.png", picture)
         points: list[dict[str, Any]] = []
         if cameras is not None:
             with summary.step("from_pose"):
@@ -121,7 +122,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
                 ):
                     points += found
                     for name, picture in drawn:
-                        picture.save(target / f"{name}.png")
+                        write_picture(target / f"{name}.png", picture)
             write_json(target / FROM_POSE, points)
             summary.results["from_pose"] = points
         if config.report:

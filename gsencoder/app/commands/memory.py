@@ -16,6 +16,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, about, advised, counted
+from gsencoder.core.files.picture_file import write_picture
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
@@ -107,7 +108,7 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
     with (
         WorkFolder(out.with_name(f"{out.name}.training")) as state,
-        join_processes(config.device) as (process, device),
+        join_processes(config.device, asked=settings(config)) as (process, device),
         ExitStack() as results,
     ):
         track = Progress(quiet=config.quiet or not process.is_first)
@@ -230,16 +231,14 @@ def _draw(
     folder: Path, scene: Scene, name: str, memory: QueryMemory, sample: RawSample, config: MemoryCommandConfig
 ) -> None:
     """Writes the pictures of one teacher's memory."""
-    from PIL import Image
-
     from gsencoder.infer.draw.attention_pictures import attention_pictures
     from gsencoder.infer.draw.component_scatter import component_scatter
 
     scatter = component_scatter(memory.bank, sample, umap=config.umap)
-    Image.fromarray(scatter).save(folder / f"components.{name}.png")
+    write_picture(folder / f"components.{name}.png", scatter)
     blend = config.prepare.fusion.blend
     for view, picture in attention_pictures(memory, scene, views=config.pictures, config=blend):
-        picture.save(folder / f"attention.{name}.view{view:03d}.png")
+        write_picture(folder / f"attention.{name}.view{view:03d}.png", picture)
 
 
 def fit_errors(memory: QueryMemory, scene: MemoryScene, min_alpha: float) -> RenderedErrors:

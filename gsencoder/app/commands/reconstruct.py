@@ -16,6 +16,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import SceneWarning
+from gsencoder.core.files.picture_file import write_picture
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
@@ -175,8 +176,6 @@ def draw(path: Path, comparisons: tuple[Comparison, ...]) -> None:
     """Writes held-out photographs and renders side by side, if there are any."""
     if not comparisons:
         return
-    from PIL import Image
-
     pictures = [picture for each in comparisons for picture in (each.photograph, each.render)]
     titles = [f"{each.name}: {kind}" for each in comparisons for kind in ("photograph", "splat")]
-    Image.fromarray(contact_sheet(pictures, titles, columns=2)).save(path)
+    write_picture(path, contact_sheet(pictures, titles, columns=2))

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from gsencoder.app.runs.output_folder import refuse_existing
 from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
@@ -83,7 +83,7 @@ def run(config: RepairConfig, summary: Summary) -> None:
     with summary.step("write"):
         save_splat(config.out, gaussians, origin=origin)
     summary.results.update(report.to_dict(), path=str(config.out))
-    write_json(f"{config.out}.summary.json", summary.to_dict())
+    write_beside(config.out, summary)
     screen = console(config.quiet)
     for change in report.changes:
         screen.print(f"{change.fix}: {change.count:,} rows {change.action}")
@@ -123,7 +123,7 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
     summary.results.update(
         path=str(config.out), changes=list(repair.changes), agreement_before=before, agreement_after=after
     )
-    write_json(f"{config.out}.summary.json", summary.to_dict())
+    write_beside(config.out, summary)
     for change in repair.changes:
         screen.print(change, highlight=False)
     outside = (

@@ -94,7 +94,11 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
             raise InputError(f"prepared={prepared}: is in the folder of {name}, {taken}; give another folder")
     training, held_out = split_scenes(find_scenes(config.paths), config.holdout, config.split, config.holdout_split)
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
-    with WorkFolder(work) as state, join_processes(config.device) as (process, device), ExitStack() as results:
+    with (
+        WorkFolder(work) as state,
+        join_processes(config.device, asked=settings(config)) as (process, device),
+        ExitStack() as results,
+    ):
         track = Progress(quiet=config.quiet or not process.is_first)
         folder = None
         with fail_together():

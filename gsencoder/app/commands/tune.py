@@ -136,7 +136,11 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
         tokens=config.tokens,
         layout=layout,
     )
-    with WorkFolder(work) as state, join_processes(config.device) as (process, device), ExitStack() as results:
+    with (
+        WorkFolder(work) as state,
+        join_processes(config.device, asked=settings(config)) as (process, device),
+        ExitStack() as results,
+    ):
         track = Progress(quiet=config.quiet or not process.is_first)
         folder = None
         with fail_together(), summary.step("prepare"):

@@ -10,10 +10,9 @@ from gsencoder.app.commands.query_words import asked_scene
 from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import refuse_existing
 from gsencoder.app.runs.progress import console
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
@@ -204,7 +203,7 @@ def _write(
         feature_error=made.feature_error,
         left_out=list(made.notes),
     )
-    write_json(f"{out}.summary.json", summary.to_dict())
+    write_beside(out, summary)
     screen = console(config.quiet)
     for note in made.notes:
         screen.print(note)

@@ -12,10 +12,11 @@ from hashlib import sha1
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.runs.summary import SUMMARY_NAME, Summary
+from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import is_full_disk, lock_folder
 from gsencoder.core.files.json_values import json_bytes, write_bytes
+from gsencoder.core.files.written_files import SUMMARY_NAME, checksums_of
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 
@@ -32,7 +33,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         path: the folder; its parents are created. It may exist if it is empty.
         overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
             old and new are exchanged in one step.
-        summary: written into the folder at the end, as summary.json.
+        summary: written into the folder at the end, as summary.json, with the checksums of files that have none.
 
     Raises:
         InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
@@ -43,7 +44,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
     _check_target(path, target, overwrite)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial, lock = _begin(target)
+        partial, lock = _begin(path, target, overwrite)
     except BlockingIOError:
         raise BusyError(f"{path}: another run is writing this folder now; wait for it or give another out=") from None
     except FileExistsError as error:
@@ -53,7 +54,8 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
     try:
         yield partial
         if summary is not None:
-            write_bytes(partial / SUMMARY_NAME, json_bytes(summary.to_dict())[0])
+            record = summary.to_dict() | {"files": checksums_of(partial)}
+            write_bytes(partial / SUMMARY_NAME, json_bytes(record)[0])
         _sync(partial)
         _check_target(path, target, overwrite)
         _move_into_place(partial, target)
@@ -69,17 +71,20 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
             os.close(lock)
 
 
-def _begin(target: Path) -> tuple[Path, int | None]:
+def _begin(path: str | Path, target: Path, overwrite: bool) -> tuple[Path, int | None]:
     """Creates and locks the hidden folder. Runs that start at the same moment do so one after the other: a folder that
     is created and not yet locked would be mistaken for that of a killed run.
 
     Raises:
         BlockingIOError: another run is writing `target`.
+        InputError: earlier results are there again, and are not to be replaced.
     """
     parent_lock = lock_folder(target.parent, wait=True)
     try:
         if _remove_stale(target):
             raise BlockingIOError
+        if _put_back(target):
+            _check_target(path, target, overwrite)
         partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
         partial.mkdir()
         return partial, lock_folder(partial)
@@ -200,7 +205,7 @@ def _sync_one(path: str | Path) -> None:
     except OSError as error:
         # Some file systems cannot sync a folder; a file that cannot be synced is an error.
         if os.path.isfile(path) or error.errno not in (errno.EINVAL, errno.ENOTSUP):
-            raise
+            raise OSError(error.errno, error.strerror, os.fspath(path)) from error
     finally:
         os.close(descriptor)
 
@@ -211,7 +216,8 @@ def _move_into_place(partial: Path, target: Path) -> None:
     if not old:
         os.rename(partial, target)
     elif not _exchange(partial, target):
-        aside = partial.with_name(f"{partial.name[:-8]}{secrets.token_hex(4)}")
+        # Not the name of a hidden folder that the next run removes: a kill between the two would lose the old results.
+        aside = _aside(target)
         os.rename(target, aside)
         try:
             os.rename(partial, target)
@@ -220,6 +226,24 @@ def _move_into_place(partial: Path, target: Path) -> None:
             raise
         os.rename(aside, partial)
     _sync_one(target.parent)
+
+
+def _aside(target: Path) -> Path:
+    """Where earlier results lie for a moment while new ones take their name, if the system cannot exchange names."""
+    return target.parent / f".{_short(target.name)}.earlier"
+
+
+def _put_back(target: Path) -> bool:
+    """Gives earlier results their name back that a run was replacing when it was killed; returns whether there were
+    such."""
+    aside = _aside(target)
+    if not aside.is_dir():
+        return False
+    if os.path.lexists(target):
+        shutil.rmtree(aside, ignore_errors=True)
+        return False
+    os.rename(aside, target)
+    return True
 
 
 def _exchange(first: Path, second: Path) -> bool:
@@ -242,9 +266,19 @@ def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) ->
         return f"{path}: no space left on the device: no result was written"
     if isinstance(error, InputError):
         return str(error).replace(str(partial), str(path))
-    named = str(getattr(error, "filename", None) or "")
-    if isinstance(error, OSError) and named.startswith(str(partial)):
-        return f"{named.replace(str(partial), str(path))}: cannot write: {error.strerror or error}"
-    if isinstance(error, OSError) and named == str(target):
+    if not isinstance(error, OSError):
+        return None
+    # A file that is copied has the second name; an error of copying a folder lists such errors.
+    names, said = [str(each) for each in (error.filename2, error.filename) if each is not None], error.strerror
+    if isinstance(error, shutil.Error) and error.args and error.args[0] and not isinstance(error.args[0], str):
+        source, copy, said = map(str, error.args[0][0])
+        names = [copy, source]
+        said = said.partition("] ")[2].partition(": ")[0] or said
+    for named in names:
+        if named.startswith(str(partial)):
+            return f"{named.replace(str(partial), str(path))}: cannot write: {said or error}"
+    if str(target) in names:
         return f"{path}: cannot be replaced by the results: {error.strerror or error}"
+    if str(target.parent) in names:
+        return f"{path}: the results are written; the system cannot sync {target.parent}: {error.strerror or error}"
     return None

@@ -10,9 +10,10 @@ from typing import Any
 from rich.console import Console
 
 from gsencoder.app.runs.printable import one_line
-from gsencoder.app.runs.summary import SUMMARY_NAME, Summary
+from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.json_values import plain
+from gsencoder.core.files.written_files import SUMMARY_NAME
 from gsencoder.core.runtime.process_rank import refuse_several
 from gsencoder.data.scenes import check_names, scene_name
 

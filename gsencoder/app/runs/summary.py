@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import gsencoder
-from gsencoder.core.files.json_values import plain
+from gsencoder.core.files.json_values import plain, write_json
+from gsencoder.core.files.written_files import SUMMARY_NAME, sha256_of
 from gsencoder.core.runtime.threads import available_cores
-
-SUMMARY_NAME = "summary.json"
 
 LIBRARIES = {
     "numpy": "numpy",
@@ -105,6 +104,16 @@ class Summary:
             },
         }
         return record | ({"non_finite": lost} if lost else {})
+
+
+def write_beside(file: Path, summary: Summary) -> None:
+    """Writes the summary of a run whose result is one file as FILE.summary.json, with the checksum of the file.
+
+    Raises:
+        InputError: the disk is full, or the system refuses.
+    """
+    files = {file.name: sha256_of(file)} if file.is_file() else {}
+    write_json(f"{file}.{SUMMARY_NAME}", summary.to_dict() | {"files": files})
 
 
 def _versions() -> dict[str, str]:

@@ -10,7 +10,7 @@ from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import atomic_file, lock_folder
 
 MARKER_FILE = "unfinished.txt"
-_PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "[0-9a-f]+[.]tmp")
+_PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "([0-9a-f]+[.])?tmp")
 
 
 class WorkFolder:

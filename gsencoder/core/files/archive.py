@@ -7,7 +7,6 @@ when it is read. Files of version 1 have none, and are read with a warning.
 
 import hashlib
 import json
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning, about
-from gsencoder.core.files.atomic import is_full_disk
+from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.checksums import block_checksums, bytes_of, damaged_blocks, file_digest
 from gsencoder.core.files.model_files import check_fetched
 
@@ -38,6 +37,8 @@ DTYPES = {
     "U16": "uint16",
 }
 """The types of arrays that archives may hold, by their names in safetensors."""
+ORDER = ("I64", "F64", "F32", "I32", "F16", "U16", "U8")
+"""The types in the order in which safetensors writes arrays: those first that are aligned to more bytes."""
 DAMAGED = "the file is damaged"
 
 
@@ -231,10 +232,6 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     Raises:
         InputError: the disk is full, or the system refuses.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import save_file
-
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     pieces = {name: _contiguous(array) for name, array in arrays.items()}
     assert not set(RESERVED_KEYS) & set(header)
     assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that cannot be read back"
@@ -242,22 +239,33 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     # The digest is of what a reader will see: JSON turns tuples into lists and keys into text.
     covered = json.loads(json.dumps({**header, "version": VERSION, "checksums": checksums}))
     digest = file_digest(covered, {name: (array.dtype.name, array.shape) for name, array in pieces.items()})
-    metadata = {"gsencoder": json.dumps({**covered, "digest": digest})}
-    try:
-        save_file(pieces, temporary, metadata)
-        with temporary.open("rb") as stream:
-            os.fsync(stream.fileno())
-        # safetensors writes files that no other user may read.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        os.replace(temporary, path)
-    except (OSError, SafetensorError) as error:
-        if is_full_disk(error):
-            raise InputError(f"{path}: no space left on the device; make room and give the command again") from error
-        raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    _write_safetensors(path, pieces, {"gsencoder": json.dumps({**covered, "digest": digest})})
+
+
+def _write_safetensors(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    """Writes the bytes that `safetensors.numpy.save` gives, without a second copy of the arrays in memory.
+
+    The library's `save_file` writes a file of a random name first, which a kill leaves in the folder for good.
+    """
+    letters = {name: letter for letter, name in DTYPES.items()}
+    order = sorted(arrays, key=lambda name: (ORDER.index(letters[arrays[name].dtype.name]), name))
+    table: dict[str, Any] = {"__metadata__": dict(metadata)}
+    end = 0
+    for name in order:
+        array = arrays[name]
+        table[name] = {
+            "dtype": letters[array.dtype.name],
+            "shape": list(array.shape),
+            "data_offsets": [end, end + array.nbytes],
+        }
+        end += array.nbytes
+    text = json.dumps(table, separators=(",", ":"), ensure_ascii=False).encode("utf-8", "surrogatepass")
+    # Arrays begin at a multiple of eight bytes.
+    text += b" " * (-len(text) % 8)
+    with atomic_file(path) as stream:
+        stream.write(len(text).to_bytes(8, "little") + text)
+        for name in order:
+            stream.write(bytes_of(arrays[name]).data)
 
 
 def _contiguous(array: np.ndarray) -> np.ndarray:

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.event_file import EventFile
+from gsencoder.core.files.picture_file import write_picture
 
 LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
 
@@ -34,23 +35,14 @@ class Log:
         """
         self.path = folder / LOG_FILE
         self._columns: list[str] = []
-        self._writer: Any = None
-        if events:
-            try:
-                from torch.utils.tensorboard import SummaryWriter
-            except ImportError as error:
-                raise InputError(
-                    "tensorboard=true needs the package tensorboard (pip install tensorboard), or tensorboard=false"
-                ) from error
-            try:
-                # Hides events of later steps, which a killed run left.
-                self._writer = SummaryWriter(str(folder / EVENTS_FOLDER), purge_step=done + 1)
-            except OSError as error:
-                raise InputError(f"{folder / EVENTS_FOLDER}: cannot write: {error.strerror or error}") from error
+        # Hides events of later steps, which a killed run left.
+        self._events = EventFile(folder / EVENTS_FOLDER, purge_step=done + 1) if events else None
         try:
             if begun and not self.path.is_file():
                 warnings.warn(f"{self.path}: is missing; the log starts at step {done}", SceneWarning, stacklevel=2)
             self._drop_rows_after(done)
+        except InputError:
+            raise
         except (OSError, ValueError, KeyError, csv.Error) as error:
             raise InputError(f"{self.path}: cannot be continued: {error}") from error
 
@@ -69,9 +61,8 @@ class Log:
             InputError: the disk is full.
         """
         self._append({"step": step, **values})
-        if self._writer is not None:
-            for name, value in values.items():
-                self._writer.add_scalar(name, value, step)
+        if self._events is not None:
+            self._events.add(step, dict(values))
 
     def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
         """Writes a picture, uint8 [H, W, 3]: a file `NAME_STEP.png` beside the log, and for TensorBoard.
@@ -82,11 +73,11 @@ class Log:
         path = self.path.parent / f"{name}_{step:06d}.png"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(pixels).save(path)
         except OSError as error:
             raise InputError(f"{path}: cannot write: {error.strerror or error}") from error
-        if self._writer is not None:
-            self._writer.add_image(name, pixels, step, dataformats="HWC")
+        write_picture(path, pixels)
+        if self._events is not None:
+            self._events.picture(step, name, pixels)
 
     def _append(self, row: Mapping[str, Any]) -> None:
         new = [name for name in row if name not in self._columns]
@@ -105,11 +96,6 @@ class Log:
     def _rewrite(self, rows: Sequence[Mapping[str, Any]]) -> None:
         with atomic_file(self.path) as stream:
             stream.write((_text(self._columns, rows, header=True) if rows else "").encode())
-
-    def close(self) -> None:
-        """Flushes TensorBoard events."""
-        if self._writer is not None:
-            self._writer.close()
 
 
 def read_log(path: Path) -> list[dict[str, str]]:

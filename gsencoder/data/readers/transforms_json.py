@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.written_files import check_written
 from gsencoder.data.readers.images import picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,
@@ -60,6 +61,7 @@ def read_json(path: Path, *, unique_keys: bool = False) -> Any:
             raise InputError(f"{path}: the key {repeated[:40]!r} is there twice; expected each once")
         return dict(pairs)
 
+    check_written(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
         return json.loads(text, object_pairs_hook=unique if unique_keys else None)

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.json_values import write_bytes
+from gsencoder.core.files.picture_file import write_picture
 from gsencoder.types import Scene, Views
 from gsencoder.types.poses import OPENCV_FROM_OPENGL
 
@@ -40,6 +42,8 @@ def write_room(scene: Scene, folder: str | Path) -> None:
         if target.exists():
             target.rmdir()
         os.replace(temporary, target)
+    except InputError as error:
+        raise InputError(str(error).replace(str(temporary), str(folder))) from error
     except OSError as error:
         raise InputError(f"{folder}: cannot write: {error.strerror or error}") from error
     finally:
@@ -47,8 +51,6 @@ def write_room(scene: Scene, folder: str | Path) -> None:
 
 
 def _write_views(scene: Scene, views: Views, folder: Path) -> None:
-    from PIL import Image
-
     assert views.images is not None
     assert views.depths is not None
     assert views.instances is not None
@@ -62,9 +64,9 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
         millimetres = np.rint(views.depths[view].astype(np.float64) * (1000 * float(scene.metres_per_unit or 1)))
         if millimetres.max(initial=0) > 65535:
             raise InputError(f"view {views.names[view]!r}: depth above 65.535 m does not fit in uint16 millimetres")
-        Image.fromarray(views.images[view]).save(folder / "images" / stem)
-        Image.fromarray(millimetres.astype(np.uint16)).save(folder / "depth" / stem)
-        Image.fromarray(views.instances[view].astype(np.uint16)).save(folder / "instance" / stem)
+        write_picture(folder / "images" / stem, views.images[view])
+        write_picture(folder / "depth" / stem, millimetres.astype(np.uint16))
+        write_picture(folder / "instance" / stem, views.instances[view].astype(np.uint16))
         frames.append(
             {
                 "file_path": f"images/{stem}",
@@ -99,4 +101,4 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
         for thing in scene.objects
     ]
     for name, content in (("transforms.json", transforms), ("objects.json", objects)):
-        (folder / name).write_text(json.dumps(content, indent=1), encoding="utf-8")
+        write_bytes(folder / name, json.dumps(content, indent=1).encode())

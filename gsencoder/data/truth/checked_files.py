@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.written_files import check_written
 
 SCENE_BYTES = 256 << 20
 """Larger files are no predictions and no truth of one scene."""
@@ -40,6 +41,7 @@ def check_file(path: Path, *, max_bytes: int = SCENE_BYTES) -> None:
         raise InputError(f"{path}: is an archive (of torch.save, perhaps), and no text; write text, JSON or .npz")
     if size > max_bytes:
         raise InputError(f"{path}: {size:,} bytes; at most {max_bytes:,} are read")
+    check_written(path)
 
 
 def read_checked(path: Path, *, max_bytes: int = SCENE_BYTES) -> bytes:

@@ -138,9 +138,9 @@ def _inputs(path: Path, config: VideoConfig) -> dict[str, Any]:
 
 
 def _write(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
-    from PIL import Image
+    from gsencoder.core.files.picture_file import write_picture
 
-    Image.fromarray(picture).save(path, quality=QUALITY, subsampling=0)
+    write_picture(path, picture, quality=QUALITY, subsampling=0)
 
 
 def _sha256(path: Path) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files.json_values import plain, write_bytes, write_json
+from gsencoder.core.files.sealed_rows import sealed, unsealed
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.splats import fingerprint
@@ -139,7 +140,7 @@ def ask_questions(
     failures: dict[str, str] = {}
     # Rows of other settings, and one that was cut off, are removed before new ones are appended.
     try:
-        write_bytes(file, b"".join(_line(row) for row in done.values()))
+        write_bytes(file, b"".join(_line(sealed(row)) for row in done.values()))
     except RecursionError as error:
         raise InputError(f"{file}: an answer is nested too deep; give resume=false to ask anew") from error
     for each in track(questions, "asking"):
@@ -159,10 +160,13 @@ def ask_questions(
             failures[each.id] = str(error)
             continue
         row = {"id": each.id, "digest": digests[each.id], "warnings": messages, **row}
-        with file.open("ab") as stream:
-            stream.write(_line(row))
-            stream.flush()
-            os.fsync(stream.fileno())
+        try:
+            with file.open("ab") as stream:
+                stream.write(_line(sealed(row)))
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            raise InputError(f"{file}: cannot write: {error.strerror or error}") from error
         done[each.id] = row
     if unanswered is not None:
         unanswered.update(failures)
@@ -193,7 +197,13 @@ def write_answers(folder: Path, work: Path, rows: Sequence[Mapping[str, Any]]) -
 
 def _answered(work: Path, digests: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     """The rows of an earlier call that answer these questions under the same settings."""
-    rows = read_answers(work / ANSWERS)
+    rows = {}
+    for name, row in read_answers(work / ANSWERS).items():
+        try:
+            rows[name] = unsealed(row)
+        except (ValueError, RecursionError) as error:
+            message = f"{work / ANSWERS}: the answer to {name[:40]} is not as it was written"
+            raise InputError(f"{message}; give resume=false to ask anew") from error
     return {
         name: rows[name]
         for name, digest in digests.items()

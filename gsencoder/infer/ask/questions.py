@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, about
+from gsencoder.core.files.written_files import check_written
 from gsencoder.data.truth.checked_files import read_checked_text
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.prompts import Task, check_question
@@ -110,6 +111,7 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
     """
     if not path.exists():
         return {}
+    check_written(path)
     try:
         lines = path.read_bytes().split(b"\n")
     except OSError as error:

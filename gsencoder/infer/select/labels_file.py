@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files.written_files import check_written
 from gsencoder.data.splats import load_property, load_splat, save_splat
 from gsencoder.infer.draw.boxes_ply import word_color
 from gsencoder.infer.localize.boxes import box_around
@@ -119,6 +120,7 @@ def read_labels(folder: str | Path) -> LabeledSplat:
         InputError: a file is missing or damaged, or they do not belong together.
     """
     path = Path(folder) / LABELS_JSON
+    check_written(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from gsencoder.core.files.picture_file import write_picture
 from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.views.pictures import picture_kinds, view_sheet
 from gsencoder.infer.views.selection import TargetScore, ViewSet
@@ -64,5 +64,5 @@ def write_pictures(
 ) -> None:
     """Each picture under the name that its row gives it, and the sheet of all."""
     for picture, row in zip(pictures, rows, strict=True):
-        Image.fromarray(picture).save(folder / row["picture"])
-    Image.fromarray(view_sheet(scene, views, pictures, boxes)).save(folder / SHEET)
+        write_picture(folder / row["picture"], picture)
+    write_picture(folder / SHEET, view_sheet(scene, views, pictures, boxes))

@@ -13,6 +13,7 @@ import torch
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.json_values import plain
+from gsencoder.core.files.written_files import check_written
 from gsencoder.core.pretrained import load_pretrained
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track, untracked
@@ -246,6 +247,8 @@ def open_tuned(folder: Path, model: Path, *, with_tokens: bool = False) -> Tuned
     _, processor, layout = open_processor(model, with_tokens=with_tokens)
     if not (folder / "adapter_model.safetensors").is_file():
         raise InputError(f"{WHAT}: {folder} has no adapter_model.safetensors; expected what tune wrote")
+    for name in ("adapter_model.safetensors", "adapter_config.json"):
+        check_written(folder / name)
     base = load_pretrained(AutoModelForImageTextToText, model.resolve(), WHAT)
     with quiet_peft():
         adapted = peft.PeftModel.from_pretrained(base, str(folder), use_safetensors=True)

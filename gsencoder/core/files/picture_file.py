@@ -1,0 +1,30 @@
+"""Pictures as files, written atomically."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsencoder.core.files.json_values import write_bytes
+
+
+def write_picture(path: Path, picture: Image.Image | np.ndarray, **options: Any) -> None:
+    """Writes a picture in the format of the file's suffix; an existing file is replaced.
+
+    It is encoded in memory: on a disk that is nearly full, encoders of Pillow that write into a file themselves pass
+    over what it did not take.
+
+    Args:
+        path: the file.
+        picture: a picture, or an array of one that Pillow takes: uint8 [H, W, 3], uint8 [H, W] or uint16 [H, W].
+        options: of Pillow's encoder.
+
+    Raises:
+        InputError: the folder is missing, the disk is full, or the system refuses.
+    """
+    held = io.BytesIO()
+    made = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
+    made.save(held, Image.registered_extensions()[path.suffix.lower()], **options)
+    write_bytes(path, held.getvalue())

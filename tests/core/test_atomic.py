@@ -1,0 +1,129 @@
+"""Atomic files: whole or as before, with one hidden name that the next run uses again."""
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files import atomic
+from gsencoder.core.files.archive import _write_safetensors, write_archive
+from gsencoder.core.files.atomic import atomic_file, locked
+from gsencoder.core.files.json_values import write_bytes
+from gsencoder.core.files.picture_file import write_picture
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from gsencoder.core.files.atomic import atomic_file
+with atomic_file(Path(sys.argv[1])) as stream:
+    stream.write(b"half")
+    stream.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="signals and locks")
+def test_what_a_killed_run_left_is_written_over_by_the_next(tmp_path: Path) -> None:
+    write_bytes(tmp_path / "a", b"earlier")
+    for _ in range(2):
+        subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "a")], check=False)
+        assert names(tmp_path) == [".a.tmp", "a"]
+        assert (tmp_path / "a").read_bytes() == b"earlier"
+    write_bytes(tmp_path / "a", b"n")
+    assert names(tmp_path) == ["a"]
+    assert (tmp_path / "a").read_bytes() == b"n"
+
+
+def test_two_that_write_one_file_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
+    with atomic_file(tmp_path / "a") as first:
+        first.write(b"first")
+        with atomic_file(tmp_path / "a") as second:
+            second.write(b"second")
+        assert (tmp_path / "a").read_bytes() == b"second"
+        write_bytes(tmp_path / "a", b"third")
+    assert (tmp_path / "a").read_bytes() == b"first"
+    assert names(tmp_path) == ["a"]
+
+
+def test_of_many_writers_every_reader_sees_one_whole(tmp_path: Path) -> None:
+    parts = [bytes([letter]) * 50_000 for letter in b"abcd"]
+    seen, begun = set(), threading.Barrier(4)
+
+    def write(part: bytes) -> None:
+        begun.wait()
+        for _ in range(25):
+            write_bytes(tmp_path / "x", part)
+            seen.add((tmp_path / "x").read_bytes())
+
+    threads = [threading.Thread(target=write, args=(part,)) for part in parts]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert seen <= set(parts)
+    assert names(tmp_path) == ["x"]
+
+
+def test_without_locks_each_writer_has_a_name_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(atomic, "fcntl", None)
+    with atomic_file(tmp_path / "a") as first:
+        write_bytes(tmp_path / "a", b"second")
+        first.write(b"first")
+    assert (tmp_path / "a").read_bytes() == b"first"
+    assert names(tmp_path) == ["a"]
+    with locked(tmp_path) as known:
+        assert not known
+
+
+@pytest.mark.skipif(not hasattr(os, "symlink"), reason="needs symbolic links")
+def test_a_link_in_the_place_of_the_hidden_file_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("mine")
+    (tmp_path / ".a.tmp").symlink_to("precious")
+    with pytest.raises(InputError, match="a: cannot write"):
+        write_bytes(tmp_path / "a", b"x")
+    assert (tmp_path / "precious").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["x" * 255, "é" * 127])
+def test_the_longest_names_can_be_written(name: str, tmp_path: Path) -> None:
+    write_bytes(tmp_path / name, b"x")
+    assert names(tmp_path) == [name]
+
+
+def test_archives_are_the_bytes_that_safetensors_writes(tmp_path: Path, rng: np.random.Generator) -> None:
+    kinds = ("uint8", "uint16", "float16", "int32", "float32", "float64", "int64")
+    shapes = ((), (0, 3), (5,), (2, 3, 4))
+    arrays = {
+        f'{"zaäb"[number % 4]}{number} "': rng.integers(0, 9, shape).astype(kind)
+        for number, (kind, shape) in enumerate((kind, shape) for kind in kinds for shape in shapes)
+    }
+    for each in ({}, arrays, dict(list(arrays.items())[5:6])):
+        text = {"gsencoder": '{"é": "\\n\u2028"}'}
+        _write_safetensors(tmp_path / "a", each, text)
+        assert (tmp_path / "a").read_bytes() == save(each, text)
+    write_archive(tmp_path / "b", {"a": np.arange(12).reshape(3, 4).T}, {})
+    assert names(tmp_path) == ["a", "b"]
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.JPG", "a.jpeg"])
+def test_pictures_are_written_in_the_format_of_their_suffix(name: str, tmp_path: Path) -> None:
+    from PIL import Image
+
+    pixels = np.full((6, 9, 3), 128, np.uint8)
+    write_picture(tmp_path / name, pixels)
+    with Image.open(tmp_path / name) as read:
+        assert read.format == ("PNG" if name.endswith("png") else "JPEG")
+        np.testing.assert_array_equal(np.asarray(read), pixels)
+    write_picture(tmp_path / "d.png", np.full((2, 3), 40_000, np.uint16))
+    with Image.open(tmp_path / "d.png") as read:
+        assert np.asarray(read).max() == 40_000

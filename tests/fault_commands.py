@@ -1,0 +1,233 @@
+"""Every command that writes, as short as it runs: what faults are put into, and the inputs that they all read."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+TRAIN = (
+    "train.steps=3",
+    "train.warmup=1",
+    "train.log_every=1",
+    "train.checkpoint_every=0",
+    "train.validate_every=0",
+    "sampling.gaussians=600",
+    "sampling.smallest=200",
+    "model.voxel=0.2",
+    "model.transformer.encoder_depths=[1,1]",
+    "model.transformer.encoder_channels=[16,16]",
+    "model.transformer.decoder_depths=[1]",
+    "model.transformer.decoder_channels=[16]",
+    "model.transformer.head_channels=16",
+    "model.transformer.patch=32",
+    "seeds.voxel=0.1",
+)
+VIEWS = ("choose.source=frames", "choose.candidates=4", "choose.count=2")
+QUESTION = "Where is the cube?"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command line without out=.
+
+    Attributes:
+        words: command and settings, of the folder of inputs.
+        out: name of what it writes; a file where it has an ending.
+        beside: what else may stay beside out= after a run that ended, and what of an unfinished one is read again.
+        server: whether it asks a server of chat.
+        several: whether it is of several scenes, each with a folder in out=.
+        packages: those that it needs beside the usual.
+    """
+
+    words: Callable[[Path], list[str]]
+    out: str = "out"
+    beside: tuple[str, ...] = ()
+    server: bool = False
+    several: bool = False
+    packages: tuple[str, ...] = ()
+
+
+def _fuse(given: Path, *more: str) -> list[str]:
+    return ["fuse", str(given / "room"), f"teacher.words={given / 'words.safetensors'}", "seeds.voxel=0.1", *more]
+
+
+def _of_room(command: str, *more: str) -> Callable[[Path], list[str]]:
+    return lambda given: [command, str(given / "room"), *more]
+
+
+def _of_features(command: str, *more: str) -> Callable[[Path], list[str]]:
+    return lambda given: [command, str(given / "features"), *more]
+
+
+def _words(given: Path) -> str:
+    return f"teacher.words={given / 'words.safetensors'}"
+
+
+CASES: dict[str, Case] = {
+    "fuse": Case(lambda given: _fuse(given)),
+    "fuse with a report": Case(lambda given: _fuse(given, "report=true")),
+    "fuse several": Case(lambda given: ["fuse", str(given / "rooms"), _words(given), "seeds.voxel=0.1"], several=True),
+    "encode": Case(_of_room("encode", "weights=GIVEN/trained", "seeds.voxel=0.1")),
+    "train": Case(
+        lambda given: ["train", str(given / "room"), _words(given), "tensorboard=true", *TRAIN],
+        beside=("out.prepared",),
+    ),
+    "reconstruct": Case(
+        _of_room(
+            "reconstruct", "optimize.steps=3", "holdout=3", "seeds.voxel=0.15", "optimize.sh_degree=0",
+            "checkpoint_every=0",
+        )
+    ),
+    "memory": Case(
+        lambda given: [
+            "memory", str(given / "room"), _words(given), "train.steps=3", "train.warmup=1", "memory.channels=4",
+            "pictures=1", "train.checkpoint_every=0", "seeds.voxel=0.1",
+        ]
+    ),
+    "localize": Case(_of_features("localize", "query=cube", "pictures=1", "report=true")),
+    "select": Case(_of_features("select", "query=cube")),
+    "views": Case(_of_features("views", "query=cube", "grid=[3,4]", *VIEWS)),
+    "ask": Case(_of_features("ask", f"question={QUESTION}", *VIEWS), server=True, packages=("openai",)),
+    "ask of a file": Case(
+        _of_features("ask", "questions=GIVEN/questions.jsonl", *VIEWS), server=True, packages=("openai",)
+    ),
+    "export of a memory": Case(
+        lambda given: ["export", f"memory={given / 'remembered'}"], out="out.onnx", packages=("onnx", "onnxscript")
+    ),
+    "pack": Case(_of_features("pack")),
+    "pack as npz": Case(_of_features("pack", "form=npz")),
+    "pack as ply": Case(_of_features("pack", "form=ply")),
+    "evaluate": Case(
+        lambda given: [
+            "evaluate", str(given / "room"), _words(given), "protocol.min_views=1", "protocol.min_pixels=1",
+            "seeds.voxel=0.1",
+        ]
+    ),
+    "evaluate instances": Case(
+        lambda given: ["evaluate", str(given / "room"), _words(given), "protocol=instances", "seeds.voxel=0.1"]
+    ),
+    "score": Case(
+        lambda given: [
+            "score", "recognition", f"predictions={given / 'named' / 'predictions.json'}",
+            f"truth={given / 'named' / 'truth.json'}", "ks=1",
+        ]
+    ),
+    "questions": Case(_of_room("questions", "min_pixels=10", "per_kind=2", "objects=2", "per_object=1")),
+    "tune": Case(
+        lambda given: [
+            "tune", str(given / "ScanQA_v1.0_train.json"), f"model={given / 'model'}",
+            f"features={given / 'tuned'}", *VIEWS, "image_side=64", "image_format=png", "lora.rank=4",
+            "train.steps=2", "train.accumulate=1", "train.warmup=1", "train.log_every=1", "train.checkpoint_every=0",
+        ],
+        beside=("out.prepared",),
+        packages=("peft", "transformers"),
+    ),
+    "tradeoff": Case(
+        lambda given: ["tradeoff", str(given / "room"), _words(given), "sweep.views=[2]", "sweep.rays_per_patch=[]",
+            "sweep.min_weight=[]", "sweep.stop_transmittance=[]", "sweep.energy=[]", "sweep.max_rank=[]",
+            "sweep.rounds=1", "seeds.voxel=0.15",]
+    ),
+    "view": Case(_of_features("view", "photographs=1"), out="out.html"),
+    "inspect": Case(_of_room("inspect")),
+    "repair": Case(lambda given: ["repair", str(given / "bad.ply")], out="out.ply"),
+    "demo": Case(lambda given: ["demo", "views=4", "width=80", "objects=2", "seeds.voxel=0.1"]),
+}  # fmt: skip
+"""By name; GIVEN stands for the folder of inputs."""
+EXHAUSTIVE: dict[str, Case] = {
+    "export": Case(
+        lambda given: ["export", f"weights={given / 'trained'}", "sizes=1,50"],
+        out="out.onnx",
+        packages=("onnx", "onnxscript"),
+    ),
+}
+"""Commands that take too long for a test."""
+
+
+def words_of(case: Case, given: Path) -> list[str]:
+    """The words of a case."""
+    return [word.replace("GIVEN", str(given)) for word in case.words(given)] + ["quiet=true"]
+
+
+def _run(*words: str) -> None:
+    from gsencoder.app import cli
+
+    if cli.main([*words, "quiet=true"]) != 0:
+        raise RuntimeError(f"{words[0]}: the inputs cannot be made")
+
+
+def _room(given: Path) -> None:
+    import shutil
+
+    from named_rooms import write_words
+
+    from gsencoder.data.synthetic.room import make_room
+    from gsencoder.data.synthetic.write import write_room
+
+    room = make_room(0, objects=2, views=3, width=64, height=48, spacing=0.15)
+    write_room(room, given / "room")
+    for name in ("a", "b"):
+        shutil.copytree(given / "room", given / "rooms" / name)
+    write_words(given / "words.safetensors", room)
+
+
+def _features(given: Path) -> None:
+    from asked_rooms import save_room
+
+    save_room(given / "features")
+    lines = [json.dumps({"id": str(number), "question": text}) for number, text in enumerate((QUESTION, "A crate?"))]
+    (given / "questions.jsonl").write_text("".join(line + "\n" for line in lines))
+
+
+def _trained(given: Path) -> None:
+    _run("train", str(given / "room"), _words(given), "tensorboard=false", *TRAIN, f"out={given / 'trained'}")
+
+
+def _remembered(given: Path) -> None:
+    _run(*CASES["memory"].words(given), f"out={given / 'remembered'}")
+
+
+def _named(given: Path) -> None:
+    asked = ("protocol=recognition", "seeds.voxel=0.1", f"out={given / 'named'}")
+    _run("evaluate", str(given / "room"), _words(given), *asked)
+
+
+def _model(given: Path) -> None:
+    from asked_rooms import save_room
+    from tiny_vlm import save_tiny_vlm
+
+    save_tiny_vlm(given / "model")
+    (given / "tuned").mkdir()
+    save_room(given / "tuned" / "room_a")
+    rows = [
+        {"scene_id": "room_a", "question_id": f"train-{number}", "question": text, "answers": [answer]}
+        for number, (text, answer) in enumerate([("What color is the crate?", "red"), ("How many crates?", "2")])
+    ]
+    (given / "ScanQA_v1.0_train.json").write_text(json.dumps(rows))
+
+
+def _bad_splat(given: Path) -> None:
+    from splat_samples import make_raw, ply_bytes, ply_columns
+
+    columns = ply_columns(make_raw(40))
+    columns["opacity"][:3] = float("nan")
+    (given / "bad.ply").write_bytes(ply_bytes(columns))
+
+
+INPUTS: dict[str, Callable[[Path], None]] = {
+    "room": _room,
+    "features": _features,
+    "trained": _trained,
+    "remembered": _remembered,
+    "named": _named,
+    "model": _model,
+    "bad.ply": _bad_splat,
+}
+NEEDED = {"encode": ("trained",), "export": ("trained",), "export of a memory": ("remembered",), "score": ("named",)}
+NEEDED |= {"tune": ("model",), "repair": ("bad.ply",)}
+
+
+def prepare(given: Path, name: str) -> None:
+    """Makes the inputs of a case that are not there."""
+    for each in ("room", "features", *NEEDED.get(name, ())):
+        if not (given / each).exists():
+            INPUTS[each](given)
