@@ -82,7 +82,8 @@ def keep_visible(b: Blend, depth: Float32[np.ndarray, "H W"], config: Visibility
     """B without the entries that fail: each is held against the depths that its row's rays meet, from the nearest to
     the farthest of them."""
     least, most = _interval(*_row_range(depth, b.lattice), config)
-    return b.keep_between(torch.from_numpy(least), torch.from_numpy(most))
+    device = b.weight.device
+    return b.keep_between(torch.from_numpy(least).to(device), torch.from_numpy(most).to(device))
 
 
 def ray_pixels(lattice: Lattice, width: int, height: int) -> tuple[Int32[np.ndarray, " j"], Int32[np.ndarray, " i"]]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32
 
 from gsencoder.core.added_options import with_added_options
@@ -208,7 +209,15 @@ class PreparedDataset:
             )
         return True
 
-    def prepare(self, scene: Scene, teacher: Teacher, config: PrepareConfig, *, source: Path = Path()) -> None:
+    def prepare(
+        self,
+        scene: Scene,
+        teacher: Teacher,
+        config: PrepareConfig,
+        *,
+        source: Path = Path(),
+        device: torch.device = torch.device("cpu"),
+    ) -> None:
         """Prepares one scene, and writes its file atomically.
 
         Args:
@@ -216,6 +225,7 @@ class PreparedDataset:
             teacher: a teacher of the dataset's space.
             config: settings of the preparation.
             source: the path that the scene was read from.
+            device: where B is made and multiplied.
 
         Raises:
             InputError: the scene cannot be fused, or the disk is full.
@@ -224,7 +234,8 @@ class PreparedDataset:
         path = self.scene_path(scene.name)
         path.parent.mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self.folder, prefix=MAPS_PREFIX) as maps:
-            prepare_scene(path, scene, CachedTeacher(teacher, Path(maps)), outputs, config, source=source)
+            cached = CachedTeacher(teacher, Path(maps))
+            prepare_scene(path, scene, cached, outputs, config, source=source, device=device)
 
     def check_kinds(self, teacher: Teacher) -> None:
         """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
@@ -313,6 +324,7 @@ def prepare_scene(
     config: PrepareConfig,
     *,
     source: Path = Path(),
+    device: torch.device = torch.device("cpu"),
 ) -> None:
     """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of every view.
 
@@ -323,6 +335,7 @@ def prepare_scene(
         outputs: output space of the dataset.
         config: settings of the preparation.
         source: the path that the scene was read from.
+        device: where B is made and multiplied.
 
     Raises:
         InputError: the scene cannot be fused, or the disk is full.
@@ -330,12 +343,18 @@ def prepare_scene(
     assert scene.gaussians is not None
     assert scene.views is not None
     fusion = replace(config.fusion, basis=outputs.basis is not None)
-    fused = fuse(scene, teacher, fusion, basis=outputs.basis)
-    rows = view_rows(scene, teacher, outputs, config)
+    fused = fuse(scene, teacher, fusion, basis=outputs.basis, device=device)
+    rows = view_rows(scene, teacher, outputs, config, device)
     write_prepared(path, scene, fused.features, outputs, rows, source=source, projections=fused.projections)
 
 
-def view_rows(scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig) -> list[ViewRows]:
+def view_rows(
+    scene: Scene,
+    teacher: Teacher,
+    outputs: OutputSpace,
+    config: PrepareConfig,
+    device: torch.device = torch.device("cpu"),
+) -> list[ViewRows]:
     """The matrix B of every view on the teacher's grid, pooled to cells of `config.render_cell` pixels, with the
     teacher's vectors; arguments are those of `prepare_scene`."""
     assert scene.gaussians is not None
@@ -344,10 +363,10 @@ def view_rows(scene: Scene, teacher: Teacher, outputs: OutputSpace, config: Prep
     rows = []
     for view in range(len(scene.views)):
         targets, valid, grid = _pool_map(teacher.feature_map(scene.views, view), outputs, config.render_cell)
-        b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid))
+        b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid), device=device)
         if scene.views.masks is not None:
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
-        arrays = (b.crow.numpy(), b.col.numpy(), b.weight.numpy())
+        arrays = tuple(each.cpu().numpy() for each in (b.crow, b.col, b.weight))
         rows.append(ViewRows(crow=arrays[0], col=arrays[1], weight=arrays[2], targets=targets, valid=valid))
     return rows
 
