@@ -14,7 +14,7 @@ export PYTHONDONTWRITEBYTECODE :=
 VIEWER := gsencoder/infer/viewer/static/viewer.js
 VIEWER_SOURCES := $(wildcard viewer/src/* viewer/*.json viewer/*.mjs viewer/*.py)
 
-.PHONY: help setup viewer demo test test-fast lint check clean
+.PHONY: help setup viewer demo test test-fast lint check gpu clean
 help:            ## what can be made
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
 
@@ -50,6 +50,9 @@ test-fast: setup ## the tests that take a second at most
 	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone and not slow" $(SLOW:%=--ignore=%)
 
 check: lint test ## what continuous integration runs
+
+gpu: setup       ## ten minutes on a GPU: parity with the CPU and costs, as gpu.md and gpu.json (runs on a CPU too: GPU=--small)
+	$(BIN)/python bench/gpu.py --out gpu.md $(GPU)
 
 clean:           ## remove the environment and every output
 	rm -rf $(VENV) outputs build dist
