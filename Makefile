@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 VIEWER := gsencoder/infer/viewer/static/viewer.js
 VIEWER_SOURCES := $(wildcard viewer/src/* viewer/*.json viewer/*.mjs viewer/*.py)
 
-.PHONY: help setup viewer demo test test-fast stability lint check clean
+.PHONY: help setup viewer demo test test-fast stability lint check gpu clean
 help:            ## what can be made
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
 
@@ -55,6 +55,9 @@ stability: setup ## searches for cases that break a promise of docs/numerics.md,
 	GSENCODER_STABILITY_EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q -n $(PROCESSES) tests/stability
 
 check: lint test ## what continuous integration runs
+
+gpu: setup       ## ten minutes on a GPU: parity with the CPU and costs, as gpu.md and gpu.json (runs on a CPU too: GPU=--small)
+	$(BIN)/python bench/gpu.py --out gpu.md $(GPU)
 
 clean:           ## remove the environment and every output
 	rm -rf $(VENV) outputs build dist

@@ -14,11 +14,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.runtime.clock import Clock, timed
+from gsencoder.core.runtime.device import choose_device
+from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.threads import ahead, thread_count
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
@@ -99,6 +102,7 @@ def fuse(
     basis: FeatureBasis | None = None,
     work: Path | None = None,
     sample_cells: bool = False,
+    device: Device | torch.device = "auto",
     track: Track = untracked,
 ) -> Fusion:
     """Lifts a teacher's maps onto the scene's Gaussians.
@@ -115,12 +119,15 @@ def fuse(
             scene's own, where `config` asks for one.
         work: folder for maps and running sums; an interrupted run is continued from it.
         sample_cells: whether cells of the maps of all views are collected, for `Fusion.sample`.
+        device: where B is made, held against depth maps, and multiplied; "auto" = a GPU if torch sees one. Features of
+            two devices are equal within rounding, so that `work` may be continued on another one.
         track: wraps the loops over views to show progress.
 
     Raises:
-        InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, or `work` holds
-            another run.
+        InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, no such device, or
+            `work` holds another run.
     """
+    chosen = device if isinstance(device, torch.device) else choose_device(device)
     gaussians, views = _checked(scene, teacher, basis)
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))
     rows = tuple(int(view) for view in even_indices(len(views), config.views or len(views)))
@@ -140,7 +147,7 @@ def fuse(
         sample = CellSample(len(rows))
         projections = ProjectionSums() if basis is not None else None
         columns = subspace.basis.rank if subspace.basis is not None else teacher.space.channels
-        sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table)
+        sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table, chosen)
         if checkpoint is not None:
             checkpoint.resume(sums)
         remaining = rows[sums.views :]
@@ -156,12 +163,14 @@ def fuse(
                     lift=config.lift,
                     visibility=config.visibility,
                     config=config.blend,
+                    device=chosen,
                 )
             return feature_map, matrix, of_view.seconds
 
-        # A costly teacher has threads of its own, and its maps may be large: one view after the other.
+        # A costly teacher has threads of its own, and its maps may be large: one view after the other, as on a GPU.
         workers = min(thread_count(), VIEWS_AT_ONCE)
-        prepared = ahead(prepare, remaining, workers) if teacher.cheap else map(prepare, remaining)
+        side_by_side = teacher.cheap and chosen.type == "cpu"
+        prepared = ahead(prepare, remaining, workers) if side_by_side else map(prepare, remaining)
         start, parts = time.perf_counter(), []
         with Clock().running() as of_sums:
             for view, (feature_map, matrix, seconds) in zip(track(remaining, "lifting views"), prepared, strict=True):

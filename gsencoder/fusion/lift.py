@@ -1,10 +1,11 @@
 """Lifting one view: the matrix that carries its map to the Gaussians, and the sums over all views."""
 
+from functools import partial
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 
 from gsencoder.core.runtime.clock import timed
 from gsencoder.fusion.basis import to_coordinates
@@ -60,7 +61,12 @@ class FeatureSums:
     """
 
     def __init__(
-        self, gaussians: int, columns: int, basis: FeatureBasis | None, table: Float32[np.ndarray, "C D"] | None
+        self,
+        gaussians: int,
+        columns: int,
+        basis: FeatureBasis | None,
+        table: Float32[np.ndarray, "C D"] | None,
+        device: torch.device = torch.device("cpu"),
     ) -> None:
         """Args:
         gaussians: number of rows.
@@ -68,13 +74,45 @@ class FeatureSums:
         basis: whose coordinates are summed; None = channels.
         table: that all maps share; None = dense maps, or maps with a table each. Sums are by its rows, unless it
             has so many that sums of vectors are far narrower.
+        device: where sums are, and the matrices of the views that are added.
         """
         self.basis, self.views, self._shared = basis, 0, table
         self.table = table if table is not None and _few_codes(len(table), columns) else None
-        # numpy, not torch, allocates what is large: its arrays lie in huge pages, which fill many times faster.
+        self.device = device
         width = columns if self.table is None else len(self.table)
-        self.sums: Float32[np.ndarray, "N columns"] = np.zeros((gaussians, width), np.float32)
-        self.weights: Float32[np.ndarray, " N"] = np.zeros(gaussians, np.float32)
+        self._sums, self._weights = self._zeros(gaussians, width), self._zeros(gaussians, 1)
+
+    @property
+    def sums(self) -> Float32[np.ndarray, "N columns"]:
+        return self._sums.cpu().numpy()
+
+    @sums.setter
+    def sums(self, values: Float32[np.ndarray, "N columns"]) -> None:
+        self._sums = self._tensor(values)
+
+    @property
+    def weights(self) -> Float32[np.ndarray, " N"]:
+        return self._weights[:, 0].cpu().numpy()
+
+    @weights.setter
+    def weights(self, values: Float32[np.ndarray, " N"]) -> None:
+        self._weights = self._tensor(values[:, None])
+
+    def _zeros(self, rows: int, columns: int) -> torch.Tensor:
+        """Zeros on the device; on a CPU allocated by numpy, whose large arrays lie in huge pages that fill many times
+        faster."""
+        if self.device.type == "cpu":
+            return torch.from_numpy(np.zeros((rows, columns), np.float32))
+        return torch.zeros(rows, columns, device=self.device)
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+
+    def _product(self, sums: torch.Tensor, table: Float32[np.ndarray, "C columns"]) -> torch.Tensor:
+        """Sums by code as sums of the vectors of a table."""
+        if self.device.type == "cpu":
+            return torch.from_numpy(sums.numpy() @ table)
+        return sums @ self._tensor(table)
 
     @timed("lift")
     def add(self, b: Blend, feature_map: FeatureMap, mask: Bool[np.ndarray, "H W"] | None) -> None:
@@ -82,7 +120,7 @@ class FeatureSums:
         self.views += 1
         share = row_mask(mask, b.lattice) if mask is not None else None
         if self.table is not None:
-            _lift_shares_into(b, feature_map, share, self.sums)
+            _lift_shares_into(b, feature_map, share, self._sums)
             return
         if feature_map.codes is not None:
             self._add_coded(b, feature_map, share)
@@ -99,8 +137,8 @@ class FeatureSums:
         maps = to_coordinates(self.basis, vectors) if self.basis is not None else vectors
         if scale.min() < 1:
             maps = maps * scale[:, None]
-        b.lift_into(torch.from_numpy(maps), torch.from_numpy(self.sums))
-        b.lift_into(torch.from_numpy(scale[:, None]), torch.from_numpy(self.weights[:, None]))
+        b.lift_into(self._tensor(maps), self._sums)
+        b.lift_into(self._tensor(scale[:, None]), self._weights)
 
     def _add_coded(self, b: Blend, feature_map: FeatureMap, share: Float32[np.ndarray, " P"] | None) -> None:
         """Adds a coded map with a table of its own: as one of a shared table, and turned into vectors at once."""
@@ -112,23 +150,23 @@ class FeatureSums:
         if not _few_codes(len(table), self.sums.shape[1]):
             self._add_vectors(b, _codes_in_mask(feature_map, share), vectors)
             return
-        sums = np.zeros((len(self.weights), len(table)), np.float32)
+        sums = self._zeros(len(self._weights), len(table))
         _lift_shares_into(b, feature_map, share, sums)
-        self.sums += sums @ vectors
-        self.weights += sums.sum(axis=1)
+        self._sums += self._product(sums, vectors)
+        self._weights += sums.sum(dim=1, keepdim=True)
 
     def _add_vectors(self, b: Blend, codes: Int32[np.ndarray, " P"], vectors: Float32[np.ndarray, "C columns"]) -> None:
         """Adds the vectors of codes, a few coordinates at a time: sums by code would be wider than those of vectors."""
         has_vector = (codes >= 0).astype(np.float32)
-        b.lift_into(torch.from_numpy(has_vector[:, None]), torch.from_numpy(self.weights[:, None]))
+        b.lift_into(self._tensor(has_vector[:, None]), self._weights)
         # The row behind the last one is what code −1 takes.
         padded = np.concatenate([vectors, np.zeros_like(vectors[:1])])
         width = max(1, BLOCK_VALUES // len(codes))
         for start in range(0, vectors.shape[1], width):
             maps = np.ascontiguousarray(padded[:, start : start + width])[codes]
-            sums = np.zeros((len(self.sums), maps.shape[1]), np.float32)
-            b.lift_into(torch.from_numpy(maps), torch.from_numpy(sums))
-            self.sums[:, start : start + width] += sums
+            sums = self._zeros(len(self._sums), maps.shape[1])
+            b.lift_into(self._tensor(maps), sums)
+            self._sums[:, start : start + width] += sums
 
     def _add_mixed(self, b: Blend, feature_map: FeatureMap, share: Float32[np.ndarray, " P"] | None) -> None:
         """Adds shares of a table that has too many rows for sums by code."""
@@ -137,8 +175,8 @@ class FeatureSums:
         shares = feature_map.shares.reshape(-1, len(self._shared))
         if share is not None:
             shares = shares * share[:, None]
-        b.lift_into(torch.from_numpy(shares @ self._in_columns(self._shared)), torch.from_numpy(self.sums))
-        b.lift_into(torch.from_numpy(shares.sum(axis=1, keepdims=True)), torch.from_numpy(self.weights[:, None]))
+        b.lift_into(self._tensor(shares @ self._in_columns(self._shared)), self._sums)
+        b.lift_into(self._tensor(shares.sum(axis=1, keepdims=True)), self._weights)
 
     def _in_columns(self, table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C columns"]:
         return to_coordinates(self.basis, table) if self.basis is not None else table
@@ -150,7 +188,7 @@ class FeatureSums:
             weights, sums = self.weights, self.sums
         else:
             weights = self.sums.sum(axis=1)
-            sums = self.sums @ self._in_columns(self.table)
+            sums = self._product(self._sums, self._in_columns(self.table)).cpu().numpy()
         # A row whose whole weight is below the smallest normal number would divide into noise or infinity.
         seen = weights > np.finfo(np.float32).tiny
         features = np.divide(sums, weights[:, None], where=seen[:, None], out=np.zeros_like(sums))
@@ -173,16 +211,16 @@ def _lift_shares_into(
     b: Blend,
     feature_map: FeatureMap,
     share: Float32[np.ndarray, " P"] | None,
-    sums: Float32[np.ndarray, "N C"],
+    sums: Float[torch.Tensor, "N C"],
 ) -> None:
     """Adds Bᵀ @ shares of a coded or mixed map, with the share of each row in the mask."""
     if feature_map.shares is not None:
         shares = feature_map.shares.reshape(-1, sums.shape[1])
         if share is not None:
             shares = shares * share[:, None]
-        b.lift_into(torch.from_numpy(shares), torch.from_numpy(sums))
+        b.lift_into(torch.from_numpy(shares).to(sums.device), sums)
         return
-    b.lift_codes_into(torch.from_numpy(_codes_in_mask(feature_map, share)), torch.from_numpy(sums))
+    b.lift_codes_into(torch.from_numpy(_codes_in_mask(feature_map, share)).to(sums.device), sums)
 
 
 def view_matrix(
@@ -194,6 +232,7 @@ def view_matrix(
     lift: Literal["blend", "center"],
     visibility: VisibilityConfig,
     config: BlendConfig,
+    device: str | torch.device = "cpu",
 ) -> Blend:
     """The matrix that a view's map is lifted with: B of its cells, or one entry for each visible center.
 
@@ -205,15 +244,17 @@ def view_matrix(
         lift: blend or center.
         visibility: what hides an entry, resolved (`visibility.resolve`).
         config: knobs of B.
+        device: where B is made and held against depth maps; centers are tested on the CPU, and go there as a matrix.
     """
     if lift == "center":
-        depths = timed("blend")(_depth_maps)(gaussians, views, view, visibility, config, None)
-        return timed("lift")(center_matrix)(gaussians, views, view, feature_map, depths, visibility, config)
+        depths = timed("blend")(_depth_maps)(gaussians, views, view, visibility, config, device, None)
+        matrix = timed("lift")(center_matrix)(gaussians, views, view, feature_map, depths, visibility, config)
+        return matrix.to(device)
     rays = capped(config, feature_map)
+    make = partial(timed("blend")(blend), gaussians, views.cameras, view, like=feature_map, config=rays, device=device)
     if visibility.against == ("sensor",):
-        between = timed("visibility")(_between)(views, view, feature_map, visibility, rays)
-        return timed("blend")(blend)(gaussians, views.cameras, view, like=feature_map, between=between, config=rays)
-    b = timed("blend")(blend)(gaussians, views.cameras, view, like=feature_map, config=rays)
+        return make(between=timed("visibility")(_between)(views, view, feature_map, visibility, rays))
+    b = make()
     return _without_hidden(b, gaussians, views, view, visibility, config)
 
 
@@ -232,7 +273,7 @@ def _without_hidden(
     b: Blend, gaussians: Gaussians, views: Views, view: int, visibility: VisibilityConfig, config: BlendConfig
 ) -> Blend:
     """The matrix without the entries of Gaussians that a depth map hides."""
-    for depth in _depth_maps(gaussians, views, view, visibility, config, b):
+    for depth in _depth_maps(gaussians, views, view, visibility, config, b.weight.device, b):
         b = keep_visible(b, depth, visibility)
     return b
 
@@ -247,7 +288,13 @@ def capped(config: BlendConfig, feature_map: FeatureMap) -> BlendConfig:
 
 
 def _depth_maps(
-    gaussians: Gaussians, views: Views, view: int, visibility: VisibilityConfig, config: BlendConfig, b: Blend | None
+    gaussians: Gaussians,
+    views: Views,
+    view: int,
+    visibility: VisibilityConfig,
+    config: BlendConfig,
+    device: str | torch.device,
+    b: Blend | None,
 ) -> list[Float32[np.ndarray, "H W"]]:
     maps = []
     for source in visibility.against:
@@ -257,7 +304,7 @@ def _depth_maps(
         else:
             size = int(views.cameras.heights[view]), int(views.cameras.widths[view])
             pixels = b if b is not None and b.lattice.side == 1 and b.shape == size else None
-            pixels = pixels or blend(gaussians, views.cameras, view, config=config)
+            pixels = pixels or blend(gaussians, views.cameras, view, config=config, device=device)
             maps.append(depth_image(pixels))
     return maps
 

@@ -89,7 +89,8 @@ def visible_depths(
 def keep_visible(b: Blend, depth: Float32[np.ndarray, "H W"], config: VisibilityConfig) -> Blend:
     """B without the entries that fail (`visible_depths`)."""
     least, most = visible_depths(depth, b.lattice, config)
-    return b.keep_between(torch.from_numpy(least), torch.from_numpy(most))
+    device = b.weight.device
+    return b.keep_between(torch.from_numpy(least).to(device), torch.from_numpy(most).to(device))
 
 
 def ray_pixels(lattice: Lattice, width: int, height: int) -> tuple[Int32[np.ndarray, " j"], Int32[np.ndarray, " i"]]:

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
-from gsencoder.render import reference
+from gsencoder.render import blend_torch, reference
 from gsencoder.render.rays import Lattice, grid_lattice, patch_lattice, strided_lattice
 from gsencoder.types import Cameras, FeatureMap, Gaussians
 
-Backend = Literal["auto", "cpu", "reference"]
+Backend = Literal["auto", "cpu", "torch", "reference"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +32,8 @@ class BlendConfig:
         stop_transmittance: a ray ends where less than this share of it is left.
         near: smallest depth, world units.
         eps2d: low-pass variance added to every projected Gaussian, pixels².
-        backend: "cpu" (numba), "reference" (plain torch, any device and float type), or "auto".
+        backend: "cpu" (numba), "torch" (batches of tiles, any device and float type), "reference" (its plain twin, tile
+            by tile), or "auto": "cpu" on a CPU in float32, else "torch".
     """
 
     rays_per_patch: int = field(default=64, metadata={"help": "rays averaged into one patch: 1, 4, 9, 16, …"})
@@ -40,7 +41,7 @@ class BlendConfig:
     stop_transmittance: float = field(default=1e-4, metadata={"help": "transmittance at which a ray ends"})
     near: float = field(default=0.01, metadata={"help": "near plane in world units"})
     eps2d: float = field(default=0.3, metadata={"help": "low-pass variance of projected Gaussians in pixels²"})
-    backend: Backend = field(default="auto", metadata={"help": "cpu (numba), reference (torch), or auto"})
+    backend: Backend = field(default="auto", metadata={"help": "cpu (numba), torch, reference (its twin), or auto"})
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_weight < 1:
@@ -93,13 +94,23 @@ class Blend:
     @cached_property
     def transposed(self) -> tuple[Int64[Tensor, " M"], Int64[Tensor, " M_plus_1"], Int32[Tensor, " nnz"], Tensor]:
         """The M columns that occur, and Bᵀ restricted to them: (columns, crow, row, weight)."""
-        if self.weight.device.type == "cpu":
+        if self._on_numba:
             from gsencoder.render import sparse_cpu as products
 
             arrays = (self.crow.numpy(), self.col.numpy(), self.weight.numpy())
             columns, crow, row, weight = map(torch.from_numpy, products.transpose(*arrays, self.gaussians))
             return columns, crow, row, weight
         return reference.transpose(self.crow, self.col, self.weight)
+
+    @property
+    def _on_numba(self) -> bool:
+        """Whether products are numba's; with the backend "torch" they are torch's on a CPU as well."""
+        return self.weight.device.type == "cpu" and self.config.backend != "torch"
+
+    def to(self, device: str | torch.device) -> "Blend":
+        """The blend with its tensors on a device."""
+        crow, col, weight, depths = (each.to(device) for each in (self.crow, self.col, self.weight, self.depths))
+        return Blend(crow, col, weight, depths, self.lattice, self.config)
 
     @property
     def columns(self) -> Int64[Tensor, " M"]:
@@ -150,20 +161,20 @@ class Blend:
     def lift_into(self, maps: Float[Tensor, "P D"], sums: Float[Tensor, "N D"]) -> None:
         """Adds Bᵀ @ maps to `sums`, touching only the rows of Gaussians that the view sees."""
         columns, crow, row, weight = self.transposed
-        _multiply_into(crow, row, weight, maps, columns, sums)
+        _multiply_into(crow, row, weight, maps, columns, sums, on_numba=self._on_numba)
 
     def lift_codes_into(self, codes: Int32[Tensor, " P"], sums: Float[Tensor, "N C"]) -> None:
         """`lift_into` for maps that are one code a row: adds each entry's weight to sums[Gaussian, code].
 
         Rows of code −1 give nothing. By linearity `sums @ table` is what lifting `table[codes]` would have given.
         """
-        if codes.device.type == "cpu":
+        if self._on_numba:
             from gsencoder.render import sparse_cpu as products
 
             products.add_codes(*(part.numpy() for part in (self.crow, self.col, self.weight, codes, sums)))
         else:
-            one_hot = torch.nn.functional.one_hot(codes.long() + 1, sums.shape[1] + 1)[:, 1:].to(sums.dtype)
-            self.lift_into(one_hot, sums)
+            columns, crow, row, weight = self.transposed
+            reference.count_codes(crow, row, weight, codes, columns, sums)
 
     def keep(self, entries: Tensor) -> "Blend":
         """The same blend with only the entries where the boolean mask `entries` is True."""
@@ -174,7 +185,7 @@ class Blend:
 
     def keep_between(self, least: Float[Tensor, " P"], most: Float[Tensor, " P"]) -> "Blend":
         """The same blend with only the Gaussians whose depth lies from `least` to `most` of their row."""
-        if self.crow.device.type == "cpu":
+        if self._on_numba:
             from gsencoder.render import sparse_cpu as products
 
             arrays = (self.crow, self.col, self.weight, self.depths, least, most)
@@ -186,13 +197,16 @@ class Blend:
         return self.keep((z >= least[row]) & (z <= most[row]))
 
 
-def _multiply_into(crow: Tensor, col: Tensor, weight: Tensor, values: Tensor, targets: Tensor, out: Tensor) -> None:
-    if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
+def _multiply_into(
+    crow: Tensor, col: Tensor, weight: Tensor, values: Tensor, targets: Tensor, out: Tensor, *, on_numba: bool
+) -> None:
+    if on_numba and values.dtype in (torch.float32, torch.float64):
         from gsencoder.render import sparse_cpu as products
 
         arrays = (crow, col, weight, values.detach().contiguous(), targets, out)
         products.product(*(array.numpy() for array in arrays))
     else:
+        # Targets are distinct: no two terms meet, so the order of additions does not depend on the device.
         out.index_add_(0, targets, reference.product(crow, col, weight, values.detach()))
 
 
@@ -202,7 +216,7 @@ class _Render(torch.autograd.Function):
         ctx.blend = blend
         out = values.new_zeros(blend.rows, values.shape[1])
         rows = torch.arange(blend.rows, device=values.device)
-        _multiply_into(blend.crow, blend.col, blend.weight, values, rows, out)
+        _multiply_into(blend.crow, blend.col, blend.weight, values, rows, out, on_numba=blend._on_numba)
         return out
 
     @staticmethod
@@ -248,11 +262,11 @@ def blend(
         between: smallest and largest depth of the entries of each row, as `Blend.keep_between` takes them: it gives the
             same, and what lies behind is not composited at all.
         config: accuracy knobs.
-        device: where the result lives; other than "cpu" needs the torch backend.
-        dtype: float type of the reference backend; the numba backend computes in float64 and stores float32.
+        device: where the result is made and lives; the numba backend computes on a CPU alone.
+        dtype: float type of the torch backends; the numba backend computes in float64 and stores float32.
 
     Raises:
-        InputError: no such view, or knobs out of range.
+        InputError: no such view, knobs out of range, or the numba backend for another device.
     """
     if not -len(cameras) <= view < len(cameras):
         raise InputError(f"view: expected 0 to {len(cameras) - 1}, got {view}")
@@ -264,16 +278,20 @@ def blend(
     else:
         lattice = strided_lattice(width, height, stride)
     backend = config.backend
+    on_cpu = torch.device(device).type == "cpu"
     if backend == "auto":
-        backend = "cpu" if torch.device(device).type == "cpu" and dtype == torch.float32 else "reference"
+        backend = "cpu" if on_cpu and dtype == torch.float32 else "torch"
     if backend == "cpu":
+        if not on_cpu:
+            raise InputError(f"blend.backend: cpu computes on a CPU alone, got device {device}; use auto or torch")
         return _blend_cpu(gaussians, cameras, view, lattice, between, config)
-    projected = _project(gaussians, cameras, view, config, device, dtype)
+    # A projection costs little, so that float64 is affordable also where a GPU is slow in it; see `blend_torch`.
+    precise = dtype if backend == "reference" else torch.float64
+    projected = _project(gaussians, cameras, view, config, device, precise)
     opacities = torch.as_tensor(gaussians.opacities, device=device, dtype=dtype)
-    crow, col, weight = reference.blend_weights(
-        projected, opacities, lattice, stop=config.stop_transmittance, keep=config.min_weight
-    )
-    b = Blend(crow, col, weight, projected.depths, lattice, config)
+    make = reference.blend_weights if backend == "reference" else blend_torch.blend_weights
+    crow, col, weight = make(projected, opacities, lattice, stop=config.stop_transmittance, keep=config.min_weight)
+    b = Blend(crow, col, weight, projected.depths.to(dtype), lattice, config)
     if between is None:
         return b
     return b.keep_between(*(torch.from_numpy(depths).to(b.depths) for depths in between))

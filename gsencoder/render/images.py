@@ -47,7 +47,7 @@ def render_image(
 
 def depth_image(b: Blend, min_alpha: float = 0.5) -> Float32[np.ndarray, "H W"]:
     """Expected depth as a map in world units; 0 = none, where alpha is below `min_alpha`."""
-    return torch.where(b.alpha >= min_alpha, b.depth, 0).reshape(b.shape).float().numpy()
+    return torch.where(b.alpha >= min_alpha, b.depth, 0).reshape(b.shape).float().cpu().numpy()
 
 
 class RenderedImages(Sequence[UInt8[np.ndarray, "H W 3"]]):

@@ -1,7 +1,7 @@
 """The plain twin of the fast backends: blending weights and sparse products in torch alone, any device and float type.
 
-It says what B is in few lines and in float64 serves tests as a check of the numba kernels; on a GPU it is also what
-runs until kernels are at hand.
+It says what B is in few lines and in float64 serves tests as a check of the fast backends. Its products are also those
+that run on a GPU.
 """
 
 from collections.abc import Iterator
@@ -34,8 +34,10 @@ def blend_weights(
     for rays, members in _tiles(projected, lattice):
         w = _composite(projected, opacities, members, _pixels(rays, lattice, opacities), stop)
         cell = (rays[:, 1] // side) * lattice.width + rays[:, 0] // side
-        cells, slot = torch.unique(cell, return_inverse=True)
-        pooled = w.new_zeros(len(cells), len(members)).index_add_(0, slot, w) / side**2
+        # Sorted sums, since `index_add_` adds in another order each time on a GPU.
+        cell, order = torch.sort(cell, stable=True)
+        cells, uses = torch.unique_consecutive(cell, return_counts=True)
+        pooled = torch.segment_reduce(w[order], "sum", lengths=uses, axis=0) / side**2
         at, member = (pooled >= keep if keep > 0 else pooled > 0).nonzero(as_tuple=True)
         rows.append(cells[at])
         cols.append(members[member])
@@ -123,3 +125,32 @@ def product(crow: Tensor, col: Tensor, weight: Tensor, values: Float[Tensor, "n 
         for part in values.split(16, dim=1)
     ]
     return torch.cat(parts, dim=1)
+
+
+def count_codes(
+    crow: Tensor,
+    col: Tensor,
+    weight: Tensor,
+    codes: Int32[Tensor, " n"],
+    targets: Int64[Tensor, " rows"],
+    out: Float[Tensor, "N C"],
+) -> None:
+    """Adds CSR @ one_hot(codes) to out[targets], by sums over entries sorted by target and code; code −1 gives nothing.
+
+    Args:
+        crow: row starts.
+        col: column of each entry.
+        weight: of each entry.
+        codes: of the columns, −1 or below C.
+        targets: distinct, of the rows.
+        out: what is added to.
+    """
+    row = torch.repeat_interleave(torch.arange(len(crow) - 1, device=crow.device), crow.diff())
+    code = codes[col.long()].long()
+    coded = code >= 0
+    key, order = torch.sort(targets[row[coded]] * out.shape[1] + code[coded], stable=True)
+    if not len(key):
+        return
+    keys, uses = torch.unique_consecutive(key, return_counts=True)
+    sums = torch.segment_reduce(weight[coded][order].to(out.dtype), "sum", lengths=uses, axis=0)
+    out.view(-1).index_add_(0, keys, sums)

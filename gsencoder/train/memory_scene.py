@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, advised
@@ -77,6 +78,7 @@ def prepare_memory(
     *,
     predicted: GaussianFeatures | None = None,
     sample: int = 0,
+    device: torch.device = torch.device("cpu"),
     track: Track = untracked,
 ) -> MemoryScene:
     """Prepares a scene for one teacher, or opens what was prepared in this folder before.
@@ -89,6 +91,7 @@ def prepare_memory(
         prepare: settings of the fusion and of the rows.
         predicted: features of the teacher's space that an encoder predicts for the scene; None = they are fused.
         sample: number of raw features that are stored beside the bank for `open_raw_sample`, or all if there are fewer.
+        device: where B is made and multiplied.
         track: wraps loops to show progress.
 
     Raises:
@@ -112,13 +115,13 @@ def prepare_memory(
         return made
     maps = folder / MAPS_FOLDER
     work = None if teacher.cheap else maps
-    features = predicted or fuse(scene, teacher, prepare.fusion, work=work, track=track).features
+    features = predicted or fuse(scene, teacher, prepare.fusion, work=work, device=device, track=track).features
     outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
     source = _source(teacher, folder)
     maps.mkdir(parents=True, exist_ok=True)
     components = build_bank(stream, features.space, features.mean, bank)
     assert scene.views is not None
-    rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)))
+    rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)), device)
     folder.mkdir(parents=True, exist_ok=True)
     _sample_raw(folder, stream, features.space, sample)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())

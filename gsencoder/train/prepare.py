@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Int64
 
 from gsencoder.core.added_options import with_added_options
@@ -236,7 +237,15 @@ class PreparedDataset:
             )
         return True
 
-    def prepare(self, scene: Scene, teacher: Teacher, config: PrepareConfig, *, source: Path = Path()) -> None:
+    def prepare(
+        self,
+        scene: Scene,
+        teacher: Teacher,
+        config: PrepareConfig,
+        *,
+        source: Path = Path(),
+        device: torch.device = torch.device("cpu"),
+    ) -> None:
         """Prepares one scene, and writes its file atomically.
 
         Args:
@@ -244,6 +253,7 @@ class PreparedDataset:
             teacher: a teacher of the dataset's space.
             config: settings of the preparation.
             source: the path that the scene was read from.
+            device: where B is made and multiplied.
 
         Raises:
             InputError: the scene cannot be fused, or the disk is full.
@@ -252,7 +262,8 @@ class PreparedDataset:
         path = self.scene_path(scene.name)
         path.parent.mkdir(exist_ok=True)
         with self._maps() as maps:
-            prepare_scene(path, scene, CachedTeacher(teacher, maps), outputs, config, source=source)
+            cached = CachedTeacher(teacher, maps)
+            prepare_scene(path, scene, cached, outputs, config, source=source, device=device)
 
     def check_kinds(self, teacher: Teacher) -> None:
         """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
@@ -376,6 +387,7 @@ def prepare_scene(
     config: PrepareConfig,
     *,
     source: Path = Path(),
+    device: torch.device = torch.device("cpu"),
 ) -> None:
     """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of `config.render_views`.
 
@@ -386,6 +398,7 @@ def prepare_scene(
         outputs: output space of the dataset.
         config: settings of the preparation.
         source: the path that the scene was read from.
+        device: where B is made and multiplied.
 
     Raises:
         InputError: the scene cannot be fused, or the disk is full.
@@ -393,15 +406,20 @@ def prepare_scene(
     assert scene.gaussians is not None
     assert scene.views is not None
     fusion = replace(config.fusion, basis=outputs.basis is not None)
-    fused = fuse(scene, teacher, fusion, basis=outputs.basis)
+    fused = fuse(scene, teacher, fusion, basis=outputs.basis, device=device)
     chosen = even_indices(len(scene.views), config.render_views or len(scene.views))
-    rows = view_rows(scene, teacher, outputs, config, chosen)
+    rows = view_rows(scene, teacher, outputs, config, chosen, device)
     with_rows = replace(scene, views=scene.views.select(chosen))
     write_prepared(path, with_rows, fused.features, outputs, rows, source=source, projections=fused.projections)
 
 
 def view_rows(
-    scene: Scene, teacher: Teacher, outputs: OutputSpace, config: PrepareConfig, views: Int64[np.ndarray, " v"]
+    scene: Scene,
+    teacher: Teacher,
+    outputs: OutputSpace,
+    config: PrepareConfig,
+    views: Int64[np.ndarray, " v"],
+    device: torch.device = torch.device("cpu"),
 ) -> list[ViewRows]:
     """The matrices B of some views on the teacher's grid, pooled to cells of `config.render_cell` pixels, with the
     teacher's vectors; the other arguments are those of `prepare_scene`."""
@@ -411,10 +429,10 @@ def view_rows(
     rows = []
     for view in views.tolist():
         targets, valid, grid = _pool_map(teacher.feature_map(scene.views, view), outputs, config.render_cell)
-        b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid))
+        b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid), device=device)
         if scene.views.masks is not None:
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
-        arrays = (b.crow.numpy(), b.col.numpy(), b.weight.numpy())
+        arrays = tuple(each.cpu().numpy() for each in (b.crow, b.col, b.weight))
         rows.append(ViewRows(crow=arrays[0], col=arrays[1], weight=arrays[2], targets=targets, valid=valid))
     return rows
 

@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from gsencoder.core.added_options import TRAINED
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files.json_values import plain
@@ -97,6 +99,7 @@ def prepare_scenes(
     voxel: float,
     heads: Sequence[str] = (),
     process: ProcessRank = ProcessRank(),
+    device: torch.device = torch.device("cpu"),
     track: Track = untracked,
 ) -> dict[str, PreparedDataset]:
     """Prepares the scenes that are not in `folder` yet; the processes of a training share the work.
@@ -113,6 +116,7 @@ def prepare_scenes(
             unknown.
         heads: names of the teacher's adapter heads that are measured over the dataset.
         process: rank of this process.
+        device: of this process, where B is made and multiplied.
         track: wraps loops to show progress.
 
     Returns:
@@ -163,7 +167,7 @@ def prepare_scenes(
         for path in assigned:
             trained = path in training
             try:
-                _prepare_scene(path, missing[path], datasets, reader, config, trained=trained, optional=several)
+                _prepare_scene(path, missing[path], datasets, reader, config, device, trained=trained, optional=several)
             except InputError as error:
                 # The error is raised when all processes have ended their shares, which may take hours.
                 if process.world_size > 1:
@@ -222,6 +226,7 @@ def _prepare_scene(
     datasets: Mapping[str, PreparedDataset],
     reader: "_SceneReader",
     config: SourceConfig,
+    device: torch.device,
     *,
     trained: bool,
     optional: bool,
@@ -251,7 +256,7 @@ def _prepare_scene(
                 datasets[name].check_kinds(teacher)
             try:
                 with config.typed_options(name):
-                    datasets[name].prepare(scene, teacher, config.prepare, source=path)
+                    datasets[name].prepare(scene, teacher, config.prepare, source=path, device=device)
             except MissingInput:
                 if not optional:
                     raise

@@ -133,7 +133,7 @@ def train(
         work: folder for the checkpoint and the log; created if it does not exist.
         held_out: scenes on which `validate` scores the encoder.
         prepared: folder of prepared scenes, which runs with the same sources can share; None = a folder in `work`.
-        device: the device on which the encoder is trained.
+        device: the device on which scenes are prepared and the encoder is trained.
         validate: scores the encoder during training, for example `gsencoder.evaluate.validation.validate_names`.
         track: wraps loops to show progress.
 
@@ -161,6 +161,7 @@ def train(
                 voxel=voxel,
                 heads=asked_heads(config.heads, config.teachers_by_name),
                 process=process,
+                device=chosen_device,
                 track=track,
             )
         return fit(

@@ -67,9 +67,10 @@ def dense(b: Blend) -> np.ndarray:
     return out
 
 
-BACKENDS = ["cpu", "reference"]
-# The numba backend computes in float64 and stores float32; its twin is asked for float64, so that both decide alike.
-DTYPE = {"cpu": torch.float32, "reference": torch.float64}
+BACKENDS = ["cpu", "torch", "reference"]
+# The numba backend computes in float64 and stores float32; the others are asked for float64, so that all decide alike.
+DTYPE = {"cpu": torch.float32, "torch": torch.float64, "reference": torch.float64}
+FAST = ["cpu", "torch"]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -92,23 +93,25 @@ def test_weights_colors_and_depths_agree_with_the_definition(backend: str, seed:
     np.testing.assert_allclose(b.alpha.numpy()[sure], alpha[sure], atol=1e-4)
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("rays", [1, 4, 9, 49])
-def test_the_fast_backend_agrees_with_its_float64_twin_on_patches(rays: int) -> None:
+def test_the_fast_backends_agree_with_their_float64_twin_on_patches(rays: int, backend: str) -> None:
     g, camera = random_gaussians(400, 5), front_camera(90, 70)
-    config = BlendConfig(rays_per_patch=rays)
-    fast = blend(g, camera, patch=7, config=config)
+    config = BlendConfig(rays_per_patch=rays, backend=backend)
+    fast = blend(g, camera, patch=7, config=config, dtype=DTYPE[backend])
     slow = blend(g, camera, patch=7, config=replace(config, backend="reference"), dtype=torch.float64)
     np.testing.assert_allclose(dense(fast), dense(slow), atol=1e-6)
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("side", [1, 2, 4])
 @pytest.mark.parametrize("stop", [1e-4, 0.1])
-def test_rays_that_stop_in_any_order_agree_with_the_twin(side: int, stop: float) -> None:
+def test_rays_that_stop_in_any_order_agree_with_the_twin(side: int, stop: float, backend: str) -> None:
     """Opaque Gaussians no larger than a tile: its rays end one after the other, at its borders and inside."""
     g = random_gaussians(500, 8, log_scale=-2.0)
     g = replace(g, opacities=np.float32(0.5) + g.opacities / 2)
-    config = BlendConfig(rays_per_patch=side * side, stop_transmittance=stop)
-    fast = blend(g, front_camera(64, 48), patch=side, config=config)
+    config = BlendConfig(rays_per_patch=side * side, stop_transmittance=stop, backend=backend)
+    fast = blend(g, front_camera(64, 48), patch=side, config=config, dtype=DTYPE[backend])
     slow = blend(g, front_camera(64, 48), patch=side, config=replace(config, backend="reference"), dtype=torch.float64)
     assert (fast.alpha > 1 - 2 * stop).float().mean() > 0.2
     np.testing.assert_allclose(dense(fast), dense(slow), atol=1e-6)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pretend_device import pretended_device
 from training_scenes import PREPARE, TABLE, DenseSideTeacher, SideTeacher, prepared, samples, scene
 
 from gsencoder.fusion.fuse import FuseConfig
@@ -28,6 +29,27 @@ def test_targets_are_centered_and_scaled_only_where_that_is_asked(
     if made.codebook is not None:
         order = np.lexsort(TABLE.T[::-1])
         np.testing.assert_allclose(made.codebook, expected[order], atol=1e-5)
+
+
+@pytest.mark.parametrize("teacher", [SideTeacher(), DenseSideTeacher()], ids=["coded", "dense"])
+def test_a_scene_that_is_prepared_on_another_device_is_the_same_within_rounding(
+    tmp_path: Path, teacher: SideTeacher
+) -> None:
+    dataset, _ = prepared(tmp_path, count=1)
+    outputs = dataset.load_space()[0]
+    prepare_scene(tmp_path / "cpu.safetensors", scene(0), teacher, outputs, PREPARE)
+    with pretended_device() as device:
+        prepare_scene(tmp_path / "device.safetensors", scene(0), teacher, outputs, PREPARE, device=device)
+    here, there = PreparedScene(tmp_path / "cpu.safetensors"), PreparedScene(tmp_path / "device.safetensors")
+    rows = np.arange(len(here))
+    np.testing.assert_allclose(there.weights, here.weights, rtol=1e-4, atol=1e-4)
+    seen = np.asarray(here.weights) > 1e-3
+    np.testing.assert_allclose(there.targets(rows)[seen], here.targets(rows)[seen], atol=2e-3)
+    for view in range(2):
+        one, other = here.view(view), there.view(view)
+        np.testing.assert_array_equal(other.crow, one.crow)
+        np.testing.assert_array_equal(other.col, one.col)
+        np.testing.assert_allclose(other.weight, one.weight, atol=2e-4)  # They are stored as float16.
 
 
 def test_faint_weights_are_left_out_of_the_rows_of_the_render_loss(tmp_path: Path) -> None:

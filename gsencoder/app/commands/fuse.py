@@ -17,6 +17,8 @@ from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.device import choose_device
+from gsencoder.core.runtime.device_names import Device
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
@@ -67,6 +69,9 @@ class FuseCommandConfig(CommonConfig):
         default=0,
         metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
     )
+    device: Device = field(
+        default="auto", metadata={"help": "where maps are lifted, cuda or cpu; auto = cuda if torch sees a GPU"}
+    )
     report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
@@ -80,6 +85,7 @@ class FuseCommandConfig(CommonConfig):
 
 def run(config: FuseCommandConfig, summary: Summary) -> None:
     """Fuses one scene into out=, or each of several into the folder OUT/NAME."""
+    choose_device(config.device)  # A missing device is an error before anything is read.
     paths = find_scenes(config.paths)
     with summary.step("teacher"):
         words = words_of(config.teacher, config.text)
@@ -171,7 +177,16 @@ def fuse_scene(
     """Fuses, in a given basis or in one of the scene's own, and adds the seconds of the steps to the summary."""
     work = None if teacher.cheap else work_folder(out)
     track = Progress(quiet=config.quiet)
-    fusion = fuse(scene, teacher, config.fusion, basis=basis, work=work, sample_cells=sample_cells, track=track)
+    fusion = fuse(
+        scene,
+        teacher,
+        config.fusion,
+        basis=basis,
+        work=work,
+        sample_cells=sample_cells,
+        device=config.device,
+        track=track,
+    )
     summary.add_seconds(fusion.seconds)
     return fusion
 

@@ -81,7 +81,7 @@ class MemoryCommandConfig(SourceConfig, CommonConfig):
         default=False, metadata={"help": "draw the scatter plot by UMAP, too; needs the package umap-learn"}
     )
     resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
-    device: Device = field(default="auto", metadata={"help": "where queries are optimized"})
+    device: Device = field(default="auto", metadata={"help": "where the scene is prepared and queries are optimized"})
 
     def __post_init__(self) -> None:
         SourceConfig.__post_init__(self)
@@ -126,7 +126,7 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
                         "lost; leave optimize=false out to continue it, or give resume=false to start again"
                     )
                 scene = _load(path, config, summary)
-                tables = _prepare(scene, words, config, state.path, summary, track)
+                tables = _prepare(scene, words, config, state.path, device, summary, track)
         scenes = {name: open_memory_scene(state.path / name) for name in config.teachers_by_name}
         with summary.step("train"):
             memories: dict[str, QueryMemory] = {}
@@ -180,7 +180,13 @@ def _load(path: Path, config: MemoryCommandConfig, summary: Summary) -> Scene:
 
 
 def _prepare(
-    scene: Scene, words: Mapping[str, Any], config: MemoryCommandConfig, work: Path, summary: Summary, track: Progress
+    scene: Scene,
+    words: Mapping[str, Any],
+    config: MemoryCommandConfig,
+    work: Path,
+    device: torch.device,
+    summary: Summary,
+    track: Progress,
 ) -> dict[str, TextTable]:
     """Prepares a scene for all teachers in folders of their own; the tables of words that lead into their features."""
     tables, spaces = {}, {}
@@ -202,6 +208,7 @@ def _prepare(
                     config.prepare,
                     predicted=features,
                     sample=DRAWN_FEATURES if config.pictures else 0,
+                    device=device,
                     track=track,
                 )
             if (table := words_beside(teacher, words.get(name))) is not None:

@@ -80,7 +80,7 @@ class TrainCommandConfig(TrainConfig, CommonConfig):
     store: Literal["float16", "float32"] = field(
         default="float16", metadata={"help": "type of the written weights and words"}
     )
-    device: Device = field(default="auto", metadata={"help": "where the encoder computes"})
+    device: Device = field(default="auto", metadata={"help": "where scenes are prepared and the encoder computes"})
 
 
 def run(config: TrainCommandConfig, summary: Summary) -> None:
@@ -118,6 +118,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 voxel=config.model.voxel,
                 heads=heads_asked,
                 process=process,
+                device=device,
                 track=track,
             )
             with_heads = datasets[teacher_of_heads(config.teachers_by_name, heads_asked)]
