@@ -6,7 +6,7 @@ Each stage that has knobs lists them beside its settings (`gsencoder.fusion.knob
 
 import typing
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from gsencoder.core.errors import InputError
@@ -25,12 +25,14 @@ class Knob:
         key: where it lies in the stage's settings, with dots between sections ("blend.rays_per_patch").
         values: worth trying, in any order; the default need not be among them.
         exact: the value at which it costs no accuracy; None where there is no such value.
+        needs: values of other knobs, by name, without which it has no effect; it is tried alone beside these.
     """
 
     name: str
     key: str
     values: tuple[Any, ...]
     exact: Any = None
+    needs: Mapping[str, Any] = field(default_factory=dict)
 
 
 def value_at(settings: object, key: str) -> Any:

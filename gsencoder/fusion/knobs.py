@@ -38,5 +38,5 @@ class PackageSettings:
 PACKAGE_KNOBS = (
     Knob(name="form", key="form", values=("index", "npz")),
     Knob(name="error", key="error", values=(0.001, 0.003, 0.03, 0.1), exact=0.001),
-    Knob(name="threshold", key="threshold", values=(0.8, 0.95, 0.98)),
+    Knob(name="threshold", key="threshold", values=(0.8, 0.95, 0.98), needs={"form": "index"}),
 )

@@ -42,9 +42,9 @@ ENCODER_KNOBS = (
     Knob(name="voxel", key="voxel", values=(0.015, 0.03, 0.04), exact=0.0),
     Knob(name="patch", key="patch", values=(32, 64, 256), exact=0),
     Knob(name="chunk", key="encode.chunk", values=(10_000, 20_000, 40_000), exact=0),
-    Knob(name="halo", key="encode.halo", values=(0.0, 0.32, 1.28)),
+    Knob(name="halo", key="encode.halo", values=(0.0, 0.32, 1.28), needs={"chunk": 20_000}),
 )
-"""Knobs of `EncoderSettings`. The halo matters where there are several chunks."""
+"""Knobs of `EncoderSettings`. The halo has an effect where there are several chunks."""
 
 LOCALIZATION_KNOBS = (
     Knob(name="relative", key="threshold.relative", values=(0.5, 0.6, 0.8, 0.9)),

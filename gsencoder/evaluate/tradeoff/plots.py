@@ -40,6 +40,7 @@ def to_json(stages: Sequence[StageResult], scaling: Sequence[ScalingResult] = ()
         ],
         "settings": [{**result.row(), "knobs": dict(result.knobs)} for each in stages for result in each.results],
         "scores": list(HIGHER_IS_BETTER),
+        "less_is_better": [name for name, higher in HIGHER_IS_BETTER.items() if not higher],
         "scaling": [each.row() for each in scaling],
     }
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.first_repeated import first_repeated
-from gsencoder.core.knobs import Knob, changed_knobs, read_value, value_at, with_knobs
+from gsencoder.core.knobs import Knob, changed_knobs, describe_values, read_value, value_at, with_knobs
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.evaluate.tradeoff.encoder import encoder_stage
 from gsencoder.evaluate.tradeoff.fusion import fusion_stage
@@ -138,7 +138,12 @@ def settings_of(stage: Stage, sweep: SweepConfig) -> list[Knobs]:
     if sweep.grid:
         count = math.prod(map(len, values.values()))
         return [changed_knobs(stage.base, stage.knobs, each) for each in draw_settings(values, count, sweep.seed)]
-    return [{}, *({name: value} for name, tried in values.items() for value in tried[1:])]
+    changes: list[Knobs] = [{}]
+    for knob in stage.knobs:
+        needed = changed_knobs(stage.base, stage.knobs, knob.needs)
+        tried = [{**needed, knob.name: value} for value in values.get(knob.name, ())[1:]]
+        changes += [each for each in ([needed] if tried else []) + tried if each not in changes]
+    return changes
 
 
 def sweep_stage(
@@ -210,13 +215,16 @@ def _is_accepted(stage: Stage, knobs: Knobs) -> bool:
 def knobs_that_matter(
     knobs: Sequence[Knob], rows: Sequence[Sequence[Record]], base: Sequence[Record], cost: Cost
 ) -> list[str]:
-    """Knobs of which a value, changed alone, moves cost or a score by more than noise."""
-    moved = {
-        name
-        for row in rows
-        for name in row[0].knobs
-        if len(row[0].knobs) == 1 and (_moves_cost(row, base, cost) or _moves_score(row, base))
-    }
+    """Knobs of which a value, changed alone or beside what it needs, moves cost or a score by more than noise."""
+    by_label = {row[0].label: row for row in rows}
+    moved = set()
+    for knob in knobs:
+        for row in rows:
+            others = {name: value for name, value in row[0].knobs.items() if name != knob.name}
+            beside = by_label.get(describe_values(others), base)
+            changes_one = knob.name in row[0].knobs and (not others or others == dict(beside[0].knobs))
+            if changes_one and (_moves_cost(row, beside, cost) or _moves_score(row, beside)):
+                moved.add(knob.name)
     return [knob.name for knob in knobs if knob.name in moved]
 
 

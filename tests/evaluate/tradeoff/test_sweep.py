@@ -145,6 +145,16 @@ def test_a_knob_without_effect_does_not_matter_and_is_not_changed_with_others() 
     assert result.results[0].phase == "base"
 
 
+def test_a_knob_that_needs_another_is_tried_beside_it_and_judged_against_that() -> None:
+    stage = Toy().stage()
+    effort, color = stage.knobs
+    # The color has no effect of its own; against the base it would seem to have that of the effort.
+    stage = replace(stage, knobs=(effort, replace(color, needs={"effort": 8})))
+    sweep = SweepConfig(rounds=1, knobs=("color",))
+    assert settings_of(stage, sweep) == [{}, {"effort": 8}, {"effort": 8, "color": 1}, {"effort": 8, "color": 2}]
+    assert sweep_stage(stage, SCENES, Records(), sweep).matter == ("effort",)
+
+
 def test_settings_of_the_joint_part_that_were_measured_before_are_not_measured_again() -> None:
     toy = Toy()
     sweep_stage(toy.stage(), SCENES, Records(), SweepConfig(rounds=1), HalvingConfig(settings=50))
