@@ -34,19 +34,18 @@ class PresetOption:
 
 
 PRESET_OPTIONS = (
-    PresetOption(key="fusion.view_share", fast=0.5),
+    PresetOption(key="fusion.view_share", fast=0.67),
     PresetOption(key="fusion.blend.rays_per_patch", exact=196),
-    PresetOption(key="fusion.blend.stop_transmittance", exact=1e-6),
+    PresetOption(key="fusion.blend.stop_transmittance", fast=0.1, exact=1e-6),
     PresetOption(key="fusion.energy", exact=1.0),
     PresetOption(key="fusion.table_energy", exact=1.0),
     PresetOption(key="fusion.max_rank", exact=0),
     PresetOption(key="prepare.fusion.blend.rays_per_patch", exact=196),
     PresetOption(key="prepare.fusion.blend.stop_transmittance", exact=1e-6),
     PresetOption(key="encode.precision", exact="float32"),
-    PresetOption(key="encode.chunk", exact=0),
+    PresetOption(key="encode.halo", fast=0.0, exact=1.28),
     PresetOption(key="choose.candidates", fast=16, exact=64),
-    PresetOption(key="choose.judged_side", exact=320),
-    PresetOption(key="budget.minutes", fast=2.0, exact=0.0),
+    PresetOption(key="budget.minutes", fast=5.0, exact=0.0),
     PresetOption(key="optimize.steps", exact=3000),
 )
 
