@@ -16,6 +16,7 @@ ADDED_OPTIONS: Mapping[str, Any] = {
     "loss.divide_by_alpha": True,
     "loss.contrast_clusters": True,
     "loss.teacher_weights": [],
+    "prepare.fusion.view_share": 1.0,
     "prepare.center": True,
     "prepare.scale": True,
     "prepare.render_views": 0,

@@ -6,6 +6,7 @@ Views stream a few at a time, and are added in their order; sums are kept in the
 does not grow with the number of views or with the teacher's width.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -59,9 +60,12 @@ class FuseConfig:
     basis: bool = field(default=True, metadata={"help": "fuse in a low-rank basis; false = in all channels"})
     narrow: int = field(default=64, metadata={"help": "teachers with no more channels than this keep all of them"})
     views: int = field(default=0, metadata={"help": "views used, evenly spaced; 0 = all"})
+    view_share: float = field(
+        default=1.0, metadata={"help": "share of the views used, evenly spaced; with views= the fewer of both"}
+    )
 
     def __post_init__(self) -> None:
-        for name in ("energy", "table_energy"):
+        for name in ("energy", "table_energy", "view_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise InputError(f"{name}: expected a share in (0, 1], got {getattr(self, name)}")
         for name in ("max_rank", "narrow", "views"):
@@ -130,7 +134,7 @@ def fuse(
     chosen = device if isinstance(device, torch.device) else choose_device(device)
     gaussians, views = _checked(scene, teacher, basis)
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))
-    rows = tuple(int(view) for view in even_indices(len(views), config.views or len(views)))
+    rows = chosen_views(len(views), config)
     checkpoint = None
     if work is not None:
         checkpoint = open_checkpoint(work, asdict(config), teacher, gaussians, views, rows, basis)
@@ -206,6 +210,12 @@ def fuse(
         projections=projections,
         sample=sample if sample_cells else None,
     )
+
+
+def chosen_views(count: int, config: FuseConfig) -> tuple[int, ...]:
+    """Row numbers of the views that are used, out of so many."""
+    share = max(1, math.ceil(config.view_share * count - 1e-9))
+    return tuple(int(view) for view in even_indices(count, min(config.views or count, share)))
 
 
 def _checked(scene: Scene, teacher: Teacher, basis: FeatureBasis | None) -> tuple[Gaussians, Views]:

@@ -46,7 +46,7 @@ def test_the_option_of_the_page_is_one_field_of_a_settings_class() -> None:
     scope: dict[str, object] = {}
     exec(f"from dataclasses import field\n{OPTION}", scope)
     cls = make_dataclass("Toy", [("views", int, scope["views"])], bases=(CommonConfig,), frozen=True, kw_only=True)
-    assert [item.name for item in fields(cls)] == ["out", "overwrite", "quiet", "views"]
+    assert [item.name for item in fields(cls)] == ["out", "overwrite", "preset", "quiet", "views"]
     assert compose("toy", cls, ["views=3"]) == cls(views=3)
 
 

@@ -210,12 +210,14 @@ def test_choices_come_from_unions_presets_and_experiments_wherever_their_section
         "student/network": ("large", "tiny"),
         "student/damage": ("blur", "noise"),
         "teacher": ("blur", "noise", "wide", "wrong"),
+        "preset": ("balanced", "exact", "fast"),
         "experiment": ("long", "none"),
     }
     assert choices.chosen == {
         "student/network": "tiny",
         "student/damage": "noise",
         "teacher": "blur",
+        "preset": "balanced",
         "experiment": "none",
     }
     assert toy(conf) == ToyConfig()

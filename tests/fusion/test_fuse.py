@@ -11,7 +11,7 @@ from fixed_teachers import EXACT, SPACE, CodedTeacher, FixedTeacher, make_scene
 from splats import one_gaussian, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
+from gsencoder.fusion.fuse import FuseConfig, Fusion, chosen_views, fuse
 from gsencoder.fusion.lift import view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.render import BlendConfig, blend
@@ -282,6 +282,19 @@ def test_maps_of_another_scene_are_never_taken_up(tmp_path: Path, rng: np.random
 def test_fewer_views_are_spread_evenly(rng: np.random.Generator) -> None:
     fusion = fuse(make_scene(), FixedTeacher(random_maps(rng)), replace(EXACT, views=3))
     assert fusion.views == (0, 2, 4)
+
+
+def test_a_share_of_the_views_is_rounded_up_and_never_none() -> None:
+    def chosen(count: int, share: float, views: int = 0) -> tuple[int, ...]:
+        return chosen_views(count, replace(EXACT, view_share=share, views=views))
+
+    assert chosen(5, 1.0) == (0, 1, 2, 3, 4)
+    assert chosen(5, 0.6) == (0, 2, 4)
+    assert chosen(5, 0.601) == chosen(5, 0.8) == (0, 1, 3, 4)
+    assert chosen(5, 1e-6) == (0,)
+    # With a number as well, the fewer of both.
+    assert chosen(5, 0.6, views=2) == (0, 4)
+    assert chosen(5, 0.4, views=4) == (0, 4)
 
 
 def test_no_more_rays_than_pixels_are_spent(rng: np.random.Generator) -> None:

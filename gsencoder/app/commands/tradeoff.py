@@ -1,34 +1,65 @@
-"""`gsencoder tradeoff SCENE…`: seconds and accuracy of each setting of fusion, as a table and a plot."""
+"""`gsencoder tradeoff SCENE…`: cost and accuracy of the knobs of each stage, as a table and plots."""
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.table import Table
 
-from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig
-from gsencoder.core.errors import InputError
+from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.csv_text import csv_text
-from gsencoder.core.files.json_values import write_bytes
+from gsencoder.core.files.json_values import json_bytes, write_bytes
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
-from gsencoder.evaluate.tradeoff import (
-    BudgetConfig,
-    SettingResult,
-    SweepConfig,
-    measure_tradeoff,
-    pick_within_budget,
-    sweep_settings,
-    table_row,
-)
-from gsencoder.evaluate.tradeoff_plot import plot_tradeoff
+from gsencoder.evaluate.tradeoff.halving import HalvingConfig
+from gsencoder.evaluate.tradeoff.plots import page, picture, to_json
+from gsencoder.evaluate.tradeoff.records import Records
+from gsencoder.evaluate.tradeoff.results import SettingResult, pick_within
+from gsencoder.evaluate.tradeoff.scaling import ScalingConfig, ScalingResult, scaling
+from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER, Inputs, StageName
+from gsencoder.evaluate.tradeoff.sweep import STAGES, StageResult, SweepConfig, check_sweep, sweep_stage
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.views.selection import ViewsConfig
+
+TABLE, RESULTS, PAGE, PICTURE, EXPONENTS = (
+    "tradeoff.csv",
+    "tradeoff.json",
+    "tradeoff.html",
+    "tradeoff.png",
+    "exponents.csv",
+)
+SECTIONS = {
+    "reconstruction": "",
+    "fusion": "fusion.",
+    "encoder": "",
+    "packages": "",
+    "localization": "localize.",
+    "views": "choose.",
+}
+"""What stands before a stage's knobs on the command line."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LimitConfig:
+    """Limits of time and error; the best setting of fusion within them is reported."""
+
+    seconds: float | None = field(
+        default=None, metadata={"help": "largest time for fusing one scene without the teacher, seconds"}
+    )
+    error: float | None = field(
+        default=None, metadata={"help": "largest error against the reference, 1 − centered cosine"}
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,68 +69,146 @@ class TradeoffConfig(CommonConfig):
     paths: tuple[str, ...] = field(
         default=(), metadata={"help": "scenes, or folders of scenes", "metavar": "SCENE", "required": True}
     )
+    stages: tuple[StageName, ...] = field(
+        default=("fusion",), metadata={"help": f"stages whose knobs are turned: {', '.join(STAGES)}"}
+    )
+    resume: bool = field(default=True, metadata={"help": "continue an interrupted sweep; false = start again"})
     sweep: SweepConfig = field(default_factory=SweepConfig)
-    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    halving: HalvingConfig = field(default_factory=HalvingConfig)
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+    budget: LimitConfig = field(default_factory=LimitConfig)
     asked: LocalizationProtocol = field(default_factory=LocalizationProtocol)
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    encode: EncodeConfig = field(default_factory=EncodeConfig)
+    choose: ViewsConfig = field(default_factory=ViewsConfig)
+
+    def __post_init__(self) -> None:
+        if not self.stages or len(set(self.stages)) < len(self.stages):
+            raise InputError(f"stages: expected one or more of {', '.join(STAGES)}, each once, got {list(self.stages)}")
 
 
 def run(config: TradeoffConfig, summary: Summary) -> None:
-    """Measures all settings, prints and writes the table with a plot, and names the setting for a budget."""
-    sweep_settings(config.sweep, config.fusion)  # A setting out of range is an error before hours of work.
+    """Measures all settings, prints and writes tables and plots, and names the setting for a budget."""
+    inputs = Inputs(
+        teacher=config.teacher,
+        protocol=config.asked,
+        data=config.data,
+        seeds=config.seeds,
+        fusion=config.fusion,
+        localize=config.localize,
+        encode=config.encode,
+        views=config.choose,
+    )
+    stages = [STAGES[name](inputs) for name in config.stages]
+    check_sweep(stages, config.sweep)
+    paths = [Path(os.path.realpath(path)) for path in find_scenes(config.paths)]
+    _check_names(paths)
     out = config.out or Path("outputs") / "tradeoff"
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-        with summary.step("sweep"):
-            trades = measure_tradeoff(
-                find_scenes(config.paths),
-                teacher=config.teacher,
-                sweep=config.sweep,
-                base=config.fusion,
-                protocol=config.asked,
-                data=config.data,
-                seeds=config.seeds,
-                localization=config.localize,
-                track=Progress(quiet=config.quiet),
-            )
-        rows = [table_row(trade) for trade in trades]
-        write_bytes(folder / "tradeoff.csv", csv_text(rows).encode())
-        with summary.step("plot"):
-            write_bytes(folder / "tradeoff.png", plot_tradeoff(trades))
-        summary.results.update(settings=rows, table="tradeoff.csv", plot="tradeoff.png")
-        summary.results["picked"] = advice = _advice(trades, config.budget)
+    target = Path(os.path.realpath(out))
+    track = Progress(quiet=config.quiet)
+    with (
+        WorkFolder(target.with_name(f"{target.name}.tradeoff")) as work,
+        output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
+    ):
+        refuse_to_replace_inputs(work.path, settings(config))
+        work.take(anew=not config.resume)
+        identity = {
+            "inputs": settings(inputs),
+            "scenes": {p.name: str(p) for p in paths},
+        }
+        records = Records(work.path, identity)
+        summary.results["continued"] = len(records)
+        results = []
+        for stage in stages:
+            with summary.step(stage.name):
+                results.append(sweep_stage(stage, paths, records, config.sweep, config.halving, track))
+        exponents: list[ScalingResult] = []
+        if config.scaling.points:
+            with summary.step("exponents"):
+                exponents = scaling(config.stages, paths, inputs, config.scaling, seed=config.sweep.seed, track=track)
+        _write(folder, results, exponents, summary)
+        summary.results["picked"] = advice = _advice(results, config.budget)
     screen = console(config.quiet)
-    screen.print(_table(trades))
+    for each in results:
+        screen.print(_table(each))
+        screen.print(f"knobs that matter: {', '.join(each.matter) or 'none'}")
+        for rung in each.rungs:
+            more = "" if rung is each.rungs[-1] else f"; the best {len(rung.kept)} went on"
+            screen.print(f"{counted(len(rung.settings), 'setting')} on {counted(rung.scenes, 'scene')}{more}")
+    for scaled in exponents:
+        value, low, high, *_ = scaled.exponent
+        screen.print(f"{scaled.stage}: CPU time grows as {scaled.factor}^{value:.2f} (95 %: {low:.2f} to {high:.2f})")
     if advice:
         screen.print(advice)
-    screen.print(f"{out}: tradeoff.csv and tradeoff.png")
+    screen.print(f"{out}: {TABLE}, {RESULTS}, {PAGE} and {PICTURE}")
 
 
-def _advice(trades: list[SettingResult], budget: BudgetConfig) -> str:
-    """The setting within the budget, or a message that there is none; the measurements are written in both cases."""
-    if budget.seconds is None and budget.error is None:
+def _check_names(paths: Sequence[Path]) -> None:
+    names = [path.name for path in paths]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"paths: two scenes are called {name}, and results are named by scene; rename one")
+
+
+def _write(folder: Path, results: Sequence[StageResult], exponents: Sequence[ScalingResult], summary: Summary) -> None:
+    rows = [each.row() for result in results for each in result.results]
+    # Stages give different scores; a table has the columns of all.
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    write_bytes(folder / TABLE, csv_text([{name: row.get(name) for name in columns} for row in rows]).encode())
+    everything = to_json(results, exponents)
+    write_bytes(folder / RESULTS, json_bytes(everything)[0])
+    if exponents:
+        write_bytes(folder / EXPONENTS, csv_text([each.row() for each in exponents]).encode())
+    with summary.step("plot"):
+        write_bytes(folder / PAGE, page(results, exponents))
+        write_bytes(folder / PICTURE, picture(results))
+    summary.results.update(
+        settings=rows,
+        matter={each.stage.name: list(each.matter) for each in results},
+        exponents=[each.row() for each in exponents],
+        table=TABLE,
+        page=PAGE,
+        plot=PICTURE,
+    )
+
+
+def _advice(results: Sequence[StageResult], budget: LimitConfig) -> str:
+    """The setting of fusion within the budget, or a message that there is none; the measurements are written in both
+    cases."""
+    fusion = [each for each in results if each.stage.name == "fusion"]
+    if not fusion or (budget.seconds is None and budget.error is None):
         return ""
     try:
-        chosen = pick_within_budget(trades, budget)
+        chosen = pick_within(fusion[0].results, budget.seconds, budget.error)
     except InputError as error:
         return str(error)
-    options = " ".join(
-        f"fusion.{'blend.' if name in ('rays_per_patch', 'min_weight', 'stop_transmittance') else ''}{name}={value}"
-        for name, value in chosen.knobs.items()
-    )
-    return f"budget: {options or 'the defaults'} ({chosen.seconds:.3g} s a scene, error {chosen.error:.3g})"
+    options = options_of_setting(fusion[0], chosen)
+    return f"budget: {options or 'the defaults'} ({chosen.seconds:.3g} s a scene, error {chosen.score('error'):.3g})"
 
 
-def _table(trades: list[SettingResult]) -> Table:
-    table = Table(title="● = on the Pareto front of seconds and error", title_justify="left")
+def options_of_setting(result: StageResult, setting: SettingResult) -> str:
+    """The options of the command line that make a setting."""
+    keys = {knob.name: SECTIONS[result.stage.name] + knob.key for knob in result.stage.knobs}
+    return " ".join(f"{keys[name]}={str(value).lower()}" for name, value in setting.knobs.items())
+
+
+def _table(result: StageResult) -> Table:
+    accuracy = result.stage.accuracy
+    table = Table(title=f"{result.stage.name}: ● = on the Pareto front of {result.cost} and {accuracy}")
+    table.title_justify = "left"
     table.add_column("setting")
-    for title in ("seconds", "MiB", "rank", "error", "covered", "Acc@0.25", "Acc@0.5", ""):
+    scores = [name for name in HIGHER_IS_BETTER if any(name in each.scores for each in result.results)]
+    for title in ("scenes", "CPU s", "± %", "of defaults", "seconds", "MiB", "kB", *scores, ""):
         table.add_column(title, justify="right")
-    for row in map(table_row, trades):
-        accuracies = (f"{row['acc_25']:.3f}", f"{row['acc_50']:.3f}") if row["objects"] else ("", "")
-        figures = (f"{row['seconds']:.3f}", f"{row['mib']:.0f}", f"{row['rank']:.1f}", f"{row['error']:.5f}")
-        table.add_row(row["setting"], *figures, f"{row['covered']:.4f}", *accuracies, "●" if row["on_front"] else "")
+    for each in result.results:
+        figures = [f"{each.scenes}", f"{each.cpu_seconds:.3g}", f"{100 * each.spread:.0f}", f"{each.ratio:.3f}"]
+        figures += [f"{each.seconds:.3g}", f"{each.mib:.0f}", f"{each.bytes / 1000:.0f}"]
+        for name in scores:
+            value, error, _ = each.scores.get(name, (float("nan"),) * 3)
+            figures.append(("" if value != value else f"{value:.4g}") + ("" if error != error else f" ± {error:.2g}"))
+        table.add_row(each.label, *figures, "●" if each.on_front else "")
     return table

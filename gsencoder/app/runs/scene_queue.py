@@ -17,8 +17,8 @@ from gsencoder.core.files.written_files import SUMMARY_NAME
 from gsencoder.core.runtime.process_rank import refuse_several
 from gsencoder.data.scenes import check_names, scene_name
 
-NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device")
-"""Settings in which two runs with the same results may differ."""
+NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device", "preset")
+"""Settings in which two runs with the same results may differ; what a preset sets is compared."""
 GOLDEN = 0.6180339887
 """Workers begin at the fractional parts of its multiples, which are spread evenly however many there are."""
 

@@ -173,7 +173,7 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
                 written = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
         elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
             written = f"[{value}]"
-        name = option.hydra_key if option is not None and option.like_group else key
+        name = option.hydra_key if option is not None and option.like_group and key not in choices.groups else key
         try:
             parsed = parser.parse_override(f"{name}={written}")
             swept = parsed.is_sweep_override()

@@ -31,6 +31,7 @@ from gsencoder.app.settings.options import (
     union_members,
     wrong_value,
 )
+from gsencoder.app.settings.presets import DEFAULT_PRESET, Preset
 from gsencoder.core.errors import InputError
 from gsencoder.core.removed_options import REMOVED_OPTIONS, check_removed_option
 
@@ -49,6 +50,14 @@ class CommonConfig:
 
     out: Path | None = field(default=None, metadata={"help": "where the results go", "metavar": "PATH"})
     overwrite: bool = field(default=False, metadata={"help": "replace what an earlier run wrote to out="})
+    preset: Preset = field(
+        default=DEFAULT_PRESET,
+        metadata={
+            "like_group": True,
+            "help": "options that trade cost for accuracy, set together where settings are composed; the command line "
+            "and experiments go over it",
+        },
+    )
     quiet: bool = field(default=False, metadata={"help": "print nothing but warnings and errors"})
 
 

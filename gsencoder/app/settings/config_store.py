@@ -3,6 +3,7 @@
 One node holds all defaults of the command. Beside it are the config groups, for what can be chosen by name:
 - a field whose type is a union of dataclasses; each of them is a member (`teacher=onnx`);
 - a section with presets; `field(…, metadata={"preset": "tiny"})` names the member that is its default (`model=tiny`);
+- `preset`, whose members set options of several sections from the table in `gsencoder.app.settings.presets`;
 - `experiment` of a command that has experiments (`CommonConfig.has_experiments`); its member `none` sets nothing.
 YAML files in the folder of a group are further members. They set only what differs from the member they build on.
 
@@ -15,9 +16,11 @@ from typing import Any
 
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.app.settings.options import LIKE_GROUP, field_types, member_name, section_classes
+from gsencoder.app.settings.presets import DEFAULT_PRESET, PRESET, PRESETS, preset_node
 
 EXPERIMENT = "experiment"
-"""The group whose members set options of several sections; they are merged last, after the command's own defaults."""
+"""The group whose members set options of several sections; they are merged last, after the command's own defaults and
+presets."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,8 +39,10 @@ class Group:
 
 
 def groups_of(cls: type[CommonConfig]) -> list[Group]:
-    """The config groups of a command, in order of declaration, experiments last."""
+    """The config groups of a command, in order of declaration, presets and experiments last."""
     groups = list(_section_groups(cls()))
+    presets = {name: {PRESET + LIKE_GROUP: name, **preset_node(cls, name)} for name in PRESETS}
+    groups.append(Group(key=PRESET, default=DEFAULT_PRESET, members=presets))
     if cls.has_experiments:
         groups.append(Group(key=EXPERIMENT, default="none", members={"none": {}}))
     return groups
@@ -70,10 +75,10 @@ def store_settings(command: str, cls: type[CommonConfig]) -> None:
         if item.metadata.get("like_group"):
             node[item.name + LIKE_GROUP] = node.pop(item.name)
     for group in groups_of(cls):
-        is_experiment = group.key == EXPERIMENT
+        is_global = group.key in (PRESET, EXPERIMENT)
         for name, member in group.members.items():
-            store.store(name=name, node=member, group=group.key, package="_global_" if is_experiment else None)
-        if is_experiment:
+            store.store(name=name, node=member, group=group.key, package="_global_" if is_global else None)
+        if is_global:
             after.append({group.key: group.default})
         else:
             before.append({group.key: group.default})

@@ -9,6 +9,7 @@ from typing import Any
 from gsencoder.app.settings.choices import choices_of
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.app.settings.options import Option, describe, join_list, options_of
+from gsencoder.app.settings.presets import DEFAULT_PRESET, PRESET, describe_presets
 
 RULES = (
     "A word KEY=VALUE is a setting if KEY is one of those above (the part after the last dot is enough where only one, "
@@ -50,13 +51,17 @@ def command_help(
     lines = [f"usage: gsencoder {name}{word} [key=value …]", "", *textwrap.wrap(summary, width)]
     if paths:
         lines += ["", "paths:", *_entry(paths.metavar or "PATH", paths.help, width)]
-    if choices.groups:
+    groups = {group: members for group, members in choices.groups.items() if group != PRESET}
+    if groups:
         lines += ["", "choices:"]
-        for group, members in choices.groups.items():
+        for group, members in groups.items():
             lines += _entry(f"{group}={'|'.join(members)}", f"[{_shown(choices.chosen[group])}]", width)
+    lines += ["", f"presets [{DEFAULT_PRESET}]:"]
+    for preset, changes in describe_presets(cls).items():
+        lines += _entry(f"{PRESET}={preset}", changes, width)
     lines += ["", "settings [default]:"]
     for option in options:
-        if option.key != "paths" and not option.member:
+        if option.key != "paths" and not option.member and option.key not in choices.groups:
             lines += _option(option, width)
     for member in dict.fromkeys(option.member for option in options if option.member):
         lines += ["", f"settings with {member} [default]:"]

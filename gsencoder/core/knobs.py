@@ -1,0 +1,143 @@
+"""Knobs: the values of a stage's settings that trade cost for accuracy, and how they are put into its frozen settings.
+
+Each stage that has knobs lists them beside its settings (`gsencoder.fusion.knobs`, `gsencoder.reconstruct.knobs`,
+`gsencoder.infer.knobs`), so that whoever chooses settings, a sweep or a budget, needs no more than such a list.
+"""
+
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+from gsencoder.core.errors import InputError
+
+Settings = TypeVar("Settings")
+
+SHOWN_DIGITS = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Knob:
+    """One knob of a stage.
+
+    Attributes:
+        name: short, unique within the stage; it stands in tables and options.
+        key: where it lies in the stage's settings, with dots between sections ("blend.rays_per_patch").
+        values: worth trying, in any order; the default need not be among them.
+        exact: the value at which it costs no accuracy; None where there is no such value.
+        needs: values of other knobs, by name, without which it has no effect; it is tried alone beside these.
+    """
+
+    name: str
+    key: str
+    values: tuple[Any, ...]
+    exact: Any = None
+    needs: Mapping[str, Any] = field(default_factory=dict)
+
+
+def value_at(settings: object, key: str) -> Any:
+    """The value of a key with dots in nested settings."""
+    for name in key.split("."):
+        settings = getattr(settings, name)
+    return settings
+
+
+def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
+    """The settings with other values; those of one section change together, so that it checks them together.
+
+    Args:
+        settings: a frozen dataclass, sections of which are frozen dataclasses.
+        values: by key, with dots between sections.
+
+    Raises:
+        InputError: no such key, or a value that the settings refuse.
+    """
+    assert is_dataclass(settings)
+    assert not isinstance(settings, type)
+    names = {item.name for item in fields(settings)}
+    sections: dict[str, dict[str, Any]] = {}
+    own: dict[str, Any] = {}
+    for key, value in values.items():
+        name, _, rest = key.partition(".")
+        if name not in names:
+            raise InputError(f"{key}: no such setting of {type(settings).__name__}; it has {', '.join(sorted(names))}")
+        if rest:
+            sections.setdefault(name, {})[rest] = value
+        else:
+            own[name] = value
+    for name, inner in sections.items():
+        own[name] = with_values(own.get(name, getattr(settings, name)), inner)
+    return typing.cast(Settings, replace(settings, **own))
+
+
+def with_knobs(settings: Settings, knobs: Sequence[Knob], values: Mapping[str, Any]) -> Settings:
+    """The settings with values of knobs, by the knobs' names.
+
+    Raises:
+        InputError: no such knob, or a value that the settings refuse; the knobs are named.
+    """
+    by_name = {knob.name: knob for knob in knobs}
+    for name in values:
+        if name not in by_name:
+            raise InputError(f"{name}: no such knob; expected one of {', '.join(by_name)}")
+    try:
+        return with_values(settings, {by_name[name].key: value for name, value in values.items()})
+    except InputError as error:
+        raise InputError(f"{describe_values(values)}: {error}") from error
+
+
+def exact_settings(settings: Settings, knobs: Sequence[Knob]) -> Settings:
+    """The settings with every knob that has an exact value at it."""
+    return with_values(settings, {knob.key: knob.exact for knob in knobs if knob.exact is not None})
+
+
+def describe_values(values: Mapping[str, Any]) -> str:
+    """Values of knobs as one line, such as `views=8, rays=16`; `defaults` where there are none."""
+    return ", ".join(f"{name}={shown_value(value)}" for name, value in values.items()) or "defaults"
+
+
+def shown_value(value: Any) -> str:
+    """A value as it is written in tables and options."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.{SHOWN_DIGITS}g}"
+    return str(value) if value not in ("", None) else "none"
+
+
+def changed_knobs(base: object, knobs: Iterable[Knob], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that differ from those of the base settings, in the order of the knobs."""
+    return {
+        knob.name: values[knob.name]
+        for knob in knobs
+        if knob.name in values and values[knob.name] != value_at(base, knob.key)
+    }
+
+
+def read_value(settings: object, knob: Knob, text: str) -> Any:
+    """A value of a knob from text, of the type that the settings declare.
+
+    Raises:
+        InputError: text of another type.
+    """
+    *sections, name = knob.key.split(".")
+    owner = value_at(settings, ".".join(sections)) if sections else settings
+    annotation = typing.get_type_hints(type(owner))[name]
+    kinds = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
+    if get_origin(annotation) is Literal:
+        if text in get_args(annotation):
+            return text
+        raise InputError(f"{knob.name}: expected one of {', '.join(map(str, get_args(annotation)))}, got {text!r}")
+    if bool in kinds and text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        if kind in kinds:
+            try:
+                return kind(text)
+            except ValueError:
+                continue
+    if str in kinds:
+        return "" if text == "none" else text
+    names = {int: "a whole number", float: "a number", bool: "true or false"}
+    expected = " or ".join(names.get(kind, str(kind)) for kind in kinds)
+    raise InputError(f"{knob.name}: expected {expected}, got {text!r}")

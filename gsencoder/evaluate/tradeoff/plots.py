@@ -1,0 +1,110 @@
+"""The plots of a trade-off: a page that answers to the mouse, and a picture."""
+
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gsencoder.core.files.json_values import plain
+from gsencoder.evaluate.tradeoff.results import SettingResult
+from gsencoder.evaluate.tradeoff.scaling import ScalingResult
+from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER
+from gsencoder.evaluate.tradeoff.sweep import StageResult
+
+TEMPLATE = Path(__file__).with_name("plot.html")
+DATA = "/*DATA*/"
+COST_NAMES = {
+    "cpu_seconds": "CPU seconds a scene",
+    "seconds": "seconds a scene",
+    "mib": "MiB of memory",
+    "bytes": "bytes",
+}
+
+
+def to_json(stages: Sequence[StageResult], scaling: Sequence[ScalingResult] = ()) -> dict[str, Any]:
+    """All that a sweep gave as JSON values."""
+    return {
+        "stages": [
+            {
+                "stage": each.stage.name,
+                "cost": each.cost,
+                "accuracy": each.stage.accuracy,
+                "matter": list(each.matter),
+                "rungs": [
+                    {"scenes": rung.scenes, "settings": len(rung.settings), "kept": len(rung.kept)}
+                    for rung in each.rungs
+                ],
+            }
+            for each in stages
+        ],
+        "settings": [{**result.row(), "knobs": dict(result.knobs)} for each in stages for result in each.results],
+        "scores": list(HIGHER_IS_BETTER),
+        "less_is_better": [name for name, higher in HIGHER_IS_BETTER.items() if not higher],
+        "scaling": [each.row() for each in scaling],
+    }
+
+
+def page(stages: Sequence[StageResult], scaling: Sequence[ScalingResult] = ()) -> bytes:
+    """The interactive plot as one HTML file that needs no network."""
+    # In a script element `</` would end it, whatever it stands in.
+    data = json.dumps(plain(to_json(stages, scaling)), ensure_ascii=False).replace("</", "<\\/")
+    return TEMPLATE.read_text(encoding="utf-8").replace(DATA, data).encode("utf-8", "backslashreplace")
+
+
+def picture(stages: Sequence[StageResult]) -> bytes:
+    """The same as a PNG: a panel a stage, a color for each changed knob, its value beside each point, the Pareto front
+    ringed."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(2, len(stages))
+    rows = -(-len(stages) // columns)
+    figure = Figure(figsize=(7.5 * columns, 5.4 * rows), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, stage in zip(panels, stages, strict=False):
+        _panel(axes, stage)
+    for axes in panels[len(stages) :]:
+        axes.set_visible(False)
+    stream = io.BytesIO()
+    canvas.print_png(stream)
+    return stream.getvalue()
+
+
+def _panel(axes: Any, stage: StageResult) -> None:
+    accuracy = stage.stage.accuracy
+    shown = [each for each in stage.results if each.score(accuracy) == each.score(accuracy)]
+    colors = {name: f"C{number}" for number, name in enumerate(dict.fromkeys(map(_group, shown)))}
+    labeled: set[str] = set()
+    for each in shown:
+        group, point = _group(each), (each.cost(stage.cost), each.score(accuracy))
+        is_base = each.phase == "base"
+        axes.scatter(
+            *point,
+            s=160 if is_base else 30,
+            marker="*" if is_base else "o",
+            color=colors[group],
+            label=None if group in labeled else group,
+            zorder=3,
+        )
+        labeled.add(group)
+        if each.on_front:
+            axes.scatter(*point, s=180, facecolors="none", edgecolors="black", linewidths=1.1, zorder=4)
+        if each.phase != "joint":
+            text = ", ".join(str(value) for value in each.knobs.values())
+            axes.annotate(text, point, xytext=(6, 4), textcoords="offset points", fontsize=7)
+    axes.set_xlabel(COST_NAMES[stage.cost])
+    axes.set_ylabel(accuracy + (" (more is better)" if HIGHER_IS_BETTER[accuracy] else " (less is better)"))
+    axes.set_title(f"{stage.stage.name} (ringed: on the Pareto front)")
+    axes.set_xscale("log")
+    axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)
+    if shown:
+        axes.legend(fontsize=7)
+
+
+def _group(result: SettingResult) -> str:
+    if not result.knobs:
+        return "defaults"
+    return next(iter(result.knobs)) if len(result.knobs) == 1 else "several"

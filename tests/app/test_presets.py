@@ -1,0 +1,102 @@
+"""Presets: what they set in every command, what goes over them, and what is said of them."""
+
+from pathlib import Path
+
+import pytest
+
+from gsencoder.app.commands import COMMANDS
+from gsencoder.app.commands.fuse import FuseCommandConfig
+from gsencoder.app.commands.train import TrainCommandConfig
+from gsencoder.app.settings.compose import compose
+from gsencoder.app.settings.config import settings, typed
+from gsencoder.app.settings.help import command_help
+from gsencoder.app.settings.multirun import run_many
+from gsencoder.app.settings.options import options_by_key
+from gsencoder.app.settings.presets import PRESET_OPTIONS, PRESETS, describe_presets, preset_node, preset_values
+from gsencoder.core.errors import InputError
+from gsencoder.core.knobs import value_at
+
+
+def composed(*words: str) -> FuseCommandConfig:
+    return compose("fuse", FuseCommandConfig, ["ROOM", *words])
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_preset_changes_in_a_command_what_the_table_says_and_nothing_else(command: str) -> None:
+    cls = COMMANDS[command].load()[0]
+    for preset in PRESETS:
+        values = preset_values(cls, preset)
+        config = compose(command, cls, [f"preset={preset}"])
+        assert config.preset == preset
+        assert {key: value_at(config, key) for key in values} == values
+        defaults = options_by_key(cls)
+        back = {key: defaults[key].default for key in values}
+        restored = settings(config)
+        for key, value in {**back, "preset": "balanced"}.items():
+            *sections, name = key.split(".")
+            inner = restored
+            for section in sections:
+                inner = inner[section]
+            inner[name] = list(value) if isinstance(value, tuple) else value
+        assert restored == settings(cls())
+        # What differs from nothing is no change.
+        assert all(values[key] != back[key] for key in values)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_says_what_each_preset_changes_or_that_it_changes_nothing(command: str) -> None:
+    cls = COMMANDS[command].load()[0]
+    text = " ".join(command_help(command, "", cls, {}).split())
+    for preset in PRESETS:
+        described = describe_presets(cls)[preset]
+        assert f"preset={preset} {described}" in text
+        if not preset_values(cls, preset) and preset != "balanced":
+            assert described == "changes nothing in this command"
+
+
+def test_every_row_of_the_table_is_an_option_of_a_command() -> None:
+    known = {key for command in COMMANDS.values() for key in options_by_key(command.load()[0])}
+    keys = [each.key for each in PRESET_OPTIONS]
+    assert set(keys) <= known
+    assert len(set(keys)) == len(keys)
+    assert all(each.fast is not None or each.exact is not None for each in PRESET_OPTIONS)
+
+
+def test_balanced_is_the_defaults() -> None:
+    assert preset_node(FuseCommandConfig, "balanced") == {}
+    assert composed("preset=balanced") == composed()
+
+
+def test_the_command_line_goes_over_a_preset_wherever_it_stands() -> None:
+    for words in (["preset=exact", "rays_per_patch=9"], ["rays_per_patch=9", "preset=exact"]):
+        config = composed(*words)
+        assert config.fusion.blend.rays_per_patch == 9
+        assert config.fusion.max_rank == composed("preset=exact").fusion.max_rank == 0
+
+
+def test_an_experiment_goes_over_a_preset() -> None:
+    def trained(*words: str) -> TrainCommandConfig:
+        return compose("train", TrainCommandConfig, ["ROOMS", *words])
+
+    preset, experiment, both = (
+        trained(*words)
+        for words in (["preset=exact"], ["experiment=splatdistill"], ["preset=exact", "experiment=splatdistill"])
+    )
+    assert both.prepare.fusion.lift == experiment.prepare.fusion.lift
+    assert both.prepare.fusion.blend.rays_per_patch == preset.prepare.fusion.blend.rays_per_patch
+    assert both.preset == "exact"
+
+
+def test_an_unknown_preset_is_an_error_that_lists_them(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="^preset: expected one of balanced, exact, fast, got 'quick'"):
+        composed("preset=quick")
+    with pytest.raises(InputError, match="^preset: expected one of fast, balanced, exact, got 'quick'"):
+        typed(FuseCommandConfig, {"preset": "quick"})
+
+
+def test_presets_can_be_swept(tmp_path: Path) -> None:
+    seen = []
+    words = ["ROOM", "preset=fast,exact", f"out={tmp_path}", "quiet=true"]
+    run_many("fuse", FuseCommandConfig, words, lambda config: seen.append(config) or "")
+    assert [each.preset for each in seen] == ["fast", "exact"]
+    assert [each.fusion for each in seen] == [composed("preset=fast").fusion, composed("preset=exact").fusion]

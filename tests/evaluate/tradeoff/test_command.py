@@ -1,0 +1,122 @@
+"""`gsencoder tradeoff` on a small room: every stage is measured, written, drawn and continued."""
+
+import csv
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsencoder.app import cli
+from gsencoder.data.synthetic.room import make_room, write_room
+from gsencoder.text.table import make_text_table, save_text_table
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tradeoff") / "room"
+    room = make_room(0, objects=4, views=4, width=96, height=72)
+    write_room(room, folder)
+    names = sorted({one.name for one in room.objects if one.name})
+    vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(80, len(names))))[0].T.astype(np.float32)
+    save_text_table(folder / "words.safetensors", make_text_table(names, vectors, "t"))
+    return folder
+
+
+def words_of(scene: Path, *more: str) -> list[str]:
+    teacher = [f"teacher.words={scene / 'words.safetensors'}", "teacher.cell=8"]
+    return ["tradeoff", str(scene), *teacher, "seeds.voxel=0.05", "asked.min_views=1", "sweep.rounds=1", *more]
+
+
+def table_of(out: Path) -> dict[tuple[str, str], dict[str, str]]:
+    with open(out / "tradeoff.csv", newline="") as stream:
+        return {(row["stage"], row["setting"]): row for row in csv.DictReader(stream)}
+
+
+def data_of(page: Path) -> dict[str, Any]:
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page.read_text(), re.DOTALL)
+    assert found
+    data = json.loads(found[1])
+    assert isinstance(data, dict)
+    return data
+
+
+def test_fusion_is_measured_against_the_exact_features_and_the_budget_advises(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    sweep = ["sweep.knobs=rays_per_patch,min_weight,max_rank,views"]
+    sweep += ["sweep.values=rays_per_patch:1,min_weight:0.2,max_rank:1,views:2", "halving.settings=4"]
+    more = ["scaling.points=3", "scaling.rounds=1", "scaling.span=4", "budget.error=2", f"out={out}"]
+    assert cli.main(words_of(scene, *sweep, *more)) == 0
+    rows = {setting: row for (_, setting), row in table_of(out).items() if "," not in setting}
+    assert list(rows)[:5] == ["defaults", "views=2", "rays_per_patch=1", "min_weight=0.2", "max_rank=1"]
+    errors = {name: float(row["error"]) for name, row in rows.items()}
+    assert errors["defaults"] == min(errors.values())
+    assert float(rows["max_rank=1"]["rank"]) == 1
+    assert int(rows["max_rank=1"]["bytes"].split(".")[0]) < float(rows["defaults"]["bytes"])
+    assert float(rows["defaults"]["acc_25_things"]) == 3  # One of four is hidden from every camera.
+    printed = capsys.readouterr().out
+    assert "budget: " in printed
+    assert "fusion: CPU time grows as channels^" in printed
+    written = json.loads((out / "tradeoff.json").read_text())
+    assert {each["size"] for each in written["scaling"]} == {"gaussians", "views", "channels", "pixels"}
+    assert all(each["low"] <= each["exponent"] <= each["high"] for each in written["scaling"])
+    assert sum(row["phase"] == "joint" for row in written["settings"]) >= 1
+    page = out / "tradeoff.html"
+    assert data_of(page) == written
+    assert not re.search(r"(?:src|href)=|https?://(?!www.w3.org/2000/svg)", page.read_text())
+    with Image.open(out / "tradeoff.png") as plot:
+        assert plot.size[0] > 500
+    assert json.loads((out / "summary.json").read_text())["results"]["picked"].startswith("budget: ")
+    assert not (tmp_path / "out.tradeoff").exists()
+
+
+def test_words_packages_and_views_have_scores_of_their_own(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    sweep = ["sweep.knobs=relative,form,candidates", "sweep.values=relative:0.9,form:index/npz,candidates:4"]
+    sweep += ["choose.candidates=8", "choose.count=2", "choose.width=64", "choose.height=48", "quiet=true"]
+    stages = "stages=[localization,packages,views]"
+    assert cli.main(words_of(scene, stages, "preset=exact", *sweep, f"out={out}")) == 0
+    given = json.loads((out / "summary.json").read_text())["settings"]
+    assert given["preset"] == "exact"
+    assert (given["fusion"]["max_rank"], given["choose"]["candidates"]) == (0, 8)
+    rows = table_of(out)
+    assert set(rows) == {
+        ("localization", "defaults"), ("localization", "relative=0.9"), ("packages", "defaults"),
+        ("packages", "form=index"), ("packages", "form=npz"), ("views", "defaults"), ("views", "candidates=4"),
+    }  # fmt: skip
+    package, index, arrays = (rows["packages", each] for each in ("defaults", "form=index", "form=npz"))
+    assert float(index["bytes"]) < float(package["bytes"]) < float(arrays["bytes"])
+    assert float(arrays["error"]) < 1e-6
+    assert 0 < float(rows["views", "defaults"]["object_share"]) < 1
+    assert float(rows["views", "defaults"]["bytes"]) > 100
+    assert rows["localization", "defaults"]["error"] == ""
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["sweep.values=min_weight:2", "sweep.rounds=0", "sweep.values=views:-1", "sweep.values=energy:0", "stages=[]"],
+)
+def test_what_is_out_of_range_is_refused(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: str
+) -> None:
+    words = [word for word in words_of(scene) if not word.startswith("sweep.")]
+    assert cli.main([*words, wrong, f"out={tmp_path / 'out'}", "quiet=true"]) == 2
+    line = capsys.readouterr().err
+    assert re.split("[:=]", wrong.partition("=")[2])[0] in line or wrong.partition("=")[0] in line
+    assert len(line.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_stage_that_asks_for_words_needs_objects_that_have_names(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = words_of(scene, "stages=localization", "asked.min_pixels=100000", "quiet=true")
+    assert cli.main([*words, f"out={tmp_path / 'out'}"]) == 2
+    assert "scene room has no object to localize" in capsys.readouterr().err

@@ -1,0 +1,227 @@
+"""Sweeps: what is run in which order, what an interrupted one does again, and what results say of scenes."""
+
+from collections import Counter
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_stage import Toy, ToySettings
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.peak_memory import Growth
+from gsencoder.evaluate.tradeoff.halving import HalvingConfig
+from gsencoder.evaluate.tradeoff.measure import interleaved, measure
+from gsencoder.evaluate.tradeoff.records import RECORDS_FILE, Record, Records, Timing
+from gsencoder.evaluate.tradeoff.results import estimate, mark_front, pick_within, summarize
+from gsencoder.evaluate.tradeoff.stage import Judged, Score
+from gsencoder.evaluate.tradeoff.sweep import SweepConfig, check_sweep, settings_of, sweep_stage
+
+SCENES = [Path("/rooms/a"), Path("/rooms/b"), Path("/rooms/c")]
+
+
+@pytest.fixture(autouse=True)
+def _without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measuring memory collects garbage, which takes long beside all that tests have imported."""
+    monkeypatch.setattr("gsencoder.evaluate.tradeoff.measure.memory_growth", lambda: nullcontext(Growth()))
+
+
+def test_every_round_takes_every_setting_once_in_an_order_of_its_own() -> None:
+    order = list(interleaved(20, 4, seed=3))
+    assert [number for number, _ in order] == sorted(number for number, _ in order)
+    rounds = [[setting for number, setting in order if number == chosen] for chosen in range(4)]
+    assert all(sorted(each) == list(range(20)) for each in rounds)
+    assert len({tuple(each) for each in rounds}) == 4
+    assert order == list(interleaved(20, 4, seed=3)) != list(interleaved(20, 4, seed=4))
+
+
+def test_each_setting_is_warmed_up_and_judged_once_and_then_timed_in_each_round() -> None:
+    toy = Toy()
+    settings = [{}, {"effort": 1}, {"color": 2}]
+    rows = measure(toy.stage(), SCENES[:2], settings, Records(), rounds=3)
+    assert [[record.scene for record in row] for row in rows] == [["a", "b"]] * 3
+    assert Counter(toy.runs) == {(scene, replace(ToySettings(), **each)): 4 for scene in "ab" for each in settings}
+    assert len(toy.judged) == len(set(toy.judged)) == 6
+    # Judged ones come before timed ones.
+    assert toy.runs[:3] == toy.judged[:3]
+
+
+@pytest.mark.parametrize("fail_at", range(1, 19, 3))
+def test_an_interrupted_sweep_goes_on_where_it_was(tmp_path: Path, fail_at: int) -> None:
+    settings = [{}, {"effort": 1}, {"color": 2}]
+    whole = Toy()
+    expected = measure(whole.stage(), SCENES[:2], settings, Records(), rounds=2)
+    toy = Toy()
+    toy.fail_at = fail_at
+    with pytest.raises(KeyboardInterrupt):
+        measure(toy.stage(), SCENES[:2], settings, Records(tmp_path), rounds=2)
+    before = len(toy.judged)
+    toy.fail_at = None
+    rows = measure(toy.stage(), SCENES[:2], settings, Records(tmp_path), rounds=2)
+    assert [[record.scores for record in row] for row in rows] == [
+        [record.scores for record in row] for row in expected
+    ]
+    assert {len(record.timings) for row in rows for record in row} == {2}
+    # Nothing is judged twice, and no run is timed twice: warm-up runs alone are repeated.
+    assert len(toy.judged) == len(set(toy.judged)) == 6
+    assert before < 6 or fail_at > 12
+    assert len(toy.runs) <= len(whole.runs) + 3
+    again = len(toy.runs)
+    measure(toy.stage(), SCENES[:2], settings, Records(tmp_path), rounds=2)
+    assert len(toy.runs) == again
+
+
+def test_a_line_that_a_kill_cut_off_is_measured_again_and_a_damaged_one_refused(tmp_path: Path) -> None:
+    toy = Toy()
+    measure(toy.stage(), SCENES[:1], [{}], Records(tmp_path), rounds=2)
+    file = tmp_path / RECORDS_FILE
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-5])
+    (row,) = measure(toy.stage(), SCENES[:1], [{}], Records(tmp_path), rounds=2)
+    assert len(row[0].timings) == 2
+    assert len(file.read_bytes().splitlines()) == len(whole.splitlines())
+    file.write_bytes(b'{"stage": 3}\n')
+    with pytest.raises(InputError, match="line 1 is damaged .*resume=false"):
+        Records(tmp_path)
+
+
+def test_measurements_of_another_sweep_are_not_mixed_in(tmp_path: Path) -> None:
+    Records(tmp_path, {"scenes": 1})
+    Records(tmp_path, {"scenes": 1})
+    with pytest.raises(InputError, match="holds measurements of a sweep with other settings; give resume=false"):
+        Records(tmp_path, {"scenes": 2})
+
+
+def test_numbers_that_are_not_finite_survive_the_file(tmp_path: Path) -> None:
+    records = Records(tmp_path)
+    records.add_timing("fusion", "a", {"x": 1}, Timing(seconds=1.0, cpu_seconds=0.5, mib=float("nan")))
+    records.add_judged("fusion", "a", {"x": 1}, Judged(scores={"cosine": Score(float("nan"), 1)}, bytes=7))
+    read = Records(tmp_path).get("fusion", "a", {"x": 1})
+    assert read.timings[0].seconds == 1.0
+    assert np.isnan(read.timings[0].mib)
+    assert np.isnan(read.scores["cosine"].total)
+    assert read.bytes == 7
+
+
+def test_one_knob_is_changed_at_a_time_and_the_base_comes_first() -> None:
+    stage = Toy().stage()
+    assert settings_of(stage, SweepConfig()) == [
+        {},
+        {"effort": 1},
+        {"effort": 2},
+        {"effort": 8},
+        {"color": 1},
+        {"color": 2},
+    ]
+    assert settings_of(stage, SweepConfig(knobs=("color",), values=("color:0/7",))) == [{}, {"color": 7}]
+    assert len(settings_of(stage, SweepConfig(grid=True))) == 4 * 3
+
+
+@pytest.mark.parametrize(
+    ("sweep", "message"),
+    [
+        (SweepConfig(knobs=("rays",)), "^knobs: 'rays' is no knob of fusion; expected some of effort, color"),
+        (SweepConfig(values=("rays:1",)), "^values: 'rays' is no knob"),
+        (SweepConfig(values=("effort:1", "effort:2")), "^values: effort is given twice"),
+        (SweepConfig(values=("effort",)), "^values: expected KNOB:VALUE/VALUE, got 'effort'"),
+        (SweepConfig(values=("effort:much",)), "^effort: expected a whole number, got 'much'"),
+        (SweepConfig(values=("effort:0",)), "^effort=0: effort: expected 1 or more"),
+    ],
+)
+def test_a_sweep_that_cannot_be_is_refused_at_once(sweep: SweepConfig, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        check_sweep([Toy().stage()], sweep)
+
+
+def test_a_knob_without_effect_does_not_matter_and_is_not_changed_with_others() -> None:
+    toy = Toy()
+    result = sweep_stage(toy.stage(), SCENES, Records(), SweepConfig(rounds=1), HalvingConfig(settings=50))
+    assert result.matter == ("effort",)
+    assert {knob for each in result.results if each.phase == "joint" for knob in each.knobs} <= {"effort"}
+    assert [rung.scenes for rung in result.rungs] == [1, 3]
+    # Cost and error of the toy trade against each other, so nothing that was tried with the knob is beaten.
+    assert all(each.on_front for each in result.results if "color" not in each.knobs)
+    assert result.results[0].phase == "base"
+
+
+def test_a_knob_that_needs_another_is_tried_beside_it_and_judged_against_that() -> None:
+    stage = Toy().stage()
+    effort, color = stage.knobs
+    # The color has no effect of its own; against the base it would seem to have that of the effort.
+    stage = replace(stage, knobs=(effort, replace(color, needs={"effort": 8})))
+    sweep = SweepConfig(rounds=1, knobs=("color",))
+    assert settings_of(stage, sweep) == [{}, {"effort": 8}, {"effort": 8, "color": 1}, {"effort": 8, "color": 2}]
+    assert sweep_stage(stage, SCENES, Records(), sweep).matter == ("effort",)
+
+
+def test_settings_of_the_joint_part_that_were_measured_before_are_not_measured_again() -> None:
+    toy = Toy()
+    sweep_stage(toy.stage(), SCENES, Records(), SweepConfig(rounds=1), HalvingConfig(settings=50))
+    assert max(Counter(toy.runs).values()) == 2
+
+
+def record(scene: str, cpu: list[float], scores: dict[str, Score] | None = None, **knobs: int) -> Record:
+    timings = tuple(Timing(seconds=2 * value, cpu_seconds=value, mib=10.0) for value in cpu)
+    return Record(
+        stage="fusion", scene=scene, knobs=knobs, timings=timings, judged=Judged(scores=scores or {}, bytes=1)
+    )
+
+
+def test_times_are_medians_over_rounds_and_means_over_scenes_and_ratios_are_of_the_same_round() -> None:
+    base = [record("a", [1.0, 2.0, 3.0]), record("b", [10.0, 20.0, 30.0])]
+    half = [record("a", [0.5, 1.0, 1.5], views=1), record("b", [5.0, 10.0, 15.0], views=1)]
+    result = summarize(half, base, "one at a time")
+    assert (result.cpu_seconds, result.seconds) == (5.5, 11.0)
+    assert result.ratio == pytest.approx(0.5)
+    assert result.ratio_error == pytest.approx(0)
+    assert result.spread == pytest.approx(1.4826 * 0.5)
+
+
+def test_a_score_counts_things_and_its_error_is_that_of_scenes() -> None:
+    value, error, things = estimate([Score(3, 4), Score(1, 4)])
+    assert (value, things) == (0.5, 8)
+    # With as many things in each scene it is the standard error of the mean of the scenes' shares.
+    assert error == pytest.approx(np.std([0.75, 0.25], ddof=1) / np.sqrt(2))
+    assert np.isnan(estimate([Score(3, 4)]).error)
+    assert np.isnan(estimate([Score(0, 0)]).value)
+    # A scene without things says nothing, and changes nothing but the number of scenes.
+    assert estimate([Score(3, 4), Score(1, 4), Score(0, 0)]).value == 0.5
+
+
+def test_standard_errors_hold_the_truth_as_often_as_they_say() -> None:
+    generator = np.random.default_rng(0)
+    inside = 0
+    for _ in range(1000):
+        chance = generator.beta(8, 2, size=40)
+        things = generator.integers(4, 15, size=40)
+        hits = generator.binomial(things, chance)
+        value, error, _ = estimate([Score(float(h), float(n)) for h, n in zip(hits, things, strict=True)])
+        inside += abs(value - 0.8) <= 1.96 * error
+    assert 0.92 < inside / 1000 < 0.98
+
+
+def test_the_front_is_drawn_among_settings_of_as_many_scenes() -> None:
+    def result(cpu: float, error: float, scenes: int = 2, **knobs: int):  # type: ignore[no-untyped-def]
+        rows = [record(name, [cpu], {"error": Score(error)}, **knobs) for name in "ab"[:scenes]]
+        return summarize(rows, rows, "grid")
+
+    marked = mark_front(
+        [result(1.0, 0.3), result(2.0, 0.2, n=1), result(3.0, 0.25, n=2), result(0.1, 0.0, scenes=1, n=3)],
+        "error",
+        "cpu_seconds",
+    )
+    assert [each.on_front for each in marked] == [True, True, False, False]
+
+
+def test_a_limit_of_error_takes_the_cheapest_and_one_of_seconds_the_most_exact() -> None:
+    def result(seconds: float, error: float, **knobs: int):  # type: ignore[no-untyped-def]
+        rows = [record("a", [seconds / 2], {"error": Score(error)}, **knobs)]
+        return summarize(rows, rows, "grid")
+
+    trades = [result(3.0, 0.1), result(2.0, 0.2, n=1), result(1.0, 0.3, n=2)]
+    assert pick_within(trades, None, 0.25).knobs == {"n": 1}
+    assert pick_within(trades, 2.5, None).knobs == {"n": 1}
+    assert pick_within(trades, 5.0, 0.3).knobs == {"n": 2}
+    with pytest.raises(InputError, match=r"fastest \(n=2\).*most exact \(defaults\)"):
+        pick_within(trades, 0.5, None)
