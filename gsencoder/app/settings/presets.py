@@ -34,7 +34,7 @@ class PresetOption:
 
 
 PRESET_OPTIONS = (
-    PresetOption(key="fusion.view_share", fast=0.67),
+    PresetOption(key="fusion.view_share", fast=0.5),
     PresetOption(key="fusion.blend.rays_per_patch", exact=196),
     PresetOption(key="fusion.blend.stop_transmittance", fast=0.1, exact=1e-6),
     PresetOption(key="fusion.energy", exact=1.0),

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 from gsencoder.core.knobs import exact_settings
@@ -43,6 +42,4 @@ def fusion_stage(inputs: Inputs) -> Stage:
         with taught_scene(path, inputs) as taught:
             yield FusionScene(taught, inputs.fusion)
 
-    # A number of views is a number of those that the scene has.
-    base = replace(inputs.fusion)
-    return Stage(name="fusion", knobs=FUSION_KNOBS, base=base, open=opened, accuracy="error")
+    return Stage(name="fusion", knobs=FUSION_KNOBS, base=inputs.fusion, open=opened, accuracy="error")
