@@ -107,7 +107,8 @@ def test_help_of_a_command_lists_every_setting_with_default_and_meaning(
     text = " ".join(capsys.readouterr().out.split())
     for option in options_of(COMMANDS[name].load()[0]):
         assert f"{option.key}=" in text or option.key == "paths"
-        assert option.help in text
+        # A preset is described by what it sets in this command.
+        assert option.help in text or option.key == "preset"
     assert "out=" in text
     assert "[false]" in text
 
@@ -128,6 +129,7 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
         "out": "null",
         "overwrite": False,
         "quiet": False,
+        "preset": "balanced",
         "paths": ["a b.ply"],
         "fix": ["quats", "huge"],
         "views": 0,

@@ -57,6 +57,7 @@ def test_events_and_pictures_are_written_for_tensorboard(tmp_path: Path) -> None
     log.picture(0, "validation/sheet", np.zeros((4, 4, 3), np.uint8))
     assert list((tmp_path / "tensorboard").glob("events*"))
     assert shown(tmp_path / "tensorboard") == [(0, 1.0)]
+    assert (tmp_path / "validation" / "sheet_000000.png").is_file()
 
 
 def shown(folder: Path) -> list[tuple[int, float]]:
@@ -98,4 +99,3 @@ def test_an_event_that_cannot_be_written_is_an_error_of_the_caller_that_names_th
     monkeypatch.setattr(Path, "open", full)
     with pytest.raises(InputError, match=r"tensorboard/events\.out\.tfevents\S*: cannot write: No space left"):
         log.add(1, {"loss": 1.0})
-    assert (tmp_path / "validation" / "sheet_000000.png").is_file()

@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.entries import box_corners
 from gsencoder.infer.ask.ask import Question
-from gsencoder.infer.ask.predictions import predictions, said, short_answer, target_corners, wrapped
+from gsencoder.infer.ask.predictions import predictions, said, short_answer, target_corners
 from gsencoder.infer.ask.question_sets import QuestionSet, caption_question, is_question_set, read_question_set
 
 
@@ -142,4 +143,4 @@ def test_what_was_said_is_on_one_line_and_loses_thoughts_and_the_last_stops() ->
     assert said("<think>no</think>  A\n b. ") == "A b."
     assert short_answer("It is 3.5. ..") == "it is 3.5."
     assert short_answer("...") == ""
-    assert wrapped("It is. It IS.") == "sos it is . it is . eos"
+    assert wrapped_caption("It is. It IS.") == "sos it is . it is . eos"
