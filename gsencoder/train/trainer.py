@@ -221,7 +221,7 @@ class Trainer:
             device_ids = [device.index] if device.type == "cuda" else None
             called = self._parallel = nn.parallel.DistributedDataParallel(called, device_ids=device_ids)
         self.objective = objective(called)
-        self._autocast = autocast_dtype(config.precision, device)
+        self._autocast = autocast_dtype(config.precision, device, training=True)
 
     def run(self, track: Track = untracked) -> TrainingState:
         """Runs the remaining steps.

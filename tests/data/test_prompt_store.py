@@ -8,6 +8,7 @@ import pytest
 from tuning_pairs import png
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.sealed_rows import sealed
 from gsencoder.data.prompt_store import PICTURES_FOLDER, PROMPTS_FILE, TOKENS_FOLDER, PromptStore
 
 
@@ -140,6 +141,6 @@ def test_folders_of_pictures_are_there_once_and_damaged_files_are_named(tmp_path
 )
 def test_names_that_leave_the_folder_are_no_prompt(tmp_path: Path, changes: dict[str, object]) -> None:
     row = {"key": "a", "text": "t", "pictures": ["x.png"], "tokens": "", "space": ""}
-    (tmp_path / PROMPTS_FILE).write_text(json.dumps(row) + "\n" + json.dumps(row | changes) + "\n")
-    with pytest.raises(InputError, match="line 2 is no prompt; remove the folder to prepare it anew"):
+    (tmp_path / PROMPTS_FILE).write_text(json.dumps(sealed(row)) + "\n" + json.dumps(sealed(row | changes)) + "\n")
+    with pytest.raises(InputError, match="line 2 is no prompt, or not as it was written; remove the folder to make it"):
         PromptStore(tmp_path)

@@ -87,14 +87,12 @@ def test_vertices_lie_in_the_frame_of_the_gaussians_and_take_masks_from_the_near
     assert semantic_truth(points, CLASSES).tolist() == [4, 0, 0]
 
 
-def test_a_class_of_id_0_is_refused_since_points_of_no_class_have_it() -> None:
+def test_a_class_may_have_the_id_0_among_labels_and_not_among_instances() -> None:
     classes = ClassTable(names=("bed", "chair"), ids=(0, 5))
     gaussians, features = line_of([BED, UNSEEN])
     points = points_at(None, 2)
-    for call in (
-        lambda: semantic_truth(points, classes),
-        lambda: predict_semantics(points, gaussians, features, classes, WORDS),
-        lambda: true_instances(points, classes),
-    ):
-        with pytest.raises(InputError, match="classes: 'bed' has the id 0, which stands for no class"):
-            call()
+    # Points of no class then have ScanNet++'s ignore label.
+    assert predict_semantics(points, gaussians, features, classes, WORDS).tolist() == [0, -100]
+    assert -100 in semantic_truth(points, classes).tolist()
+    with pytest.raises(InputError, match="classes: 'bed' has the id 0, which files of instances cannot hold"):
+        true_instances(points, classes)

@@ -143,4 +143,4 @@ def test_what_was_said_is_on_one_line_and_loses_thoughts_and_the_last_stops() ->
     assert said("<think>no</think>  A\n b. ") == "A b."
     assert short_answer("It is 3.5. ..") == "it is 3.5."
     assert short_answer("...") == ""
-    assert wrapped_caption("It is. It IS.") == "sos it is . it is . eos"
+    assert wrapped_caption("it is. it is.") == "sos it is . it is . eos"

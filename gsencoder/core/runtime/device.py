@@ -30,11 +30,11 @@ def choose_device(name: Device, local_rank: int = 0) -> torch.device:
     return torch.device("cuda", local_rank)
 
 
-def autocast_dtype(precision: Precision, device: torch.device) -> torch.dtype | None:
+def autocast_dtype(precision: Precision, device: torch.device, *, training: bool = False) -> torch.dtype | None:
     """The type for torch.autocast on a device; None for float32 throughout.
 
-    "auto" is bfloat16 on NVIDIA GPUs since Ampere and on CPUs that multiply it, in AMX tiles or by AVX512_BF16, and
-    float32 elsewhere, where bfloat16 is slower.
+    "auto" is bfloat16 on NVIDIA GPUs since Ampere and on CPUs with AMX tiles, without training also on those with
+    AVX512_BF16, and float32 elsewhere, where bfloat16 is slower.
     """
     if precision == "float32":
         return None
@@ -42,7 +42,7 @@ def autocast_dtype(precision: Precision, device: torch.device) -> torch.dtype | 
         return torch.bfloat16
     if device.type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else None
-    multiplied = torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
+    multiplied = torch.cpu._is_amx_tile_supported() or (not training and torch.cpu._is_avx512_bf16_supported())
     return torch.bfloat16 if multiplied else None
 
 
