@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.written_files import sha256_of
 from gsencoder.data.readers.images import check_picture
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.video.decode import SUFFIXES as VIDEO_SUFFIXES
@@ -175,7 +176,7 @@ def load_placement(folder: Path, work: Path, config: SfmConfig = SfmConfig()) ->
 
 def _digests(model: Path) -> dict[str, str]:
     """The SHA-256 of each file of a model."""
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(model.iterdir())}
+    return {path.name: sha256_of(path) for path in sorted(model.iterdir())}
 
 
 def _digest(record: Mapping[str, Any]) -> str:

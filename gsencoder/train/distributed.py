@@ -22,8 +22,6 @@ from gsencoder.core.runtime.threads import available_cores
 
 T = TypeVar("T")
 
-MAX_VALUE = 64
-"""Largest number of characters of a value that processes compare."""
 STOPPED_ELSEWHERE = "another process stopped; its own message says why"
 WAIT_HOURS = 24.0
 """Longest wait for other processes, which may be preparing scenes or validate. One that dies ends the wait at once."""
@@ -153,7 +151,7 @@ def digest_of_weights(network: torch.nn.Module) -> str:
 
 def sum_over_processes(values: Tensor) -> Tensor:
     """Sums each entry over all processes, in place; with one process the values are unchanged."""
-    if distributed.is_available() and distributed.is_initialized():
+    if _in_group():
         distributed.all_reduce(values)
     return values
 
@@ -168,7 +166,7 @@ def summed_array(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]
 
 def value_of_first(value: T) -> T:
     """The value of the first process, in all of them; with one process its own."""
-    if not (distributed.is_available() and distributed.is_initialized()):
+    if not _in_group():
         return value
     values = [value]
     distributed.broadcast_object_list(values, src=0)
@@ -177,7 +175,7 @@ def value_of_first(value: T) -> T:
 
 def values_of_all(value: T) -> list[T]:
     """The values of all processes, by rank, in all of them; with one process its own."""
-    if not (distributed.is_available() and distributed.is_initialized()):
+    if not _in_group():
         return [value]
     values: list[T | None] = [None] * distributed.get_world_size()
     distributed.all_gather_object(values, value)
@@ -186,7 +184,7 @@ def values_of_all(value: T) -> list[T]:
 
 def current_process() -> ProcessRank:
     """The rank of this process in the group that it has joined; the only one without a group."""
-    if not (distributed.is_available() and distributed.is_initialized()):
+    if not _in_group():
         return ProcessRank()
     return ProcessRank(rank=distributed.get_rank(), world_size=distributed.get_world_size())
 
@@ -199,8 +197,13 @@ def cpu_share(process: ProcessRank, threads: int = 0) -> int:
     return torch.get_num_threads() if process.world_size == 1 else max(1, available_cores() // process.local_world_size)
 
 
+def _in_group() -> bool:
+    """Whether this process has joined others (`join_processes`)."""
+    return distributed.is_available() and distributed.is_initialized()
+
+
 def _is_nccl() -> bool:
-    return distributed.is_available() and distributed.is_initialized() and distributed.get_backend() == "nccl"
+    return _in_group() and distributed.get_backend() == "nccl"
 
 
 def check_agreement(what: str, value: str, advice: str = "give all processes the same files") -> None:
@@ -208,22 +211,13 @@ def check_agreement(what: str, value: str, advice: str = "give all processes the
 
     Args:
         what: what it is the value of, for the error.
-        value: of this process, at most `MAX_VALUE` characters of ASCII; empty = this process has none, and any fits.
+        value: of this process; empty = it has none, and any fits.
         advice: what to do where they differ.
 
     Raises:
         InputError: in every process: two processes have different values; both are named.
     """
-    if not (distributed.is_available() and distributed.is_initialized()):
-        return
-    own = torch.zeros(MAX_VALUE, dtype=torch.uint8)
-    own[: len(value)] = torch.frombuffer(bytearray(value.encode("ascii")), dtype=torch.uint8) if value else own[:0]
-    if _is_nccl():
-        own = own.cuda()
-    gathered = [torch.zeros_like(own) for _ in range(distributed.get_world_size())]
-    distributed.all_gather(gathered, own)
-    values = [bytes(each.tolist()).rstrip(b"\0").decode("ascii") for each in gathered]
-    known = [(rank, each) for rank, each in enumerate(values) if each]
+    known = [(rank, each) for rank, each in enumerate(values_of_all(value)) if each]
     for rank, each in known:
         if each != known[0][1]:
             raise InputError(

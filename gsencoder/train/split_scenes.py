@@ -34,42 +34,33 @@ def split_scenes(
                 f"holdout: no scene is called {pattern!r}; the scenes are {listed(names, 5)}; give names of these, or "
                 "holdout=[] for none (experiments hold out scenes of the data that they are made for)"
             )
-    if split is not None or holdout_split is not None:
-        return _split_by_files(paths, patterns, split, holdout_split)
-    is_held_out = [any(fnmatch(name, pattern) for pattern in patterns) for name in names]
-    held_out = [path for path, held in zip(paths, is_held_out, strict=True) if held]
-    training = [path for path, held in zip(paths, is_held_out, strict=True) if not held]
-    if not training:
-        raise InputError("holdout: matches every scene; at least one must remain for training")
-    return training, held_out
-
-
-def _split_by_files(
-    paths: Sequence[Path], patterns: Sequence[str], split: Path | None, holdout_split: Path | None
-) -> tuple[list[Path], list[Path]]:
-    path_of = {path.name: path for path in paths}
-    chosen: dict[str, tuple[str, ...]] = {}
-    for option, file in (("split", split), ("holdout_split", holdout_split)):
-        chosen[option] = read_split(file) if file is not None else ()
-        missing = [name for name in chosen[option] if name not in path_of]
-        if missing:
-            raise InputError(
-                f"{option}={file}: {len(missing)} of its {len(chosen[option])} scenes are not among those given, such "
-                f"as {missing[0]!r}"
-            )
-    held_out = set(chosen["holdout_split"])
-    if holdout_split is not None and patterns:
-        raise InputError("holdout: expected holdout= or holdout_split=, got both; leave one out, or give holdout=[]")
+    trained = _names_of("split", split, names) or tuple(names)
+    held_out = set(_names_of("holdout_split", holdout_split, names))
     if holdout_split is None:
-        held_out = {name for name in path_of if any(fnmatch(name, pattern) for pattern in patterns)}
-    twice = sorted(held_out & set(chosen["split"])) if holdout_split is not None else []
-    if twice:
+        held_out = {name for name in names if any(fnmatch(name, pattern) for pattern in patterns)}
+    elif patterns:
+        raise InputError("holdout: expected holdout= or holdout_split=, got both; leave one out, or give holdout=[]")
+    elif split is not None and (twice := sorted(held_out.intersection(trained))):
         raise InputError(
             f"holdout_split={holdout_split}: {len(twice)} of its scenes are in split= too, such as {twice[0]!r}; a "
             "scene is trained on or held out"
         )
-    trained = chosen["split"] if split is not None else tuple(path_of)
+    path_of = dict(zip(names, paths, strict=True))
     training = [path_of[name] for name in trained if name not in held_out]
     if not training:
         raise InputError("holdout: matches every scene; at least one must remain for training")
     return training, [path for path in paths if path.name in held_out]
+
+
+def _names_of(option: str, file: Path | None, given: Sequence[str]) -> tuple[str, ...]:
+    """The names in a split file, none without a file; all must be among those given."""
+    if file is None:
+        return ()
+    chosen, known = read_split(file), frozenset(given)
+    missing = [name for name in chosen if name not in known]
+    if missing:
+        raise InputError(
+            f"{option}={file}: {len(missing)} of its {len(chosen)} scenes are not among those given, such as "
+            f"{missing[0]!r}"
+        )
+    return chosen

@@ -1,6 +1,5 @@
 """Frames of a video as photographs in a folder."""
 
-import hashlib
 import json
 import shutil
 import warnings
@@ -14,6 +13,7 @@ from jaxtyping import UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.written_files import sha256_of
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.video.choose import SIZE, choose_frames, follow
 from gsencoder.data.video.decode import Video, color_picture, grey_picture
@@ -109,7 +109,7 @@ def take_frames(
             _write(folder / names[-1], color_picture(frame, config.pixels, video.pixel_aspect))
         if index == chosen[-1]:
             break
-    digests = {name: _sha256(folder / name) for name in names}
+    digests = {name: sha256_of(folder / name) for name in names}
     with atomic_file(folder / RECORD_FILE) as stream:
         stream.write(json.dumps({"asked": inputs, "files": digests}).encode())
     return tuple(names)
@@ -125,7 +125,7 @@ def _taken(folder: Path, inputs: dict[str, Any]) -> tuple[str, ...] | None:
     try:
         record = json.loads((folder / RECORD_FILE).read_text(encoding="utf-8"))
         files = record["files"]
-        if record["asked"] != inputs or any(_sha256(folder / name) != digest for name, digest in files.items()):
+        if record["asked"] != inputs or any(sha256_of(folder / name) != digest for name, digest in files.items()):
             return None
         return tuple(files)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -141,7 +141,3 @@ def _write(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
     from gsencoder.core.files.picture_file import write_picture
 
     write_picture(path, picture, quality=QUALITY, subsampling=0)
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
