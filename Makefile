@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 VIEWER := gsencoder/infer/viewer/static/viewer.js
 VIEWER_SOURCES := $(wildcard viewer/src/* viewer/*.json viewer/*.mjs viewer/*.py)
 
-.PHONY: help setup viewer demo test test-fast stability lint check gpu clean
+.PHONY: help setup viewer demo test test-fast stability lint check gpu cli docs clean
 help:            ## what can be made
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
 
@@ -59,5 +59,16 @@ check: lint test ## what continuous integration runs
 gpu: setup       ## ten minutes on a GPU: parity with the CPU and costs, as gpu.md and gpu.json (runs on a CPU too: GPU=--small)
 	$(BIN)/python bench/gpu.py --out gpu.md $(GPU)
 
+cli: setup       ## docs/cli.md, the reference of the command line, from the code
+	$(BIN)/python docs/tooling/cli_page.py
+
+$(VENV)/.docs: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	@touch $@
+
+# The theme's notice of its end of life is no warning about these pages.
+docs: $(VENV)/.docs ## the documentation as a site, in site/; links that lead nowhere are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+
 clean:           ## remove the environment and every output
-	rm -rf $(VENV) outputs build dist
+	rm -rf $(VENV) outputs build dist site

@@ -6,7 +6,9 @@ python examples/02_blend_is_a_matrix.py outputs/demo/room
 
 import sys
 
+import numpy as np
 import torch
+from PIL import Image
 
 from gsencoder import load_scene, seed
 from gsencoder.render import blend
@@ -19,6 +21,14 @@ def main(folder: str) -> None:
     # B for the first camera: one row a patch of 8 × 8 pixels, one column a Gaussian. It depends on geometry alone.
     b = blend(gaussians, scene.views.cameras, 0, patch=8)
     print(f"B: {b.rows:,} patches × {b.gaussians:,} Gaussians, {len(b.weight):,} entries that are not zero")
+
+    # Colors, from the spherical harmonics of degree 0, as the matrix renders them: one mean color a patch.
+    colors = 0.5 + 0.2820948 * torch.as_tensor(gaussians.sh[:, 0])
+    patches = (255 * b.render(colors).clamp(0, 1)).byte().reshape(*b.shape, 3).numpy()
+    patches = patches.repeat(8, axis=0).repeat(8, axis=1)
+    photograph = scene.views.images[0][: len(patches), : patches.shape[1]]
+    Image.fromarray(np.hstack([photograph, patches[: len(photograph)]])).save("patches.png")
+    print("patches.png: the photograph, and B @ colors")
 
     # Any number of channels is rendered at once: here 64.
     values = torch.randn(len(gaussians), 64, requires_grad=True)

@@ -7,7 +7,12 @@ python examples/03_encode_a_splat.py outputs/demo/room table,chair
 import sys
 from dataclasses import replace
 
-from gsencoder import load_encoder, load_scene, localize, save_features, seed
+import numpy as np
+import torch
+from PIL import Image
+
+from gsencoder import load_encoder, load_scene, localize, render_image, save_features, save_splat, seed
+from gsencoder.render import blend
 
 
 def main(folder: str, words: str) -> None:
@@ -22,12 +27,23 @@ def main(folder: str, words: str) -> None:
     # It knows the names that it was trained on; the words lie beside the weights.
     scene = replace(scene, features={features.space.name: features})
     localization = localize(scene, words.split(","), encoder.words)
-    for word, threshold in zip(localization.queries, localization.thresholds, strict=True):
-        scores = [f"{box.score:.2f}" for box in localization.boxes if box.query == word]
-        print(f"{word}: {len(scores)} boxes above {threshold:.2f} ({', '.join(scores) or 'none'})")
+    for word in localization.queries:
+        boxes = [box for box in localization.boxes if box.query == word]
+        best = f", the best with probability {boxes[0].probability:.2f}" if boxes else ""
+        print(f"{word}: {len(boxes)} boxes{best}")
+
+    # Features as colors: their three principal directions, of which each render is a product with B.
+    values = torch.as_tensor(features.features[:, :3])
+    values = (values - values.mean(0)) / (4 * values.std(0)) + 0.5
+    b = blend(scene.gaussians, scene.views.cameras, 0)
+    colors = (255 * b.render(values.clamp(0, 1)).clamp(0, 1)).byte().reshape(*b.shape, 3).numpy()
+    picture = render_image(scene.gaussians, scene.views.cameras, 0, blended=b)
+    Image.fromarray(np.hstack([picture, colors])).save("encoded.png")
 
     # A folder of features is what `gsencoder localize`, `views`, `ask` and `pack` take.
     save_features("encoded", scene, features, {"encoder": "house_cpu"})
+    save_splat("room.ply", scene.gaussians)
+    print("encoded.png: view 0, and its features as colors; encoded: the features; room.ply: the splat alone")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Finds a word in a splat with an exported encoder, without torch.
 
 gsencoder export out=encoder.onnx
-python examples/05_onnx_without_torch.py encoder.onnx room.ply mug
+python examples/05_onnx_without_torch.py encoder.onnx room.ply table   # room.ply is from 03_encode_a_splat.py
 """
 
 import sys
@@ -16,9 +16,9 @@ def main(model: str, splat: str, word: str) -> None:
     gaussians = load_splat(splat)
     features = encoder.encode(gaussians)  # of a splat in metres; else give metres_per_unit=
     scene = Scene(name="scene", gaussians=gaussians, features={features.space.name: features})
-    for box in localize(scene, [word], encoder.words).boxes:
+    for box in localize(scene, [word], encoder.words).boxes[:3]:  # best first
         size = " × ".join(f"{side:.2f}" for side in box.aabb_max - box.aabb_min)
-        print(f"{word} at {box.center.round(2)}, {size}, score {box.score:.2f}")
+        print(f"{word} at {box.center.round(2)}, {size}, probability {box.probability:.2f}")
 
 
 if __name__ == "__main__":

@@ -6,9 +6,11 @@ import importlib.util
 import inspect
 import re
 import shlex
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -260,6 +262,36 @@ def test_make_targets_exist(page: Path) -> None:
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     asked = set(re.findall(r"(?:^|\s|`)make ((?:[A-Z]+=\S+ )?[a-z][\w-]*)(?=`|\s+#|$)", text_of(page), re.MULTILINE))
     assert {name.split()[-1] for name in asked} <= targets
+
+
+def loaded(name: str) -> ModuleType:
+    """A script of docs/tooling."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "tooling" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # Its dataclasses look up the names of their module.
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_reference_of_the_command_line_is_what_make_cli_writes() -> None:
+    assert text_of(ROOT / "docs" / "cli.md") == loaded("cli_page").page()
+
+
+def test_the_reference_has_every_command_and_every_option() -> None:
+    text = text_of(ROOT / "docs" / "cli.md")
+    headings = set(re.findall(r"^### (\w+)$", text, re.MULTILINE))
+    rows = set(re.findall(r"^\| `([\w.]+)` \|", text, re.MULTILINE))
+    assert set(COMMANDS) <= headings
+    for command in COMMANDS:
+        assert set(choices(command).options) - {"paths"} <= rows
+
+
+def test_every_document_is_in_the_navigation_of_the_site() -> None:
+    listed = set(re.findall(r": ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert {page.name for page in PAGES if page.parent.name == "docs"} <= listed
 
 
 def test_modules_in_the_table_of_moves_are_gone_from_their_old_places() -> None:

@@ -34,7 +34,9 @@ COMMANDS = {
     command.name: command
     for command in (
         Command(
-            name="demo", config="DemoConfig", help="run the pipeline on a built-in scene, offline, and write a report"
+            name="demo",
+            config="DemoConfig",
+            help="run the whole pipeline on a built-in room, offline, and write a report",
         ),
         Command(
             name="reconstruct",
@@ -89,7 +91,7 @@ COMMANDS = {
             config="ViewConfig",
             help="look at a scene and its features in a browser, and search it; or write that as one file",
         ),
-        Command(name="ask", config="AskCommandConfig", help="ask a vision-language model about such views"),
+        Command(name="ask", config="AskCommandConfig", help="ask a vision-language model about views of a scene"),
         Command(
             name="questions",
             config="QuestionsCommandConfig",
@@ -101,7 +103,12 @@ COMMANDS = {
             help="train adapters of a vision-language model on questions about scenes and their answers",
             several=True,
         ),
-        Command(name="evaluate", config="EvaluateConfig", help="compute metrics on labeled scenes", several=True),
+        Command(
+            name="evaluate",
+            config="EvaluateConfig",
+            help="score boxes, names, masks and views on labeled scenes",
+            several=True,
+        ),
         Command(
             name="score",
             config="ScoreConfig",
@@ -110,9 +117,15 @@ COMMANDS = {
         Command(
             name="tradeoff",
             config="TradeoffConfig",
-            help="measure the seconds and the accuracy of each setting of fusion",
+            help="measure what each knob of a stage costs and gains, alone and together",
         ),
-        Command(name="inspect", config="InspectConfig", help="show the contents and the defects of a splat file"),
-        Command(name="repair", config="RepairConfig", help="repair the defects of a splat file and report the changes"),
+        Command(
+            name="inspect", config="InspectConfig", help="show what a scene or a splat file holds, and what is wrong"
+        ),
+        Command(
+            name="repair",
+            config="RepairConfig",
+            help="mend a splat file, or the poses of a scene, and report the changes",
+        ),
     )
 }

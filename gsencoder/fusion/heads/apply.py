@@ -80,7 +80,8 @@ def equal_rows(
     """Groups rows of equal bits.
 
     Returns:
-        One row number of each group, and for each row the number of its group: values[first][inverse] equals values.
+        One row number of each group, and for each row the number of its group: `values[first][inverse]` equals
+        `values`.
     """
     bits = np.ascontiguousarray(values).view(np.uint32)
     # Rows are compared by a sum with random odd factors modulo 2⁶⁴, which is much faster than by all their columns.

@@ -35,7 +35,7 @@ class LocalizeConfig:
         default=False,
         metadata={
             "help": "score by contrast with negative words and the other queries (LERF), not by cosine; use "
-            "threshold.kind=fixed threshold.fixed=0.9"
+            "localize.threshold.kind=fixed localize.threshold.fixed=0.9"
         },
     )
     negatives: tuple[str, ...] = field(
