@@ -45,11 +45,12 @@ def api_pages() -> dict[str, str]:
         name = ".".join(folder.relative_to(ROOT).parts)
         short = name.removeprefix("gsencoder.")
         modules = sorted(path.stem for path in folder.glob("*.py") if path.stem not in ("__init__", "__main__"))
-        blocks = [f"# {short}", f"::: {name}\n    options: {{members: false, show_root_heading: false}}"]
+        options = "{members: false, show_root_heading: false, show_root_toc_entry: false}"
+        blocks = [f"# {short}", f"::: {name}\n    options: {options}"]
         blocks += [f"::: {name}.{module}" for module in modules]
         if modules:
             pages[f"api/{short}.md"] = "\n\n".join(blocks) + "\n"
-    return dict(sorted(pages.items()))
+    return dict(sorted(pages.items(), key=lambda page: page[0].removesuffix(".md")))
 
 
 def public_names() -> str:
@@ -58,6 +59,7 @@ def public_names() -> str:
     for name in gsencoder.__all__:
         value = getattr(gsencoder, name)
         line = re.sub(r"\s+", " ", (value.__doc__ or "").strip().split("\n\n")[0])
+        line = line.replace("*", "\\*")
         rows.append(f"| [`{name}`][{value.__module__}.{value.__qualname__}] | {line} |")
     text = (
         "# Public names\n\n`from gsencoder import …` has these names; each is loaded when it is first used. "
@@ -107,3 +109,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return f"{match[1]}{relative}{'#' if fragment else ''}{fragment})"
 
     return LINK.sub(led, markdown)
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
+    """Lets long names in tables break after dots, underscores, slashes, commas and equal signs."""
+
+    def breakable(table: re.Match[str]) -> str:
+        return re.sub(r"(?<=<code>)[^<]+", lambda name: re.sub(r"([._/,=])(?=\w)", r"\1<wbr>", name[0]), table[0])
+
+    return re.sub(r"<table>.*?</table>", breakable, html, flags=re.DOTALL)
