@@ -66,9 +66,9 @@ $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	@touch $@
 
-# The theme's notice of its end of life is no warning about these pages.
+# The theme's notice of its end of life is no warning about these pages. With --quiet, --strict would let everything pass.
 docs: $(VENV)/.docs ## the documentation as a site, in site/; links that lead nowhere are errors
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 clean:           ## remove the environment and every output
 	rm -rf $(VENV) outputs build dist site
