@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import shutil
 import signal
 import subprocess
 import sys
@@ -25,7 +24,6 @@ from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.signals import Stopped
 from gsencoder.train import data_workers
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
-from gsencoder.train import data_workers
 from gsencoder.train.data_workers import automatic_workers, silence_connection_errors
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.losses import LossConfig
