@@ -1,13 +1,14 @@
 """Questions answered by a scripted model that knows what each picture shows: the ceiling of views, marks and scores.
 
     python bench/answers.py SCENE … [--counts 4,8,16,32] [--per-kind 6] [--objects 8] [--seed 0] [--out FILE.json]
+                            [--features FOLDER [--space labels]]
     python bench/answers.py --unlabeled FEATURES --words table,chair [--photos SCENE] [--counts 8]
 
 Questions and expressions are made from the labels of each scene, and asked of fused features of the labels teacher
-with the photographs of the scene. Views are chosen greedily or are evenly spread frames. A question is answered rightly
-where some picture shows 200 pixels or more of each object that it is about; absence needs nothing to be seen. Seconds
-are of looking up words, choosing views and making pictures ("views", by the clock and of all cores), and of the request
-to a server on this machine; bytes are those of the request's JSON.
+with the photographs of the scene, or of those that --features holds for each scene. Views are chosen greedily or are
+evenly spread frames. A question is answered rightly where some picture shows 200 pixels or more of each object that it
+is about; absence needs nothing to be seen. Seconds are of looking up words, choosing views and making pictures
+("views", by the clock and of all cores), and of the request to a server on this machine; bytes are those of its JSON.
 
 Without labels nothing is right or wrong. With --unlabeled, "Where is the WORD?" is asked, the boxes that localize finds
 stand in for objects, and the figure is the share of words whose best box is shown by 200 pixels or more in some
@@ -27,6 +28,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from gsencoder.app.commands.evaluated_features import stored_words, with_stored_features
 from gsencoder.app.commands.query_words import load_words
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.json_values import write_json
@@ -163,8 +165,12 @@ def measure(
         tally.ious.append(iou)
 
 
-def labeled_scene(path: str) -> tuple[Scene, Any]:
-    """A scene with fused features of the labels teacher, and the words that lead into them."""
+def labeled_scene(path: str, stored: str, space: str) -> tuple[Scene, Any]:
+    """A scene with stored features, or fused ones of the labels teacher, and the words that lead into them."""
+    if stored:
+        scene = load_scene(path)
+        [(scene, _)] = with_stored_features([(scene, 0.0)], stored, space=space)
+        return scene, stored_words(stored, scene.name, space=space)
     table = load_text_table(find_file(WORDS, "words"))
     scene = with_gaussians(load_scene(path))
     features = fuse(scene, build_teacher(LabelsConfig(words=WORDS), scene, table)).features
@@ -179,7 +185,7 @@ def labeled(paths: Sequence[str], settings: argparse.Namespace, vlm: VlmConfig) 
     made = make_expressions(seen, seed=settings.seed, per_object=1, per_scene=settings.objects)
     expressions = [each.expression for each in made]
     for path in paths:
-        scene, words = labeled_scene(path)
+        scene, words = labeled_scene(path, settings.features, settings.space)
         truth, sheet = PictureTruth(scene, scene), AnswerSheet()
         add_questions(sheet, questions)
         add_expressions(sheet, expressions)
@@ -263,6 +269,8 @@ def main() -> None:
     parser.add_argument("--per-kind", default=6, type=int)
     parser.add_argument("--objects", default=8, type=int)
     parser.add_argument("--seed", default=0, type=int)
+    parser.add_argument("--features", default="", help="folder of the features of each scene, as evaluate takes it")
+    parser.add_argument("--space", default="", help="name of the features where there are several")
     parser.add_argument("--unlabeled", default="")
     parser.add_argument("--words", default=[], type=lambda text: text.split(","))
     parser.add_argument("--photos", default="")

@@ -16,71 +16,70 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 BENCH = Path(__file__).resolve().parent
 sys.path[:0] = [str(BENCH), str(BENCH.parent / "tests")]
 
-import gpu_parts  # noqa: E402
+import gpu_networks  # noqa: E402
+import gpu_render  # noqa: E402
 import torch  # noqa: E402
+from gpu_measure import Row, Setting, Skipped, broken_limits  # noqa: E402
 
 from gsencoder.core.runtime.device import choose_device  # noqa: E402
 
-Part = Callable[[gpu_parts.Setting], list[gpu_parts.Row]]
+Part = Callable[[Setting], Iterator[Row]]
 PACKAGES = ("torch", "triton", "gsplat", "numba", "numpy", "transformers", "onnxruntime", "onnxruntime-gpu")
 
 
-def environment(setting: gpu_parts.Setting) -> list[gpu_parts.Row]:
+def environment(setting: Setting) -> Iterator[Row]:
     """Machine, card, driver and versions."""
-    rows: list[gpu_parts.Row] = [
-        {
-            "what": "machine",
-            "value": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
-        }
-    ]
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    yield {"what": "machine", "value": machine}
     if setting.cuda:
         properties = torch.cuda.get_device_properties(setting.device)
         card = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, compute capability {properties.major}."
-        rows.append({"what": "card", "value": card + str(properties.minor)})
-        rows.append({"what": "CUDA of torch", "value": str(torch.version.cuda)})
+        yield {"what": "card", "value": card + str(properties.minor)}
+        yield {"what": "CUDA of torch", "value": str(torch.version.cuda)}
         query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
         done = subprocess.run(query, capture_output=True, text=True, check=False, timeout=30)
-        rows.append({"what": "driver", "value": done.stdout.strip() or done.stderr.strip()})
+        yield {"what": "driver", "value": done.stdout.strip() or done.stderr.strip()}
     for name in PACKAGES:
         try:
             version = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             version = "not installed"
-        rows.append({"what": name, "value": version})
-    return rows
+        yield {"what": name, "value": version}
 
 
 PARTS: dict[str, Part] = {
     "environment": environment,
-    "blend": gpu_parts.blend_parity,
-    "products": gpu_parts.sparse_products,
-    "losses": gpu_parts.losses,
-    "memory": gpu_parts.memory_attention,
-    "gsplat": gpu_parts.gsplat_parity,
-    "encoder": gpu_parts.encoder_parity,
-    "encoder_cost": gpu_parts.encoder_cost,
-    "processes": gpu_parts.processes,
-    "radio": gpu_parts.radio,
-    "onnx": gpu_parts.onnx,
+    "blend": gpu_render.blend_parity,
+    "products": gpu_render.sparse_products,
+    "losses": gpu_render.losses,
+    "memory": gpu_networks.memory_attention,
+    "gsplat": gpu_render.gsplat_parity,
+    "encoder": gpu_networks.encoder_parity,
+    "encoder_cost": gpu_networks.encoder_cost,
+    "processes": gpu_networks.processes,
+    "radio": gpu_networks.radio,
+    "onnx": gpu_networks.onnx,
 }
 
 
-def run_parts(setting: gpu_parts.Setting, parts: Mapping[str, Part]) -> list[dict[str, Any]]:
-    """Runs the parts; whatever one raises is its result."""
+def run_parts(setting: Setting, parts: Mapping[str, Part]) -> list[dict[str, Any]]:
+    """Runs the parts. One fails if it raises, or if an error is above its limit; its rows up to there stay."""
     results = []
     for name, part in parts.items():
         start, rows = time.perf_counter(), []
         try:
-            rows = part(setting)
-            state = "ok"
-        except gpu_parts.Skipped as reason:
+            for row in part(setting):
+                rows.append(row)
+            broken = broken_limits(rows)
+            state = f"failed: {'; '.join(broken)}" if broken else "ok"
+        except Skipped as reason:
             state = f"skipped: {reason}"
         except Exception as error:
             # Everything is caught: a failure must not cost the rest of the minutes on a borrowed card.
@@ -96,7 +95,7 @@ def run_parts(setting: gpu_parts.Setting, parts: Mapping[str, Part]) -> list[dic
     return results
 
 
-def markdown(setting: gpu_parts.Setting, results: list[dict[str, Any]]) -> str:
+def markdown(setting: Setting, results: list[dict[str, Any]]) -> str:
     """The report."""
     lines = [f"## GPU run on {setting.device.type}", ""]
     lines += [f"`python bench/gpu.py{' --small' if setting.small else ''}`, {time.strftime('%Y-%m-%d')}.", ""]
@@ -127,7 +126,7 @@ def main() -> int:
     names = chosen.parts.split(",")
     if unknown := [name for name in names if name not in PARTS]:
         parser.error(f"--parts: expected some of {', '.join(PARTS)}, got {', '.join(unknown)}")
-    setting = gpu_parts.Setting(device=choose_device(chosen.device), small=chosen.small, radio=chosen.radio)
+    setting = Setting(device=choose_device(chosen.device), small=chosen.small, radio=chosen.radio)
     results = run_parts(setting, {name: PARTS[name] for name in names})
     chosen.out.parent.mkdir(parents=True, exist_ok=True)
     chosen.out.write_text(markdown(setting, results), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A training of a few steps, alone or by two processes: python bench/gpu_training.py FOLDER cpu:1 cuda:2 …
+"""A training of a few steps by each of some processes: gpu_training.py FOLDER cpu:1:float32 cuda:2:bfloat16 …
 
 Prints the losses of each run as JSON. Processes are forked before any of them has used a GPU or a thread.
 """
@@ -17,6 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
+from gsencoder.core.runtime.device_names import Precision
+from gsencoder.models.blocks import DropPath
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.distributed import join_processes
 from gsencoder.train.prepare import PreparedDataset
@@ -29,16 +31,21 @@ def prepare(folder: Path) -> None:
     prepared(folder, count=1)
 
 
-def train(folder: Path, out: Path, device: str, rank: int, count: int, port: int) -> None:
+def train(folder: Path, out: Path, device: str, precision: Precision, rank: int, count: int, port: int) -> None:
     """One process of a run."""
     if count > 1:
         group = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": count, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
         os.environ.update({name: str(value) for name, value in group.items()})
     data = samples(PreparedDataset(folder, {"made": "for a test"}), ["wall_0"])
-    config = replace(SHORT, steps=STEPS, accumulate=2 // count)
+    config = replace(SHORT, steps=STEPS, accumulate=2 // count, precision=precision, workers=0)
+    encoder = small_encoder()
+    for module in encoder.modules():
+        if isinstance(module, DropPath):
+            # Devices draw different random numbers.
+            module.drop_prob = 0.0
     with join_processes(device) as (process, chosen):  # type: ignore[arg-type]
         trainer = encoder_trainer(
-            small_encoder(), data, LOSSES, config, folder=out, settings={}, process=process, device=chosen
+            encoder, data, LOSSES, config, folder=out, settings={}, process=process, device=chosen
         )
         trainer.run()
 
@@ -50,13 +57,13 @@ def main() -> None:
     first.start()
     first.join()
     for run in runs:
-        device, count = run.split(":")
+        device, count, precision = run.split(":")
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         out = folder / run.replace(":", "_")
         out.mkdir()
-        arguments = (folder / "prepared", out, device)
+        arguments = (folder / "prepared", out, device, precision)
         started = [
             context.Process(target=train, args=(*arguments, rank, int(count), port)) for rank in range(int(count))
         ]

@@ -78,6 +78,8 @@ def score_instances(
     ]
     groups = {f"ap_{group}": values.ap for group, values in scores.groups.items()}
     notes = [EQUAL_SCORES] if scores.equal_scores else []
+    if class_agnostic:
+        notes.append("All masks are of one class; published figures, which are of classes, do not stand beside it.")
     others = sum(each.other_classes for each in matches)
     if others:
         notes.append(
@@ -103,7 +105,12 @@ def score_instances(
             **groups,
             "spread": spread(by_scene, list(overall)),
         },
-        table=table_of("Instances", {method: overall | groups}, published="splatdistill_2_instances", notes=notes),
+        table=table_of(
+            "Instances",
+            {method: overall | groups},
+            published="" if class_agnostic else "splatdistill_2_instances",
+            notes=notes,
+        ),
         rows={"scenes": by_scene, "classes": by_class},
         line=f"{counted(int(scores.truths.sum()), 'object')} in {counted(scores.scenes, 'scene')}: AP "
         f"{overall['ap']:.3f}, AP50 {overall['ap_50']:.3f}, AP25 {overall['ap_25']:.3f}"

@@ -82,6 +82,6 @@ def unit_queries(queries: Float[Tensor, "n s"], gram: Float[Tensor, "s s"]) -> F
     return unit / squares.clamp(min=EPS**2).sqrt()
 
 
-def random_projection(channels: int, width: int, generator: torch.Generator) -> Float[Tensor, "s D"]:
-    """A random W_m, with rows of length 1 on average."""
-    return torch.randn(channels, width, generator=generator) / math.sqrt(width)
+def random_projection(query_channels: int, channels: int, generator: torch.Generator) -> Float[Tensor, "s D"]:
+    """A random W_m of queries with s channels and components with D, with rows of length 1 on average."""
+    return torch.randn(query_channels, channels, generator=generator) / math.sqrt(channels)

@@ -9,48 +9,14 @@ from gsencoder.models.grid.neighbors import NeighborConv
 
 MASKED_SCORE = -3e4
 """Added to attention scores of masked slots in an exported graph; finite in half precision."""
-HIDDEN_SCORE = -1e30
-"""The same where masks are folded: below every score, and finite after it is scaled; half the least number of a type
-that does not reach so far."""
-MASK_CHANNELS = 8
-"""Channels that carry the mask in queries and keys; flash attention takes multiples of eight."""
-
-
-def attend_folded(
-    q: Float[Tensor, "patches heads width c"],
-    k: Float[Tensor, "patches heads width c"],
-    v: Float[Tensor, "patches heads width c"],
-    attn_mask: Bool[Tensor, "patches 1 1 width"],
-) -> Float[Tensor, "patches heads width c"]:
-    """Attention with the mask as a channel in place of an argument, since flash attention takes none.
-
-    Queries have a further channel of 1, keys one that is 0, or so far below 0 in masked slots that their weights
-    underflow to zero: scores, and so results and gradients, are those of `scaled_dot_product_attention` with the mask.
-    """
-    channels = q.shape[3]
-    one = functional.pad(q.new_ones(1), (0, MASK_CHANNELS - 1))
-    hidden = torch.where(attn_mask, 0.0, max(HIDDEN_SCORE, torch.finfo(q.dtype).min / 2)).to(q.dtype).transpose(2, 3)
-    shape = (*q.shape[:3], MASK_CHANNELS)
-    q = torch.cat((q, one.expand(shape)), dim=3)
-    k = torch.cat((k, functional.pad(hidden, (0, MASK_CHANNELS - 1)).expand(shape)), dim=3)
-    attended = functional.scaled_dot_product_attention(
-        q, k, functional.pad(v, (0, MASK_CHANNELS)), scale=channels**-0.5
-    )
-    return attended[..., :channels]
 
 
 class PatchAttention(nn.Module):
-    """Multi-head self-attention among the tokens of a patch.
-
-    Attributes:
-        folds_mask: whether masks are folded into queries and keys (`attend_folded`); None = where that lets flash
-            attention compute, which is in half precision on a GPU.
-    """
+    """Multi-head self-attention among the tokens of a patch."""
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.folds_mask: bool | None = None
         self.qkv = nn.Linear(channels, 3 * channels)
         self.project = nn.Linear(channels, channels)
 
@@ -72,18 +38,10 @@ class PatchAttention(nn.Module):
         qkv = (gathered.float() if upcast else gathered).view(-1, patch_width, 3, self.heads, channels // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
         with torch.autocast(gathered.device.type, enabled=False):
-            if attn_mask is not None and self._folds_mask(q):
-                attended = attend_folded(q, k, v, attn_mask)
-            else:
-                attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
+            attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
         flat = attended.transpose(1, 2).reshape(-1, channels)
         out: Tensor = self.project(flat.index_select(0, scatter_index))
         return out
-
-    def _folds_mask(self, q: Tensor) -> bool:
-        if self.folds_mask is not None:
-            return self.folds_mask
-        return q.is_cuda and q.dtype in (torch.float16, torch.bfloat16)
 
     def _forward_exported(
         self,

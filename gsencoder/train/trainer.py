@@ -1,14 +1,11 @@
 """The training loop, resumable, with equal results on one process or several."""
 
 import math
-import signal
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -23,9 +20,11 @@ from gsencoder.core.runtime.device import autocast_dtype
 from gsencoder.core.runtime.device_names import Precision
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.signals import defer_signals, stop_of
+from gsencoder.core.runtime.threads import threads_of_torch
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.train import distributed
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
+from gsencoder.train.data_workers import automatic_workers, start_worker
 from gsencoder.train.distributed import (
     STOPPED_ELSEWHERE,
     check_agreement,
@@ -47,6 +46,8 @@ CHANGEABLE_ON_RESUME = (
     "accumulate",
 )
 """Settings of the loop that a resumed run may change, since they do not change the result of a step."""
+SAMPLE_THREADS = 4
+"""Threads while a sample is made in the training process: its arrays are small, and sixteen take 3 times as long."""
 NO_WEIGHT = 1e-12
 """Divisor of a term that nothing in a step has a weight for."""
 
@@ -67,10 +68,17 @@ class TrainerConfig:
     clip: float = field(default=1.0, metadata={"help": "norm to which the gradient is clipped; 0 = no clipping"})
     precision: Precision = field(
         default="auto",
-        metadata={"help": "floating-point type of the network; auto = bfloat16 on devices with hardware support"},
+        metadata={
+            "help": "floating-point type of the network; auto = bfloat16 on a CPU with AMX, else float32 (on a GPU "
+            "bfloat16 suits model=base)"
+        },
     )
-    workers: int = field(
-        default=0, metadata={"help": "number of processes that make samples; 0 = make them in the training process"}
+    workers: int | None = field(
+        default=None,
+        metadata={
+            "help": "number of processes that make samples; 0 = make them in the training process, null = that "
+            "without a GPU, else one a core, at most 8, as far as /dev/shm has 1 GiB for each"
+        },
     )
     prefetch: int = field(
         default=2,
@@ -87,7 +95,7 @@ class TrainerConfig:
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         for name in ("warmup", "weight_decay", "clip", "workers", "seed", "validate_every", "checkpoint_every"):
-            if not 0 <= getattr(self, name) < math.inf:
+            if not 0 <= (getattr(self, name) or 0) < math.inf:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         if self.seed >= 1 << 63:
             raise InputError(f"seed: expected a number below 2⁶³, got {self.seed}")
@@ -255,7 +263,8 @@ class Trainer:
             self._close_step()
         batches = iter(self._loader(first))
         for step in track(range(first, config.steps), "training"):
-            items = [next(batches) for _ in range(config.accumulate)]
+            with threads_of_torch(min(SAMPLE_THREADS, torch.get_num_threads())):
+                items = [next(batches) for _ in range(config.accumulate)]
             with lost_processes(self.process, distributed.STEP_MINUTES):
                 losses = self._gradients(step, items)
             unlogged = (*self.state.unlogged, losses)
@@ -302,15 +311,16 @@ class Trainer:
             rank=self.process.rank,
             world=self.process.world_size,
         )
+        workers = automatic_workers(self.device, self.process) if config.workers is None else config.workers
         # Workers are spawned: a forked child would inherit the state of threads that do not exist in it.
         return DataLoader(
             self.dataset,
             batch_sampler=sampler,
             collate_fn=self._collate,
-            num_workers=config.workers,
-            multiprocessing_context="spawn" if config.workers else None,
-            worker_init_fn=_init_worker if config.workers else None,
-            prefetch_factor=config.prefetch if config.workers else None,
+            num_workers=workers,
+            multiprocessing_context="spawn" if workers else None,
+            worker_init_fn=start_worker if workers else None,
+            prefetch_factor=config.prefetch if workers else None,
         )
 
     def _gradients(self, step: int, items: list[Any]) -> dict[str, float]:
@@ -433,25 +443,3 @@ def _parameter_groups(network: nn.Module, config: TrainerConfig) -> list[dict[st
     matrices = [value for value in trained if value.ndim > 1]
     vectors = [value for value in trained if value.ndim <= 1]
     return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
-
-
-def _init_worker(worker: int) -> None:  # noqa: ARG001
-    """Sets a data worker to one thread, and makes it ignore signals that are sent to the process group: the training
-    process ends its workers after it has saved, and a worker that dies earlier would be an error while it saves."""
-    torch.set_num_threads(1)
-    for name in ("SIGTERM", "SIGHUP", "SIGINT"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
-    sys.excepthook = _silence_connection_errors
-
-
-def _silence_connection_errors(
-    error_type: type[BaseException], error: BaseException, trace: TracebackType | None
-) -> None:
-    """An excepthook of data workers that does not print errors of connections.
-
-    If the training process stops while it receives a sample, it reports the reason itself; the worker's thread that
-    sends the sample would print that its connection was reset or closed.
-    """
-    if not issubclass(error_type, ConnectionError | EOFError):
-        sys.__excepthook__(error_type, error, trace)

@@ -109,8 +109,10 @@ def test_equal_scores_masks_over_several_objects_and_smaller_regions_are_told(tm
     truths = {"a": np.repeat([4001, 4002, 0], [100, 100, 800])}
     folders = instance_folders(tmp_path, truths, {"a": [(40, 160, 5, 1.0), (0, 100, 5, 1.0)]})
     report = score_instances(*folders, CLASSES, class_agnostic=True)
+    assert [row.source for row in report.table.rows] == ["measured"]
     assert report.table.notes[0] == EQUAL_SCORES
-    assert report.table.notes[1].startswith(
+    assert report.table.notes[1].startswith("All masks are of one class")
+    assert report.table.notes[2].startswith(
         "Of the masks 1 overlap several true objects by more than 0.25; AP at 0.25 depends"
     )
     assert report.line.endswith(" without classes")

@@ -436,6 +436,7 @@ def save_oneformer(folder: Path) -> tuple[Any, Any]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize("size", [(40, 64), (64, 48)])
 def test_a_oneformer_gives_the_semantic_map_of_its_library_and_fetches_no_list_of_classes(
     tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]
@@ -463,6 +464,7 @@ def test_a_oneformer_without_its_tokenizer_is_refused(tmp_path: Path, rng: np.ra
         SegmenterTeacher(SegmenterConfig(model=str(tmp_path)), words(rng))
 
 
+@pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize("size", [(40, 64), (64, 48)])
 def test_a_segformer_equals_a_direct_call_of_its_library(
     tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]
@@ -483,6 +485,7 @@ def test_a_segformer_equals_a_direct_call_of_its_library(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize("size", [(40, 64), (64, 48)])
 def test_a_mask2former_gives_the_semantic_map_of_its_library_without_the_padding(
     tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]

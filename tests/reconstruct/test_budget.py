@@ -99,6 +99,7 @@ def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time() -> 
     assert plan_steps(usual, BudgetConfig(minutes=80.0)) == 2 * USUAL.steps
 
 
+@pytest.mark.usefixtures("no_gpu")
 def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,6 +60,7 @@ def test_a_comparison_holds_the_photograph_and_the_render_of_the_same_view(
         assert np.argmin(differences) == row
 
 
+@pytest.mark.usefixtures("no_gpu")
 def test_an_interrupted_call_is_continued_from_its_folder_with_the_same_result(
     scene: Scene, result: Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

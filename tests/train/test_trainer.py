@@ -1,6 +1,7 @@
 """The loop: it learns, it goes on after a kill, it does the same on several processes, and it stops before harm."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,8 +20,11 @@ from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.step_log import LOG_FILE, read_log
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.signals import Stopped
+from gsencoder.train import data_workers
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
+from gsencoder.train.data_workers import automatic_workers, silence_connection_errors
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
@@ -30,7 +34,6 @@ from gsencoder.train.trainer import (
     TrainerConfig,
     ValidationResult,
     _parameter_groups,
-    _silence_connection_errors,
 )
 
 pytestmark = pytest.mark.slow
@@ -148,9 +151,9 @@ def test_a_stop_that_compiled_code_wraps_is_a_stop(
 
 def test_a_worker_whose_training_process_is_gone_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     for error in (ConnectionResetError(), BrokenPipeError(), EOFError()):
-        _silence_connection_errors(type(error), error, None)
+        silence_connection_errors(type(error), error, None)
     assert capsys.readouterr().err == ""
-    _silence_connection_errors(ValueError, ValueError("wrong"), None)
+    silence_connection_errors(ValueError, ValueError("wrong"), None)
     assert "ValueError: wrong" in capsys.readouterr().err
 
 
@@ -470,3 +473,18 @@ def test_matrices_decay_and_norms_and_biases_do_not() -> None:
     assert len(decay) == sum(len(group["params"]) for group in groups) == len(list(encoder.parameters()))
     for name, value in encoder.named_parameters():
         assert decay[id(value)] == (0.0 if name.endswith("bias") or "norm" in name else 0.3), name
+
+
+@pytest.mark.parametrize(
+    ("cores", "processes", "gigabytes", "expected"),
+    [(16, 1, 64, 8), (16, 4, 64, 3), (4, 1, 64, 3), (2, 4, 64, 0), (16, 1, 2.5, 2), (16, 8, 4, 0), (1, 1, 64, 0)],
+)
+def test_beside_a_gpu_samples_are_made_by_the_cores_that_are_left_as_far_as_shared_memory_reaches(
+    monkeypatch: pytest.MonkeyPatch, cores: int, processes: int, gigabytes: float, expected: int
+) -> None:
+    usage = shutil.disk_usage(".")._replace(free=int(gigabytes * 2**30))
+    monkeypatch.setattr(data_workers, "available_cores", lambda: cores)
+    monkeypatch.setattr(data_workers.shutil, "disk_usage", lambda folder: usage)
+    process = ProcessRank(rank=0, world_size=processes, local_rank=0, local_world_size=processes)
+    assert automatic_workers(torch.device("cuda"), process) == expected
+    assert automatic_workers(torch.device("cpu"), process) == 0

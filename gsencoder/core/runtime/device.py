@@ -31,17 +31,18 @@ def choose_device(name: Device, local_rank: int = 0) -> torch.device:
 
 
 def autocast_dtype(precision: Precision, device: torch.device, *, training: bool = False) -> torch.dtype | None:
-    """The type for torch.autocast on a device; None for float32 throughout.
+    """The type for torch.autocast of a point transformer on a device; None for float32 throughout.
 
-    "auto" is bfloat16 on NVIDIA GPUs since Ampere and on CPUs with AMX tiles, without training also on those with
-    AVX512_BF16, and float32 elsewhere, where bfloat16 is slower.
+    "auto" is bfloat16 on CPUs with AMX tiles, without training also on those with AVX512_BF16, and float32 elsewhere:
+    on a CPU without these instructions bfloat16 is slower, and on a GPU the default network waits for launches and
+    gathers and not for products (docs/measurements.md, "GPU"). A large network on a GPU gains from "bfloat16".
     """
     if precision == "float32":
         return None
     if precision == "bfloat16":
         return torch.bfloat16
     if device.type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else None
+        return None
     multiplied = torch.cpu._is_amx_tile_supported() or (not training and torch.cpu._is_avx512_bf16_supported())
     return torch.bfloat16 if multiplied else None
 
@@ -51,8 +52,8 @@ def teacher_autocast(device: str) -> torch.autocast:
 
     On a CPU its maps are those of its library.
     """
-    dtype = autocast_dtype("auto", torch.device(device)) if device == "cuda" else None
-    return torch.autocast(device, dtype or torch.bfloat16, enabled=dtype is not None)
+    enabled = device == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+    return torch.autocast(device, torch.bfloat16, enabled=enabled)
 
 
 @contextmanager

@@ -29,7 +29,7 @@ class EncodeConfig:
     precision: Precision = field(
         default="auto",
         metadata={
-            "help": "type that the encoder computes in; auto = bfloat16 where the hardware multiplies it, else float32"
+            "help": "type that the encoder computes in; auto = bfloat16 on a CPU that multiplies it, else float32"
         },
     )
     device: Device = field(default="auto", metadata={"help": "where the encoder computes"})
