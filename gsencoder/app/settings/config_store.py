@@ -12,6 +12,7 @@ The nodes are plain dicts: OmegaConf makes a node of a frozen dataclass read-onl
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
 from gsencoder.app.settings.config import CommonConfig, settings
@@ -38,14 +39,15 @@ class Group:
     members: Mapping[str, dict[str, Any]]
 
 
-def groups_of(cls: type[CommonConfig]) -> list[Group]:
+@cache
+def groups_of(cls: type[CommonConfig]) -> tuple[Group, ...]:
     """The config groups of a command, in order of declaration, presets and experiments last."""
     groups = list(_section_groups(cls()))
     presets = {name: {PRESET + LIKE_GROUP: name, **preset_node(cls, name)} for name in PRESETS}
     groups.append(Group(key=PRESET, default=DEFAULT_PRESET, members=presets))
     if cls.has_experiments:
         groups.append(Group(key=EXPERIMENT, default="none", members={"none": {}}))
-    return groups
+    return tuple(groups)
 
 
 def _section_groups(config: Any, prefix: str = "") -> Iterator[Group]:

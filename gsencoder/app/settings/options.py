@@ -5,6 +5,7 @@ import types
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -173,7 +174,8 @@ def join_list(items: Iterable[str]) -> str:
     return ",".join(written)
 
 
-def field_types(cls: type) -> dict[str, Any]:
+@cache
+def field_types(cls: type) -> Mapping[str, Any]:
     """The resolved types of a dataclass's fields."""
     hints = typing.get_type_hints(cls)
     return {item.name: hints[item.name] for item in fields(cls)}
@@ -239,7 +241,8 @@ def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = No
     return options
 
 
-def options_by_key(cls: type, prefix: str = "") -> dict[str, Option]:
+@cache
+def options_by_key(cls: type, prefix: str = "") -> Mapping[str, Option]:
     """The options of a class by full key; where members of a choice share a key, the option of the first."""
     options: dict[str, Option] = {}
     for option in options_of(cls, prefix):
