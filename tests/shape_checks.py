@@ -8,11 +8,11 @@ names of axes for both.
 """
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import is_dataclass
 from functools import wraps
-from types import CodeType, FunctionType
-from typing import Any
+from types import FunctionType
+from typing import Any, Literal, get_args, get_origin
 
 import jaxtyping
 from beartype import beartype
@@ -25,9 +25,8 @@ _jaxtyped = jaxtyping.jaxtyped
 class Checks:
     """The checks of the arguments and of the result of functions with one code and the same annotations."""
 
-    def __init__(self, function: FunctionType, annotations: dict[str, Any]) -> None:
-        self.annotations = annotations
-        self._resolved = {name: _resolved(each, function) for name, each in annotations.items()}
+    def __init__(self, function: FunctionType) -> None:
+        self._resolved = {name: _resolved(each, function) for name, each in function.__annotations__.items()}
         self._result = self._resolved.pop("return", Any)
         self._function = function
         self._compiled = False
@@ -60,7 +59,7 @@ class Checks:
                 raise jaxtyping.TypeCheckError(str(error)) from error
 
 
-_checks: dict[CodeType, list[Checks]] = {}
+_checks: dict[Hashable, Checks] = {}
 
 
 def checked(target: Any = None, *, typechecker: Any) -> Any:
@@ -77,12 +76,10 @@ def checked(target: Any = None, *, typechecker: Any) -> Any:
         return target
     if not isinstance(target, FunctionType) or inspect.isgeneratorfunction(target) or _names_arguments(target):
         return _jaxtyped(target, typechecker=typechecker)
-    annotations = target.__annotations__
-    known = _checks.setdefault(target.__code__, [])
-    checks = next((each for each in known if _same(each.annotations, annotations)), None)
+    key = (target.__code__, tuple((name, _meaning(each)) for name, each in target.__annotations__.items()))
+    checks = _checks.get(key)
     if checks is None:
-        checks = Checks(target, annotations)
-        known.append(checks)
+        checks = _checks[key] = Checks(target)
 
     @wraps(target)
     def function(*args: Any, **kwargs: Any) -> Any:
@@ -94,8 +91,15 @@ def checked(target: Any = None, *, typechecker: Any) -> Any:
     return function
 
 
-def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return one.keys() == other.keys() and all(one[name] is other[name] or one[name] == other[name] for name in one)
+def _meaning(annotation: Any) -> Hashable:
+    """What is equal for annotations that mean the same; jaxtyping makes a new type each time that one is written."""
+    if inspect.isclass(annotation) and issubclass(annotation, jaxtyping.AbstractArray):
+        return annotation.dtype, annotation.array_type, annotation.dim_str
+    if isinstance(annotation, list):
+        return tuple(map(_meaning, annotation))
+    if get_args(annotation) and get_origin(annotation) is not Literal:
+        return get_origin(annotation), tuple(map(_meaning, get_args(annotation)))
+    return annotation if isinstance(annotation, Hashable) else id(annotation)
 
 
 def _names_arguments(function: FunctionType) -> bool:

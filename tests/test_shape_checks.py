@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shape_checks
 from beartype import beartype
 from jaxtyping import Float32, Float64, Int32, TypeCheckError
 from shape_checks import checked
@@ -77,6 +78,24 @@ def test_closures_of_one_function_are_checked_by_the_annotations_of_each() -> No
     for kind, value in ((int, 1.5), (str, 1)):
         with pytest.raises(TypeCheckError):
             closure(kind, 1)(value)
+
+
+def test_the_checks_of_a_function_within_another_are_made_once() -> None:
+    def closure(name: str, axes: str) -> Callable[[Any], Any]:
+        @on
+        def inside(value: "Float32[np.ndarray, ''] | None", b: Float32[np.ndarray, axes] | None = None) -> list[Any]:
+            return [name, value, b]
+
+        return inside
+
+    before = len(shape_checks._checks)
+    for number in range(20):
+        assert closure(str(number), "n 3")(None) == [str(number), None, None]
+    assert len(shape_checks._checks) == before + 1
+    assert len(closure("0", "3 n")(None, zeros(3, 2))) == 3
+    assert len(shape_checks._checks) == before + 2
+    with pytest.raises(TypeCheckError):
+        closure("0", "n 3")(None, zeros(3, 2))
 
 
 def test_every_kind_of_parameter_is_checked() -> None:
