@@ -84,6 +84,13 @@ def test_training_brings_the_loss_down(dataset: Prepared, tmp_path: Path) -> Non
     assert np.mean(curve[-5:]) < 0.6 * np.mean(curve[:5])
 
 
+@pytest.mark.skipif(torch.cuda.is_initialized(), reason="a GPU is in use")
+def test_a_run_on_a_cpu_leaves_nothing_to_do_for_a_gpu(dataset: Prepared, tmp_path: Path) -> None:
+    before = len(torch.cuda._queued_calls)
+    trainer(dataset, tmp_path).run()
+    assert len(torch.cuda._queued_calls) == before
+
+
 def test_a_rerun_gives_the_same_losses(dataset: Prepared, tmp_path: Path) -> None:
     for name in ("a", "b"):
         torch.manual_seed(len(name))

@@ -12,11 +12,10 @@ The nodes are plain dicts: OmegaConf makes a node of a frozen dataclass read-onl
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Any
 
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.app.settings.options import LIKE_GROUP, field_types, member_name, section_classes
+from gsencoder.app.settings.options import LIKE_GROUP, cached, field_types, member_name, section_classes
 from gsencoder.app.settings.presets import DEFAULT_PRESET, PRESET, PRESETS, preset_node
 
 EXPERIMENT = "experiment"
@@ -39,7 +38,7 @@ class Group:
     members: Mapping[str, dict[str, Any]]
 
 
-@cache
+@cached
 def groups_of(cls: type[CommonConfig]) -> tuple[Group, ...]:
     """The config groups of a command, in order of declaration, presets and experiments last."""
     groups = list(_section_groups(cls()))

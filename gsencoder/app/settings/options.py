@@ -3,15 +3,21 @@
 import difflib
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from gsencoder.core.removed_options import REMOVED_VALUES
 
 Kind = Literal["text", "list", "value"]
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def cached(function: Function) -> Function:
+    """`functools.cache` that keeps the signature: mypy does not see that the class of a dataclass can be hashed."""
+    return cast(Function, cache(function))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,7 +180,7 @@ def join_list(items: Iterable[str]) -> str:
     return ",".join(written)
 
 
-@cache
+@cached
 def field_types(cls: type) -> Mapping[str, Any]:
     """The resolved types of a dataclass's fields."""
     hints = typing.get_type_hints(cls)
@@ -241,7 +247,7 @@ def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = No
     return options
 
 
-@cache
+@cached
 def options_by_key(cls: type, prefix: str = "") -> Mapping[str, Option]:
     """The options of a class by full key; where members of a choice share a key, the option of the first."""
     options: dict[str, Option] = {}
