@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shape_checks  # noqa: F401  # Before any module of the package.
 from hypothesis import settings
 from jaxtyping import config as jaxtyping_config
 

@@ -385,7 +385,12 @@ class Trainer:
         """Seeds the network's random numbers by the number of the micro-batch in the run, so that a resumed run repeats
         them."""
         state = np.random.SeedSequence([self.config.seed, number]).generate_state(1, np.uint64)
-        torch.manual_seed(int(state[0] >> np.uint64(1)))
+        seed = int(state[0] >> np.uint64(1))
+        if self.device.type == "cpu":
+            # torch.manual_seed would queue the call, with its stack, for a GPU that a run on a CPU never starts.
+            torch.default_generator.manual_seed(seed)
+        else:
+            torch.manual_seed(seed)
 
     def _finite_totals(
         self, step: int, batches: list[TrainingBatch], micro_losses: Float64[Tensor, "micro terms"], norm: float

@@ -87,6 +87,13 @@ def test_training_brings_the_loss_down(dataset: Prepared, tmp_path: Path) -> Non
     assert np.mean(curve[-5:]) < 0.6 * np.mean(curve[:5])
 
 
+@pytest.mark.skipif(torch.cuda.is_initialized(), reason="a GPU is in use")
+def test_a_run_on_a_cpu_leaves_nothing_to_do_for_a_gpu(dataset: Prepared, tmp_path: Path) -> None:
+    before = len(torch.cuda._queued_calls)
+    trainer(dataset, tmp_path).run()
+    assert len(torch.cuda._queued_calls) == before
+
+
 def test_a_rerun_gives_the_same_losses(dataset: Prepared, tmp_path: Path) -> None:
     for name in ("a", "b"):
         torch.manual_seed(len(name))
@@ -450,9 +457,8 @@ def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_on
 
 
 def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path) -> None:
-    whole = script(dataset, tmp_path / "whole", steps=60, accumulate=1)
+    trainer(dataset, tmp_path / "whole", replace(SHORT, steps=60)).run()
     cut = script(dataset, tmp_path / "cut", steps=60, accumulate=1)
-    subprocess.run([sys.executable, "-W", "ignore", str(whole)], check=True, timeout=300)
     running = subprocess.Popen([sys.executable, "-W", "ignore", str(cut)])
     log, deadline = tmp_path / "cut" / LOG_FILE, time.monotonic() + 120
     while time.monotonic() < deadline and not (log.is_file() and len(log.read_text().splitlines()) > 10):

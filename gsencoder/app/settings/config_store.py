@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.app.settings.options import LIKE_GROUP, field_types, member_name, section_classes
+from gsencoder.app.settings.options import LIKE_GROUP, cached, field_types, member_name, section_classes
 from gsencoder.app.settings.presets import DEFAULT_PRESET, PRESET, PRESETS, preset_node
 
 EXPERIMENT = "experiment"
@@ -38,14 +38,15 @@ class Group:
     members: Mapping[str, dict[str, Any]]
 
 
-def groups_of(cls: type[CommonConfig]) -> list[Group]:
+@cached
+def groups_of(cls: type[CommonConfig]) -> tuple[Group, ...]:
     """The config groups of a command, in order of declaration, presets and experiments last."""
     groups = list(_section_groups(cls()))
     presets = {name: {PRESET + LIKE_GROUP: name, **preset_node(cls, name)} for name in PRESETS}
     groups.append(Group(key=PRESET, default=DEFAULT_PRESET, members=presets))
     if cls.has_experiments:
         groups.append(Group(key=EXPERIMENT, default="none", members={"none": {}}))
-    return groups
+    return tuple(groups)
 
 
 def _section_groups(config: Any, prefix: str = "") -> Iterator[Group]:

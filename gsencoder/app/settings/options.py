@@ -3,14 +3,21 @@
 import difflib
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from gsencoder.core.removed_options import REMOVED_VALUES
 
 Kind = Literal["text", "list", "value"]
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def cached(function: Function) -> Function:
+    """`functools.cache` that keeps the signature: mypy does not see that the class of a dataclass can be hashed."""
+    return cast(Function, cache(function))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,7 +180,8 @@ def join_list(items: Iterable[str]) -> str:
     return ",".join(written)
 
 
-def field_types(cls: type) -> dict[str, Any]:
+@cached
+def field_types(cls: type) -> Mapping[str, Any]:
     """The resolved types of a dataclass's fields."""
     hints = typing.get_type_hints(cls)
     return {item.name: hints[item.name] for item in fields(cls)}
@@ -239,7 +247,8 @@ def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = No
     return options
 
 
-def options_by_key(cls: type, prefix: str = "") -> dict[str, Option]:
+@cached
+def options_by_key(cls: type, prefix: str = "") -> Mapping[str, Option]:
     """The options of a class by full key; where members of a choice share a key, the option of the first."""
     options: dict[str, Option] = {}
     for option in options_of(cls, prefix):

@@ -1,0 +1,177 @@
+"""The checks of types and shapes that the other tests run under."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import shape_checks
+from beartype import beartype
+from jaxtyping import Float32, Float64, Int32, TypeCheckError
+from shape_checks import checked
+
+from gsencoder.core.files.json_values import plain
+from gsencoder.types import FeatureMap, FeatureSpace, Gaussians
+from gsencoder.types.cameras import pixel_centers
+
+
+def on(target: Any) -> Any:
+    return checked(target, typechecker=beartype)
+
+
+@on
+def joined(
+    a: Float32[np.ndarray, "n 3"], b: Float32[np.ndarray, "n k"], *, rows: int = 0
+) -> Float32[np.ndarray, "n m"]:
+    return np.concatenate([a, b], axis=1)[rows:]
+
+
+def zeros(*shape: int) -> np.ndarray:
+    return np.zeros(shape, np.float32)
+
+
+def test_what_fits_its_annotations_is_returned() -> None:
+    assert joined(zeros(4, 3), b=zeros(4, 2)).shape == (4, 5)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "rows"),
+    [
+        (zeros(4, 2), zeros(4, 2), 0),
+        (zeros(4, 3), zeros(5, 2), 0),
+        (zeros(4, 3).astype(np.float64), zeros(4, 2), 0),
+        (zeros(4, 3), zeros(4), 0),
+        (zeros(4, 3), [1.0], 0),
+        (zeros(4, 3), zeros(4, 2), "0"),
+        (zeros(4, 3), zeros(4, 2), 1),  # An axis of the result has the size that it has in the arguments.
+    ],
+)
+def test_what_does_not_fit_is_refused(a: Any, b: Any, rows: Any) -> None:
+    with pytest.raises((TypeCheckError, ValueError)) as caught:
+        joined(a, b, rows=rows)
+    assert caught.type is TypeCheckError
+
+
+def test_axes_of_one_name_are_those_of_one_call() -> None:
+    def outer(a: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
+        return inner(np.concatenate([a, a]))[: len(a)]
+
+    @on
+    def inner(a: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
+        return a
+
+    for size in (2, 3):
+        assert on(outer)(zeros(size)).shape == (size,)
+
+
+def test_closures_of_one_function_are_checked_by_the_annotations_of_each() -> None:
+    def closure(kind: Any, add: int) -> Callable[[Any], Any]:
+        @on
+        def inside(value: kind) -> kind:
+            return value + add
+
+        return inside
+
+    assert [closure(int, add)(1) for add in (1, 2)] == [2, 3]
+    assert closure(float, 1)(1.5) == 2.5
+    for kind, value in ((int, 1.5), (str, 1)):
+        with pytest.raises(TypeCheckError):
+            closure(kind, 1)(value)
+
+
+def test_the_checks_of_a_function_within_another_are_made_once() -> None:
+    def closure(name: str, axes: str) -> Callable[[Any], Any]:
+        @on
+        def inside(value: "Float32[np.ndarray, ''] | None", b: Float32[np.ndarray, axes] | None = None) -> list[Any]:
+            return [name, value, b]
+
+        return inside
+
+    before = len(shape_checks._checks)
+    for number in range(20):
+        assert closure(str(number), "n 3")(None) == [str(number), None, None]
+    assert len(shape_checks._checks) == before + 1
+    assert len(closure("0", "3 n")(None, zeros(3, 2))) == 3
+    assert len(shape_checks._checks) == before + 2
+    with pytest.raises(TypeCheckError):
+        closure("0", "n 3")(None, zeros(3, 2))
+
+
+def test_every_kind_of_parameter_is_checked() -> None:
+    @on
+    def kinds(a: int, /, b: int = 0, *more: int, c: int = 0, **others: int) -> int:
+        return a + b + sum(more) + c + sum(others.values())
+
+    assert (kinds(1), kinds(1, 2, 3, 4, c=5, d=6)) == (1, 21)
+    for args, kwargs in (
+        (("1",), {}),
+        ((1,), {"b": "2"}),
+        ((1, 2, "3"), {}),
+        ((1,), {"c": "5"}),
+        ((1,), {"d": "6"}),
+    ):
+        with pytest.raises(TypeCheckError):
+            kinds(*args, **kwargs)
+    with pytest.raises(TypeError, match="argument"):
+        kinds()
+
+
+def test_dataclasses_and_their_children_are_checked_where_they_are_made() -> None:
+    @on
+    @dataclass(frozen=True)
+    class Points:
+        points: Float32[np.ndarray, "n 3"]
+        labels: Int32[np.ndarray, " n"]
+
+    @on
+    @dataclass(frozen=True)
+    class Named(Points):
+        name: str = ""
+
+    assert Named(zeros(2, 3), np.zeros(2, np.int32), "two").name == "two"
+    for cls, rest in ((Points, ()), (Named, ("two",))):
+        with pytest.raises(TypeCheckError):
+            cls(zeros(2, 3), np.zeros(3, np.int32), *rest)
+    with pytest.raises(TypeCheckError):
+        Named(zeros(2, 3), np.zeros(2, np.int32), 2)  # type: ignore[arg-type]
+
+
+def test_names_in_quotes_stand_for_types() -> None:
+    @on
+    def quoted(a: "int") -> "str":
+        return a  # type: ignore[return-value]
+
+    with pytest.raises(TypeCheckError):
+        quoted("1")
+    with pytest.raises(TypeCheckError):
+        quoted(1)
+
+
+def test_what_a_generator_is_given_is_checked() -> None:
+    @on
+    def counted(n: int) -> Iterator[int]:
+        yield from range(n)
+
+    assert list(counted(3)) == [0, 1, 2]
+    with pytest.raises(TypeCheckError):
+        counted("3")
+
+
+def test_the_checks_can_be_switched_off(no_jaxtyping: None) -> None:
+    assert joined(zeros(4, 3), zeros(4, 2), rows=1).shape == (3, 5)
+
+
+def test_the_package_is_under_them() -> None:
+    assert hasattr(plain, "has_checks")
+    assert hasattr(Gaussians.__init__, "has_checks")
+    with pytest.raises(TypeCheckError):
+        pixel_centers("4", 3)  # type: ignore[arg-type]
+    with pytest.raises(TypeCheckError):
+        FeatureMap(
+            features=zeros(2, 2, 3).astype(np.float64),
+            grid_from_image=np.zeros((2, 3)),
+            space=FeatureSpace(name="three", channels=3),
+        )
+    centers: Float64[np.ndarray, "3 4 2"] = pixel_centers(4, 3)
+    assert centers.shape == (3, 4, 2)
