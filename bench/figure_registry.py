@@ -17,7 +17,7 @@ REGISTRY = Path(__file__).with_name("figures.yaml")
 OUTPUT = "figures.json"
 """What an entry's command writes into $OUT, if the figure names no other file."""
 Kind = Literal["accuracy", "error", "ratio", "count", "bytes", "memory", "seconds"]
-REPEATABLE = ("accuracy", "error", "count", "bytes")
+REPEATABLE = ("accuracy", "error", "count", "bytes", "memory")
 """Kinds that do not depend on what else the machine does."""
 NEEDS: dict[str, tuple[Callable[[Path], bool], str]] = {
     "shared": (lambda shared: (shared / "scenes").is_dir(), "no folder of shared data (GSENCODER_SHARED)"),
@@ -109,6 +109,10 @@ class Entry:
     figures: tuple[Figure, ...]
     needs: tuple[str, ...] = ()
     repeats: int = 1
+
+    @property
+    def minutes_of_all_runs(self) -> float:
+        return self.minutes * self.repeats
 
     @property
     def deterministic(self) -> bool:

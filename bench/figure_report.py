@@ -99,7 +99,7 @@ def listing(registry: Registry, shared: Path) -> str:
         missing = f"; skipped: {entry.missing(shared)}" if entry.missing(shared) else ""
         kind = "" if entry.deterministic else ", depends on load"
         lines.append(f"{entry.name}: {entry.minutes:g} min{runs}, {len(entry.figures)} figures{kind}{missing}")
-    total = sum(entry.minutes * entry.repeats for entry in registry.entries)
+    total = sum(entry.minutes_of_all_runs for entry in registry.entries)
     lines.append(f"{len(registry.entries)} entries, {total:.0f} minutes\n\nNot remade here:")
     lines += [f"{each.section}: {each.figures}: {each.why}" for each in registry.not_remade]
     return "\n".join(lines)

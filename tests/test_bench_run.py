@@ -248,7 +248,7 @@ def test_recorded_values_are_written_into_their_lines_and_nothing_else_is(bench:
 
 def test_minutes_take_deterministic_entries_first(script: dict[str, Any], entries: tuple[Any, ...]) -> None:
     chosen = script["choose"](entries, [], 60)
-    assert 45 < sum(entry.minutes * entry.repeats for entry in chosen) <= 60
+    assert 45 < sum(entry.minutes_of_all_runs for entry in chosen) <= 60
     assert [entry.deterministic for entry in chosen] == sorted((e.deterministic for e in chosen), reverse=True)
     with pytest.raises(script["RegistryError"], match="--only 'nothing': no such entry; there are demo"):
         script["choose"](entries, ["nothing"], 0)
