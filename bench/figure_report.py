@@ -78,16 +78,17 @@ def markdown(machine: Mapping[str, str], rows: Sequence[Mapping[str, Any]]) -> s
     """The report."""
     moved = [row for row in rows if row["state"] == "moved"]
     lines = [f"# Figures remade on {machine['date']}", ""]
-    lines += [f"{len(moved)} of {len(rows)} figures moved by more than their spread."]
+    measured = [row for row in rows if row["values"]]
+    lines += [f"{len(moved)} of {len(measured)} figures moved by more than their spread; {len(rows)} were asked for."]
     lines += ["Seconds are shown and not judged, as machines differ.", ""]
     lines += [f"- {name}: {value}" for name, value in machine.items()]
     lines += ["", "| entry | figure | recorded | now | |", "|---|---|---|---|---|"]
     for row in rows:
-        now = f"{row['now']:.4g} ± {row['now_spread']:.2g} ({len(row['values'])})" if row["values"] else ""
+        now = f"{row['now']:.6g} ± {row['now_spread']:.2g} ({len(row['values'])})" if row["values"] else ""
         state = row["state"].replace("|", "\\|")
         state = f"**{state}**" if row["state"] == "moved" else state
         what = f"{row['figure']} ({row['kind']})"
-        lines.append(f"| {row['entry']} | {what} | {row['recorded']:.4g} ± {row['spread']:.2g} | {now} | {state} |")
+        lines.append(f"| {row['entry']} | {what} | {row['recorded']:.6g} ± {row['spread']:.2g} | {now} | {state} |")
     return "\n".join(lines) + "\n"
 
 
