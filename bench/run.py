@@ -174,6 +174,8 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="print the entries, and what is not remade")
     parser.add_argument("--record", action="store_true", help="write the medians into the registry")
     options = parser.parse_args()
+    # A runner that is asked to end takes its command with it.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         registry = load_registry(options.registry)
         if options.list:

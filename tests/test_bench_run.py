@@ -1,10 +1,14 @@
 """The figures that `make bench` remakes: what the registry names is there, and the runner loses nothing on the way."""
 
 import json
+import os
 import re
 import runpy
 import shlex
+import signal
+import subprocess
 import sys
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -149,7 +153,11 @@ class Bench:
         """The exit code, and the state of each figure."""
         words = ("--registry", str(self.registry), "--out", str(self.out), *words)
         self.monkeypatch.setattr(sys, "argv", ["run.py", *words])
-        code = self.script["main"]()
+        before = signal.getsignal(signal.SIGTERM)
+        try:
+            code = self.script["main"]()
+        finally:
+            signal.signal(signal.SIGTERM, before)
         rows = json.loads((self.out / "results.json").read_text())["figures"]
         return code, {(row["entry"], row["figure"]): row["state"] for row in rows}
 
@@ -224,6 +232,25 @@ def test_failing_and_hanging_entries_hide_no_other_and_a_later_call_goes_on(benc
     assert states["good", "moved"] == "moved"
     runs = [json.loads(line)["entry"] for line in (bench.out / "runs.jsonl").read_text().splitlines()[1:]]
     assert sorted(runs) == ["failing", "failing", "good", "hanging", "spread", "spread"]
+
+
+def test_a_runner_that_is_ended_takes_its_command_with_it(bench: Bench, tmp_path: Path) -> None:
+    pid = tmp_path / "pid"
+    text = bench.registry.read_text()
+    bench.registry.write_text(
+        text.replace(
+            "minutes: 0.001\n  command: sleep 60 & wait", f"minutes: 1\n  command: echo $$ > {pid}; sleep 60 & wait"
+        )
+    )
+    command = [sys.executable, BENCH / "run.py", "--registry", bench.registry, "--out", bench.out, "--only", "hanging"]
+    with subprocess.Popen([str(word) for word in command], stdout=subprocess.DEVNULL) as process:
+        while not (pid.exists() and pid.read_text()):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.terminate()
+        assert process.wait() == 128 + signal.SIGTERM
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
 
 
 def test_earlier_results_are_not_written_over(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
