@@ -239,7 +239,8 @@ def test_a_runner_that_is_ended_takes_its_command_with_it(bench: Bench, tmp_path
     text = bench.registry.read_text()
     bench.registry.write_text(
         text.replace(
-            "minutes: 0.001\n  command: sleep 60 & wait", f"minutes: 1\n  command: echo $$ > {pid}; sleep 60 & wait"
+            "minutes: 0.001\n  command: sleep 60 & wait",
+            f"minutes: 1\n  command: sleep 0.5; echo $$ > {pid}; sleep 60 & wait",
         )
     )
     command = [sys.executable, BENCH / "run.py", "--registry", bench.registry, "--out", bench.out, "--only", "hanging"]
