@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Processes that tests run in, each on one thread.
 PROCESSES ?= 2
+# Options of bench/run.py.
+BENCH ?= --minutes 60
 # Cases that `make stability` tries for each routine.
 EXAMPLES ?= 500
 # Files with tests that run alone, which are all that the second run collects, and files with slow tests only.
@@ -16,7 +18,7 @@ export PYTHONDONTWRITEBYTECODE :=
 VIEWER := gsencoder/infer/viewer/static/viewer.js
 VIEWER_SOURCES := $(wildcard viewer/src/* viewer/*.json viewer/*.mjs viewer/*.py)
 
-.PHONY: help setup viewer demo test test-fast stability lint check gpu cli docs clean
+.PHONY: help setup viewer demo test test-fast stability lint check bench gpu cli docs clean
 help:            ## what can be made
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## */\t/'
 
@@ -55,6 +57,9 @@ stability: setup ## searches for cases that break a promise of docs/numerics.md,
 	GSENCODER_STABILITY_EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q -n $(PROCESSES) tests/stability
 
 check: lint test ## what continuous integration runs
+
+bench: setup     ## the measured figures again, as far as an hour goes; outputs/bench/results.md (others: BENCH="--only 'encode*'")
+	$(BIN)/python bench/run.py --out outputs/bench $(BENCH)
 
 gpu: setup       ## ten minutes on a GPU: parity with the CPU and costs, as gpu.md and gpu.json (runs on a CPU too: GPU=--small)
 	$(BIN)/python bench/gpu.py --out gpu.md $(GPU)

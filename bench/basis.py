@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("--held-out", type=int, default=8, help="rooms, the last ones, that it is applied to")
     parser.add_argument("--views", type=int, default=3, help="views of a room")
     parser.add_argument("--views-of-others", type=int, default=16, help="views of another scene")
+    add_json_option(parser)
     arguments = parser.parse_args()
     rooms = find_scenes((arguments.house,))
     config = compose("train", TrainCommandConfig, ["-", "teacher=dinov2_s14"])
@@ -62,6 +64,7 @@ def main() -> None:
         sources[Path(path).name] = vectors_of([Path(path)], teacher, arguments.views_of_others)
     print("| vectors of | rank | energy kept | mean cosine | worst 5 % below |")
     print("|---|---|---|---|---|", flush=True)
+    figures: dict[str, dict[int, dict[str, float]]] = {}
     for name, maps in sources.items():
         sums = [ProjectionSums() for _ in bases]
         for rows in maps:
@@ -69,7 +72,10 @@ def main() -> None:
                 each.add(basis, rows)
         for each, basis in zip(sums, bases, strict=True):
             fit = each.fit()
+            found = {"energy": fit.energy, "cosine": fit.cosine, "worst": fit.worst}
+            figures.setdefault(name, {})[basis.rank] = found
             print(f"| {name} | {basis.rank} | {fit.energy:.3f} | {fit.cosine:.3f} | {fit.worst:.3f} |", flush=True)
+    write_figures(arguments.json, figures)
 
 
 if __name__ == "__main__":

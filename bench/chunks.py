@@ -11,6 +11,7 @@ import time
 from itertools import product
 
 import numpy as np
+from json_option import add_json_option, write_figures
 from per_scene import labeled, quality
 
 from gsencoder.core.files.model_files import find_file
@@ -32,6 +33,7 @@ def main() -> None:
     parser.add_argument("--words", default="clip_vitb32_names.npz")
     parser.add_argument("--chunks", default="125000,80000,40000")
     parser.add_argument("--halos", default="0,0.64,1.28")
+    add_json_option(parser)
     chosen = parser.parse_args()
     retain_freed_memory()
     words = load_text_table(find_file(chosen.words, "words"))
@@ -57,11 +59,14 @@ def main() -> None:
             same = 1 - field_error(found, whole).centered
             rows[name].append((*quality(scene, truth, found, teacher, words), same, spent, parts))
     print("| setting | chunks | cosine with the whole | names | Acc@0.25 | seconds |\n|---|---|---|---|---|---|")
+    figures = {}
     for name, each in rows.items():
         names = naming_scores([row[0] for row in each])["accuracy"]
         hits = accuracy([hit for row in each for hit in row[1]], 0.25)
         same, spent, parts = (float(np.mean([row[place] for row in each])) for place in (2, 3, 4))
         print(f"| {name} | {parts:.1f} | {same:.4f} | {names:.3f} | {hits:.3f} | {spent:.2f} |")
+        figures[name] = {"chunks": parts, "cosine": same, "names": names, "Acc@0.25": hits, "seconds": spent}
+    write_figures(chosen.json, figures)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from encoder import CHANNELS, surface
+from json_option import add_json_option, write_figures
 from torch.nn import functional
 
 from gsencoder.app.commands.train import TrainCommandConfig
@@ -100,6 +101,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=15_000)
     parser.add_argument("--rounds", type=int, default=12)
     parser.add_argument("--only", default="", help="heap, forward or rounding, -on or -off: its seconds")
+    add_json_option(parser)
     chosen = parser.parse_args()
     if chosen.only:
         if chosen.only not in ("heap-off", "forward-off"):
@@ -111,6 +113,7 @@ def main() -> None:
         return
     own = [sys.executable, __file__, f"--gaussians={chosen.gaussians}", f"--rounds={chosen.rounds}"]
     told = {"heap": "a step without the heap", "forward": "a forward without it", "rounding": "a step without rounding"}
+    figures = {}
     for choice, text in told.items():
         ratios = []
         for _ in range(3):
@@ -119,13 +122,17 @@ def main() -> None:
                 for way in ("off", "on")
             )
             ratios.append(off / on)
+        figures[choice] = np.median(ratios)
         print(f"{choice}: {text} takes {np.median(ratios):.2f} times as long", flush=True)
     retain_freed_memory()
     ratio = in_turn(attention(torch.bfloat16), attention(torch.float32), chosen.rounds)
+    figures["attention"] = ratio
     print(f"attention: forward and backward in bfloat16 take {ratio:.2f} times as long as in float32")
     for size in (chosen.gaussians, 20 * chosen.gaussians):
         ratio = in_turn(convolution(size, shuffled=True), convolution(size, shuffled=False), chosen.rounds)
         print(f"order: the convolution over {size:,} shuffled tokens {ratio:.2f} times as long as in Morton order")
+        figures[f"order, {size}"] = ratio
+    write_figures(chosen.json, figures)
 
 
 if __name__ == "__main__":

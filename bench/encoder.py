@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from json_option import add_json_option, write_figures
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsencoder.app.commands.train import TrainCommandConfig
@@ -239,6 +240,7 @@ def main() -> None:
     parser.add_argument("--step", default="", help="prepared scenes: what the parts of a training step take")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--chunk", type=int, default=250_000)
+    add_json_option(parser)
     chosen = parser.parse_args()
     retain_freed_memory()
     config = compose("train", TrainCommandConfig, ["scene", f"model={chosen.model}"])
@@ -286,6 +288,16 @@ def main() -> None:
             f"{row['before_gib']:.2f} GiB before and {row['peak_gib']:.2f} GiB at most",
             flush=True,
         )
+    figures = {
+        row["gaussians"]: {
+            "forward": row["forward"],
+            "forward / products": row["forward"] / row["products"],
+            "plan / forward": row["plan"] / row["forward"],
+            "peak GiB": row["peak_gib"],
+        }
+        for row in rows
+    }
+    write_figures(chosen.json, figures)
     if len(rows) > 1:
         tokens = np.array([row["tokens"] for row in rows])
         forward = np.array([row["forward"] for row in rows])

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -57,6 +58,7 @@ def main() -> None:
     parser.add_argument("--weights", default="house_cpu")
     parser.add_argument("--bank-rooms", nargs="*", default=[], type=Path)
     parser.add_argument("--optimize", action="store_true", help="also optimize a memory of each room")
+    add_json_option(parser)
     arguments = parser.parse_args()
     encoder, labels = load_encoder(arguments.weights), LabelsConfig()
     words = words_of(labels)
@@ -107,12 +109,15 @@ def main() -> None:
     print(
         "| features | names | centered cosine with fused | bytes a Gaussian | seconds a room |\n|---|---|---|---|---|"
     )
+    figures = {}
     for key, rows in results.items():
         scored = naming_scores([counts for counts, _ in rows])
         spent = f"{np.mean(seconds[key]):.2f}" if key in seconds else ""
         cosine = np.nanmean([counts.cosine for counts, _ in rows])
         size = np.mean([size for _, size in rows])
         print(f"| {key} | {scored['accuracy_named']:.3f} | {cosine:.3f} | {size:.0f} | {spent} |")
+        figures[key] = {"names": scored["accuracy_named"], "cosine": cosine, "bytes a Gaussian": size}
+    write_figures(arguments.json, figures)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import FEATURES_FILE, WORDS_FILE, load_features
@@ -52,9 +53,11 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--flips", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
+    add_json_option(parser)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     rng, kinds = random.Random(given.seed), {".safetensors", ".gsf", ".ply"}
+    files = all_silent = 0
     for folder in given.folders:
         with tempfile.TemporaryDirectory() as name:
             copy = Path(shutil.copytree(folder, Path(name) / "copy"))
@@ -78,10 +81,12 @@ def main() -> None:
                             except InputError:
                                 refused += 1
                 silent = given.flips - refused - same
+                files, all_silent = files + 1, all_silent + silent
                 size = file.stat().st_size / 2**20
                 print(
                     f"{folder.name}/{file.name} ({size:.1f} MiB): {refused} refused, {same} the same, {silent} silent"
                 )
+    write_figures(given.json, {"files": files, "silent": all_silent})
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from errors import existing_folder, one_line_errors, positive
+from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import load_scene
@@ -29,8 +30,11 @@ from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.types import Cameras, Scene
 
 
-def timings(field: FeatureField, cameras: Cameras, view: int, names: list[str], text: TextTable, runs: int) -> None:
-    """Prints the seconds of each part, and of an answer with kept geometry beside one that makes it anew."""
+def timings(
+    field: FeatureField, cameras: Cameras, view: int, names: list[str], text: TextTable, runs: int
+) -> dict[str, float]:
+    """Prints the seconds of each part, and of an answer with kept geometry beside one that makes it anew; their ratio
+    and the seconds are returned."""
 
     def timed(title: str, work: Callable[[], Any]) -> Any:
         start = time.perf_counter()
@@ -59,6 +63,7 @@ def timings(field: FeatureField, cameras: Cameras, view: int, names: list[str], 
     print(f"anew / kept, one word    {medians['one word, anew'] / medians['one word, kept']:8.1f}")
     print(f"16 words, each           {1e3 * medians['16 words, kept'] / 16:8.1f} ms")
     print(f"entries a pixel          {len(kept.b.col) / kept.b.rows:8.1f}")
+    return {**medians, "anew / kept": medians["one word, anew"] / medians["one word, kept"]}
 
 
 def moved(cameras: Cameras, shift: float, turn: float, rng: np.random.Generator) -> Cameras:
@@ -98,7 +103,7 @@ def right(point: PosePoint, scene: Scene, margin: float) -> bool:
 def truth(
     scene: Scene, field: FeatureField, cameras: Cameras, text: TextTable, maps: Callable[[int, Blend], np.ndarray],
     *, pixels: int, margin: float,
-) -> str:  # fmt: skip
+) -> dict[str, float]:  # fmt: skip
     """Asks all names of the scene in all views; `maps` gives the instances of a view's pixels."""
     named = sorted({each.name for each in scene.objects if each.name is not None and each.name in text.names})
     asked = inside = visible = hidden = absent = 0
@@ -114,10 +119,19 @@ def truth(
             elif counts[ids].sum() == 0:
                 absent += 1
                 hidden += not point.visible
+    return {
+        "asked": asked,
+        "right": inside / max(asked, 1),
+        "visible": visible / max(asked, 1),
+        "absent": absent,
+        "hidden": hidden / max(absent, 1),
+    }
+
+
+def told(found: dict[str, float]) -> str:
     return (
-        f"{asked} asked, position right {inside / max(asked, 1):.4f}, "
-        f"said to be visible {visible / max(asked, 1):.4f}; "
-        f"{absent} not in view, said so {hidden / max(absent, 1):.4f}"
+        f"{found['asked']} asked, position right {found['right']:.4f}, said to be visible {found['visible']:.4f}; "
+        f"{found['absent']} not in view, said so {found['hidden']:.4f}"
     )
 
 
@@ -132,6 +146,7 @@ def main() -> None:
     parser.add_argument("--margin", type=float, default=0.05)
     parser.add_argument("--shift", type=float, default=0.2)
     parser.add_argument("--turn", type=float, default=15.0)
+    add_json_option(parser)
     options = parser.parse_args()
     scene, text = load_scene(options.scene), load_text_table(Path(options.features) / WORDS_FILE)
     views = scene.views
@@ -146,10 +161,11 @@ def main() -> None:
     large = views.cameras.resized(options.width)
     names = [each.name for each in scene.objects if each.name is not None and each.name in text.names]
     print(f"view {options.view} at {large.widths[options.view]}×{large.heights[options.view]}:")
-    timings(field, large, options.view, names, text, options.runs)
+    seconds = timings(field, large, options.view, names, text, options.runs)
 
     limits = {"pixels": options.pixels, "margin": options.margin}
-    print("views: " + truth(scene, field, views.cameras, text, lambda view, _: instances[view], **limits))
+    own = truth(scene, field, views.cameras, text, lambda view, _: instances[view], **limits)
+    print(f"views: {told(own)}")
     of_gaussians = torch.from_numpy(instances_of_gaussians(scene, field))
     shares = torch.nn.functional.one_hot(of_gaussians).float()
 
@@ -157,9 +173,9 @@ def main() -> None:
         return np.where(b.alpha.numpy() >= 0.5, b.render(shares).argmax(dim=1).numpy(), 0)
 
     poses = moved(views.cameras, options.shift, options.turn, np.random.default_rng(0))
-    print(
-        f"moved by {options.shift:g} m and {options.turn:g}°: " + truth(scene, field, poses, text, rendered, **limits)
-    )
+    away = truth(scene, field, poses, text, rendered, **limits)
+    print(f"moved by {options.shift:g} m and {options.turn:g}°: {told(away)}")
+    write_figures(options.json, {"seconds": seconds, "views": own, "moved": away})
 
 
 if __name__ == "__main__":

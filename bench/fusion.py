@@ -9,8 +9,11 @@ of threads, agree to the last bit.
 import argparse
 import hashlib
 import os
+import statistics
 import time
 from pathlib import Path
+
+from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -24,12 +27,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--runs", type=int, default=5)
+    add_json_option(parser)
     options = parser.parse_args()
     scene = with_gaussians(load_scene(options.scene), SeedConfig())
     assert scene.gaussians is not None
     assert scene.views is not None
     teacher = build_teacher(LabelsConfig(), scene, words_of(LabelsConfig(), TableTextConfig()))
     print(f"{len(scene.gaussians):,} Gaussians, {len(scene.views)} views")
+    runs = []
     for _ in range(options.runs):
         start, before = time.perf_counter(), os.times()
         fusion = fuse(scene, teacher)
@@ -38,6 +43,13 @@ def main() -> None:
         cpu = after.user - before.user + after.system - before.system
         steps = ", ".join(f"{step} {taken:.2f}" for step, taken in fusion.seconds.items())
         print(f"{seconds:.2f} s, {cpu:.2f} s of CPU time: {steps}; {digest}")
+        runs.append(seconds)
+    figures = {
+        "gaussians": len(scene.gaussians),
+        "fresh process": runs[0],
+        "later": statistics.median(runs[1:] or runs),
+    }
+    write_figures(options.json, figures)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from json_option import add_json_option, write_figures
 from PIL import Image
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
@@ -127,9 +128,12 @@ def score(arguments: argparse.Namespace) -> None:
         encoder = load_encoder(weights)
         unit = unit_of(kept, encoder.voxel)
         rows[Path(weights).name] = encoder.encode(kept.gaussians, metres_per_unit=unit)
+    figures = {}
     for name, features in rows.items():
         raw, centered, covered = rendered_cosines(kept.gaussians, features, left_out, maps)
         print(f"| {name} | {features.features.shape[1]} | {raw:.3f} | {centered:.3f} | {covered:.3f} |", flush=True)
+        figures[name] = {"raw": raw, "centered": centered, "covered": covered}
+    write_figures(arguments.json, figures)
 
 
 def main() -> None:
@@ -144,6 +148,7 @@ def main() -> None:
     scoring.add_argument("out", type=Path)
     scoring.add_argument("--teacher", default="dinov2_s14")
     scoring.add_argument("--weights", nargs="*", default=[])
+    add_json_option(scoring)
     arguments = parser.parse_args()
     retain_freed_memory()
     if arguments.action == "write":

@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from json_option import add_json_option, write_figures
 from synthetic_teacher import SyntheticTeacher
 
 from gsencoder.core.runtime.peak_memory import memory_growth
@@ -186,6 +187,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=0, help="0 = all")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="6 views, 2 runs")
+    add_json_option(parser)
     options = parser.parse_args()
     if options.quick:
         options.views, options.runs = 6, 2
@@ -214,10 +216,16 @@ def main() -> None:
         width = channels if entry[1] else problem.basis.rank
         print(f"{entry[0]:18s}{width:9d}{median[entry]:9.3f}{spread:>16s}{memory[entry]:8.0f}")
     print()
+    figures: dict[str, dict[str, float]] = {}
     for way, rule in ((way, WAYS[way][1]) for way, dense in entries if dense):
         low, high = (rule, False), (way, True)
         narrow, wide = field(problem, *low), field(problem, *high)
         error = field_error(narrow, wide)
+        figures[f"{rule} against {way}"] = {
+            "faster": median[high] / median[low],
+            "less memory": memory[high] / max(memory[low], 1e-9),
+            "centered cosine error": error.centered,
+        }
         print(
             f"{rule} in the basis against {way}, all channels: {median[high] / median[low]:.1f}× faster, "
             f"{memory[high] / max(memory[low], 1e-9):.1f}× less memory, centered cosine error {error.centered:.4f} "
@@ -228,6 +236,7 @@ def main() -> None:
             found = field_error(narrow, truth).centered, field_error(wide, truth).centered
             print(f"    against maps without noise: in the basis {found[0]:.4f}, all channels {found[1]:.4f}")
         del narrow, wide
+    write_figures(options.json, figures)
 
 
 def field(problem: Problem, way: str, dense: bool) -> GaussianFeatures:

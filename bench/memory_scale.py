@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from json_option import add_json_option, write_figures
 
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.memory.attention import MemoryAttention
@@ -39,7 +40,7 @@ def milliseconds(answer: Callable[[], object], repeats: int) -> float:
     return 1e3 * statistics.median(seconds)
 
 
-def words_over_gaussians(count: int) -> None:
+def words_over_gaussians(count: int) -> dict[str, float]:
     rng = np.random.default_rng(0)
     axes = np.linalg.qr(rng.standard_normal((CHANNELS, RANK)))[0].T
     basis = FeatureBasis(
@@ -63,9 +64,10 @@ def words_over_gaussians(count: int) -> None:
     print(
         f"a word over {count:,} Gaussians: index {quick:.1f} ms, rows of their own {slow:.0f} ms ({slow / quick:.0f} ×)"
     )
+    return {"index, ms": quick, "rows / index": slow / quick}
 
 
-def attention_over_components(count: int) -> None:
+def attention_over_components(count: int) -> dict[str, float]:
     rng = np.random.default_rng(0)
     bank = MemoryBank(
         components=rng.standard_normal((count, CHANNELS), np.float32),
@@ -83,10 +85,12 @@ def attention_over_components(count: int) -> None:
     queries = torch.randn(QUERIES, QUERY_CHANNELS, requires_grad=True)
     before, start = resident_megabytes(), time.perf_counter()
     attention(queries).square().mean().backward()
+    seconds, memory = time.perf_counter() - start, peak_megabytes() - before
     print(
         f"{QUERIES:,} queries over {count:,} components of {CHANNELS} channels, forward and backward: "
-        f"{time.perf_counter() - start:.1f} s, {peak_megabytes() - before:.0f} MB"
+        f"{seconds:.1f} s, {memory:.0f} MB"
     )
+    return {"attention, s": seconds, "attention, MB": memory}
 
 
 def resident_megabytes() -> float:
@@ -102,9 +106,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gaussians", type=int, default=1_000_000)
     parser.add_argument("--components", type=int, default=100_000)
+    add_json_option(parser)
     arguments = parser.parse_args()
-    attention_over_components(arguments.components)
-    words_over_gaussians(arguments.gaussians)
+    figures = attention_over_components(arguments.components)
+    write_figures(arguments.json, figures | words_over_gaussians(arguments.gaussians))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
+from json_option import add_json_option, write_figures  # noqa: E402
 from stability import routines  # noqa: E402
 from stability.extremes import EXTREMES  # noqa: E402
 from stability.registry import ROUTINES, TABLE, committed, error_of, most, write_table  # noqa: E402
@@ -93,6 +94,7 @@ def picture(errors: Errors) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="compare with the table, and write nothing")
+    add_json_option(parser)
     options = parser.parse_args()
     errors = measured()
     broken = [key for key, error in errors.items() if not error <= ROUTINES[key[0]].promise]
@@ -100,6 +102,8 @@ def main() -> None:
     print(
         f"{len(ROUTINES)} routines × {len(EXTREMES)} extremes: {len(errors)} of {cells} cells apply, {len(broken)} over"
     )
+    counts = {"routines": len(ROUTINES), "cells": len(errors), "over": len(broken)}
+    write_figures(options.json, counts)
     for name, extreme in broken:
         print(f"over its promise: {name} at {extreme}")
     if options.check:

@@ -17,6 +17,8 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from json_option import add_json_option, write_figures
+
 ROUNDS, PASSES = 3, 5
 
 
@@ -52,6 +54,7 @@ def main() -> None:
     parser.add_argument("--weights", default="house_cpu")
     parser.add_argument("--sizes", default="20000,100000")
     parser.add_argument("--child", action="store_true")
+    add_json_option(parser)
     chosen = parser.parse_args()
     if chosen.child:
         print(json.dumps(measure(chosen.model, chosen.scene)))
@@ -65,6 +68,7 @@ def main() -> None:
     everything = with_gaussians(load_scene(chosen.scene)).gaussians
     assert everything is not None
     far = np.linalg.norm(everything.means - np.median(everything.means, axis=0), axis=1)
+    figures: dict[int, dict[str, float]] = {}
     for size in map(int, chosen.sizes.split(",")):
         with TemporaryDirectory() as folder:
             part = everything.select(np.sort(np.argsort(far, kind="stable")[:size]))
@@ -76,9 +80,12 @@ def main() -> None:
                     done = subprocess.run(words, capture_output=True, text=True, check=True)
                     found[engine].append(json.loads(done.stdout))
         print(f"{len(part):,} Gaussians")
+        figures[size] = {}
         for key in ("seconds", "peak", "cold"):
             theirs, ours = (statistics.median(each[key] for each in found[name]) for name in ("torch", "onnx"))
+            figures[size][key], figures[size][f"{key} / torch"] = ours, ours / theirs
             print(f"  {key}: torch {theirs:.3f}, onnxruntime {ours:.3f}, ratio {ours / theirs:.2f}")
+    write_figures(chosen.json, figures)
 
 
 if __name__ == "__main__":

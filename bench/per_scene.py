@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from json_option import add_json_option, write_figures
 
 from gsencoder.core.files.model_files import find_file
 from gsencoder.core.runtime.heap import retain_freed_memory
@@ -115,6 +116,7 @@ def main() -> None:
     parser.add_argument("--words", default="clip_vitb32_names.npz")
     parser.add_argument("--rounds", default="5,20,50")
     parser.add_argument("--stride", type=int, default=2)
+    add_json_option(parser)
     chosen = parser.parse_args()
     retain_freed_memory()
     words = load_text_table(find_file(chosen.words, "words"))
@@ -134,12 +136,16 @@ def main() -> None:
         for name, (features, seconds) in found.items():
             table.setdefault(name, []).append((*quality(scene, truth, features, teacher, words), seconds))
     print("| features | names | centered cosine | Acc@0.25 | Acc@0.5 | seconds a scene |\n|---|---|---|---|---|---|")
+    written = {}
     for name, rows in table.items():
         scores = naming_scores([names for names, _, _ in rows])
         hits = [hit for _, found_hits, _ in rows for hit in found_hits]
-        figures = (scores["accuracy"], scores["cosine"], accuracy(hits, 0.25), accuracy(hits, 0.5))
+        figures = {"names": scores["accuracy"], "cosine": scores["cosine"]}
+        figures |= {"Acc@0.25": accuracy(hits, 0.25), "Acc@0.5": accuracy(hits, 0.5)}
         seconds = float(np.mean([spent for _, _, spent in rows]))
-        print(f"| {name} | " + " | ".join(f"{value:.3f}" for value in figures) + f" | {seconds:.2f} |")
+        print(f"| {name} | " + " | ".join(f"{value:.3f}" for value in figures.values()) + f" | {seconds:.2f} |")
+        written[name] = {**figures, "seconds": seconds}
+    write_figures(chosen.json, written)
 
 
 if __name__ == "__main__":

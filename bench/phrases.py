@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 from sklearn.metrics import roc_auc_score
 
 from gsencoder.core.errors import SceneWarning
@@ -47,6 +48,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=48)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--text", default="minilm_l6")
+    add_json_option(parser)
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
     os.environ.setdefault("GSENCODER_MODELS", str(Path(options.scenes).parents[1] / "models"))
@@ -83,11 +85,23 @@ def main() -> None:
     scores = np.concatenate([values[:, 0], absent])
     bins = np.minimum((scores * BINS).astype(int), BINS - 1)
     gaps = [abs((truth - scores)[bins == one].mean()) * (bins == one).mean() for one in np.unique(bins)]
+    figures = {
+        "present": len(values),
+        "right": (boxed & right).mean(),
+        "right of all boxes": right.mean(),
+        "by name": (values[:, 2] >= LEAST_IOU).mean(),
+        "boxed if present": boxed.mean(),
+        "absent": len(absent),
+        "boxed if absent": (np.array(absent) >= level).mean(),
+        "AUROC": roc_auc_score(truth, scores),
+        "calibration error": sum(gaps),
+    }
+    write_figures(options.json, figures)
     print(
-        f"{len(present)} phrases, {len(values)} times present: first box right {(boxed & right).mean():.3f} "
-        f"({right.mean():.3f} with min_probability=0), by its name {(values[:, 2] >= LEAST_IOU).mean():.3f}, boxed "
-        f"{boxed.mean():.3f}; {len(absent)} times absent: boxed {(np.array(absent) >= level).mean():.3f}; AUROC "
-        f"{roc_auc_score(truth, scores):.3f}, ECE {sum(gaps):.3f}"
+        f"{len(present)} phrases, {len(values)} times present: first box right {figures['right']:.3f} "
+        f"({figures['right of all boxes']:.3f} with min_probability=0), by its name {figures['by name']:.3f}, boxed "
+        f"{figures['boxed if present']:.3f}; {len(absent)} times absent: boxed {figures['boxed if absent']:.3f}; AUROC "
+        f"{figures['AUROC']:.3f}, ECE {figures['calibration error']:.3f}"
     )
     for phrase, pairs in sorted(present.items(), key=lambda item: np.mean([pair[1] >= LEAST_IOU for pair in item[1]])):
         median = np.median([pair[0] for pair in pairs])

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
@@ -33,6 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("models", nargs="+")
     parser.add_argument("--scenes", nargs="+", required=True)
+    add_json_option(parser)
     chosen = parser.parse_args()
     config = EncodeConfig(chunk=0, device="cpu")
     encoders = {name: OnnxEncoder(name, device="cpu") for name in chosen.models}
@@ -53,12 +55,20 @@ def main() -> None:
             lows[name].append(float(np.quantile(near, 0.01)))
             seconds[name].append(best[name] / best[chosen.models[0]])
     size = Path(chosen.models[0]).stat().st_size
+    figures = {}
     for name, encoder in encoders.items():
+        figures[encoder.header.precision] = {
+            "size": Path(name).stat().st_size / size,
+            "cosine": np.mean(means[name]),
+            "1 % below": np.mean(lows[name]),
+            "seconds": np.median(seconds[name]),
+        }
         print(
             f"{encoder.header.precision}: bytes {Path(name).stat().st_size / size:.3f}; centered cosine "
             f"{np.mean(means[name]):.5f} (worst scene {min(means[name]):.5f}), 1 % below {np.mean(lows[name]):.4f}; "
             f"seconds {np.median(seconds[name]):.2f} ({min(seconds[name]):.2f} to {max(seconds[name]):.2f})"
         )
+    write_figures(chosen.json, {"bytes": size, **figures})
 
 
 if __name__ == "__main__":

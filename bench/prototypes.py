@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import load_scene
@@ -64,6 +65,7 @@ def main() -> None:
     parser.add_argument("model")
     parser.add_argument("--learn", nargs="+", required=True)
     parser.add_argument("--ask", nargs="+", required=True)
+    add_json_option(parser)
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
     config = OnnxConfig(model=options.model, layout="tokens", skip_tokens=1, patch=14, size=448)
@@ -84,8 +86,9 @@ def main() -> None:
             )
             hits[level] += found
         print(f"asked {Path(path).name} after {time.perf_counter() - start:.0f} s", flush=True)
-    for level, found in hits.items():
-        row = scores(found)
+    table_of_levels = {level: scores(found) for level, found in hits.items()}
+    write_figures(options.json, table_of_levels)
+    for level, row in table_of_levels.items():
         figures = ", ".join(f"{name} {row[name]:.3f}" for name in ("acc_25", "acc_50", "oracle_acc_25", "mean_iou"))
         print(f"threshold {level}: {row['objects']} objects, {figures}")
 

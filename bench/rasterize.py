@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from json_option import add_json_option, write_figures
 from torch import Tensor
 
 from gsencoder.data.scenes import load_scene
@@ -93,6 +94,7 @@ def main() -> None:
     parser.add_argument("scene")
     parser.add_argument("--view", type=int, default=3)
     parser.add_argument("--sparse", type=int, default=9, help="the reference is compared on every so many-th Gaussian")
+    add_json_option(parser)
     options = parser.parse_args()
     scene = load_scene(options.scene)
     gaussians = scene.gaussians if scene.gaussians is not None else seed(scene)
@@ -108,11 +110,13 @@ def main() -> None:
 
     exact = torch.autograd.grad(total(on_cpu(wide := leaves(gaussians, torch.float64))), list(wide.values()))
     found = torch.autograd.grad(total(on_cpu(inputs)), list(inputs.values()))
+    errors = {}
     for name, value, truth in zip(inputs, found, exact, strict=True):
         seen = truth.reshape(len(truth), -1).norm(dim=1)
         error = (value - truth).reshape(len(truth), -1).norm(dim=1)[seen > 0]
         # A row's gradient is a sum of both signs, so it is judged against no less than a typical one.
         relative = error / seen[seen > 0].clamp(min=float(seen[seen > 0].median()))
+        errors[name] = float(relative.median())
         far = relative > 1e-3
         rest = float(error[~far].norm() / seen[seen > 0][~far].norm())
         print(
@@ -131,6 +135,8 @@ def main() -> None:
         f"{len(few['means']):,} Gaussians: {fast:.3f} s there and back; torch reference {slow[0]:.1f} + {slow[1]:.1f} "
         f"s, ratio {sum(slow) / fast:.0f}"
     )
+    seconds = {"forward": forward, "backward": backward, "backward / forward": backward / forward}
+    write_figures(options.json, {**seconds, "reference / rasterizer": sum(slow) / fast, "median error": errors})
 
 
 if __name__ == "__main__":

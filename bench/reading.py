@@ -11,6 +11,7 @@ file; a return is a stay in a file that an earlier stay was in. Three counts for
     all         every function that is called, at its first call only
 """
 
+import argparse
 import itertools
 import sys
 import tempfile
@@ -20,6 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from json_option import add_json_option, write_figures
 from synthetic_teacher import SyntheticTeacher
 
 import gsencoder
@@ -68,6 +70,10 @@ def stays(calls: list[tuple[int, str, str]], levels: int, *, repeats: bool) -> t
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_json_option(parser)
+    options = parser.parse_args()
+    figures: dict[str, dict[str, int]] = {}
     scene = make_room(views=3)
     assert scene.gaussians is not None
     teacher = ExpensiveTeacher(channels=96, rank=8)
@@ -88,10 +94,12 @@ def main() -> None:
             start = next(index for index, (_, _, function) in enumerate(calls) if function == name)
             calls = calls[start:]
             counts = [stays(calls, 1, repeats=True), stays(calls, 2, repeats=False), stays(calls, 99, repeats=False)]
+            figures[name] = {"stays": counts[0][0], "returns": counts[0][1]}
             print(
                 f"{name:16}"
                 + "".join(f"{f'{n} / {again}':>{w}}" for (n, again), w in zip(counts, (10, 14, 10), strict=True))
             )
+    write_figures(options.json, figures)
 
 
 if __name__ == "__main__":

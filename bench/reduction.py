@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
@@ -82,6 +83,7 @@ def main() -> None:
     parser.add_argument("--maps", type=Path)
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--replicas", type=int, default=0)
+    add_json_option(parser)
     arguments = parser.parse_args()
     features = raw_features(arguments.scene, arguments.teacher, arguments.maps)
     features = features[even_indices(len(features), arguments.rows)]
@@ -92,6 +94,7 @@ def main() -> None:
         return
     print("| θ | algorithm | seconds | × | components | coverage | mean cosine | same set |")
     print("|---|---|---|---|---|---|---|---|")
+    figures: dict[str, dict[str, float]] = {}
     for threshold in arguments.thresholds:
         start = time.perf_counter()
         published, used = transcription(features, threshold)
@@ -106,12 +109,19 @@ def main() -> None:
             rows.append((name, min(seconds), made))
         for name, each, made in rows:
             best = nearest_cosines(features, made.rows)
+            figures[f"{name}, {threshold}"] = {
+                "faster": reference / each,
+                "components": len(made.rows),
+                "coverage": (best >= threshold - 1e-6).mean(),
+                "cosine": best.mean(),
+            }
             print(
                 f"| {threshold} | {name} | {each:.2f} | {reference / each:.1f} | {len(made.rows):,} | "
                 f"{(best >= threshold - 1e-6).mean():.3f} | {best.mean():.3f} | "
                 f"{'yes' if np.array_equal(made.rows, published) else 'no'} |",
                 flush=True,
             )
+    write_figures(arguments.json, figures)
 
 
 def of_many(features: np.ndarray, thresholds: list[float], replicas: int) -> None:

@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 from PIL import Image
 
 from gsencoder.core.errors import SceneWarning
@@ -67,10 +68,10 @@ def write_masks(photos: str, out: str, count: int) -> None:
     print(f"{len(paths)} label images, {regions / max(len(paths), 1):.0f} regions each, in {seconds:.1f} s")
 
 
-def compare_captions(paths: list[str]) -> None:
+def compare_captions(paths: list[str]) -> dict[str, dict[str, float]]:
     warnings.simplefilter("ignore", SceneWarning)
     os.environ.setdefault("GSENCODER_MODELS", str(Path(paths[0]).parents[2] / "models"))
-    text = OnnxTextConfig(model="minilm_l6", pooling="mean")
+    text, figures = OnnxTextConfig(model="minilm_l6", pooling="mean"), {}
     none, mean = (RegionsConfig(masks="instances", rest=rest) for rest in ("none", "mean"))
     for label, teacher, all_names in (
         ("labels", LabelsConfig(), True),
@@ -90,10 +91,11 @@ def compare_captions(paths: list[str]) -> None:
         outcomes = evaluate_localization(load_scenes(paths), source, words)
         ious = np.array([hit.iou for outcome in outcomes for hit in outcome.hits])
         seconds = sum(sum(outcome.seconds.values()) for outcome in outcomes)
-        print(
-            f"{label}: {len(ious)} objects, Acc@0.25 {(ious >= 0.25).mean():.3f}, Acc@0.5 {(ious >= 0.5).mean():.3f}, "
-            f"mean IoU {ious.mean():.3f}, {seconds:.0f} s"
-        )
+        found = {"Acc@0.25": (ious >= 0.25).mean(), "Acc@0.5": (ious >= 0.5).mean(), "mean IoU": ious.mean()}
+        told = ", ".join(f"{name} {value:.3f}" for name, value in found.items())
+        print(f"{label}: {len(ious)} objects, {told}, {seconds:.0f} s")
+        figures[label] = found
+    return figures
 
 
 def main() -> None:
@@ -101,6 +103,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     captions = commands.add_parser("captions")
     captions.add_argument("scenes", nargs="+")
+    add_json_option(captions)
     masks = commands.add_parser("masks")
     masks.add_argument("photos")
     masks.add_argument("out")
@@ -109,7 +112,7 @@ def main() -> None:
     if options.command == "masks":
         write_masks(options.photos, options.out, options.count)
     else:
-        compare_captions(options.scenes)
+        write_figures(options.json, compare_captions(options.scenes))
 
 
 if __name__ == "__main__":

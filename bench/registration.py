@@ -11,6 +11,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from gsencoder import load_scene
@@ -64,16 +65,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path)
     parser.add_argument("--stride", type=int, default=1, help="every n-th view")
+    add_json_option(parser)
     chosen = parser.parse_args()
     identity = tuple(np.eye(4).reshape(-1).tolist())
     depth_camera = (585.0, 585.0, 320.0, 240.0)
     as_files = SceneConfig(intrinsics=depth_camera, depth_intrinsics=depth_camera, depth_from_color=identity)
     print("| depth | correlation of details | colors that agree | compared |\n|---|---|---|---|")
+    figures = {}
     for name, options in (("as in the files", as_files), ("registered on load", SceneConfig())):
         views = load_scene(chosen.scene, options=options).views
         assert views is not None
         correlation, share, compared = agreement(views)
         print(f"| {name} | {correlation:.3f} | {share:.3f} | {compared:,} |", flush=True)
+        figures[name] = {"correlation": correlation, "share": share, "compared": compared}
+    write_figures(chosen.json, figures)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.number_files import write_whole_numbers
@@ -58,8 +59,10 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=100)
     parser.add_argument("--instances", type=int, default=200)
     parser.add_argument("--points", type=int, default=20_000)
+    add_json_option(parser)
     options = parser.parse_args()
     kinds = (max(options.points // options.instances, 100), options.points)
+    figures: dict[str, float] = {}
     for mask in kinds:
         matches, seconds = [], 0.0
         for seed in range(options.scenes):
@@ -72,6 +75,8 @@ def main() -> None:
         last = time.perf_counter() - start
         size = f"{options.instances * mask:,} vertices, {options.instances} masks of {mask:,}"
         print(f"{options.scenes} scenes of {size}: matching {seconds:.2f} s, scores {last:.2f} s")
+        figures[f"masks of {mask}: seconds"] = seconds + last
+        figures[f"masks of {mask}: AP"] = scores.overall.ap
         print(f"    AP {scores.overall.ap:.3f}, AP50 {scores.overall.ap50:.3f}, AP25 {scores.overall.ap25:.3f}")
     with tempfile.TemporaryDirectory() as name:
         for form in ("text", "npz"):
@@ -86,6 +91,8 @@ def main() -> None:
             instance_scores(list(match_instance_files(*folders, CLASSES)), CLASSES)
             seconds = (time.perf_counter() - start) / FILE_SCENES
             print(f"from files, {form}: {seconds:.3f} s a scene, {seconds * options.scenes:.1f} s for all")
+            figures[f"{form}: seconds"] = seconds * options.scenes
+    write_figures(options.json, figures)
 
 
 if __name__ == "__main__":

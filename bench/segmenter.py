@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from json_option import add_json_option, write_figures
 from PIL import Image
 
 from gsencoder.core.errors import SceneWarning
@@ -44,6 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
     parser.add_argument("--every", type=int, default=8)
+    add_json_option(parser)
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
     os.environ.setdefault("GSENCODER_MODELS", str(Path(options.scene).parents[1] / "models"))
@@ -82,6 +84,8 @@ def main() -> None:
             red.append((iou(named[seen] == cabinet, fronts), iou(predicted[seen] == cabinet, fronts)))
     fused, network_iou = np.mean(red, axis=0)
     print(f"{len(left_out)} frames left out: {np.mean(agreements):.3f} of the pixels have the network's own class")
+    figures = {"agreement": np.mean(agreements), "IoU, fused": fused, "IoU, network": network_iou}
+    write_figures(options.json, figures)
     print(f"red fronts in {len(red)} frames: IoU {fused:.3f} of the fused map, {network_iou:.3f} of the network's own")
 
 

@@ -29,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from json_option import add_json_option, write_figures
 from scipy.ndimage import binary_dilation
 
 from gsencoder.core.errors import SceneWarning
@@ -161,6 +162,7 @@ def main() -> None:
     parser.add_argument("--weights", default="house_cpu")
     parser.add_argument("--every", type=int, default=4)
     parser.add_argument("--alone", action="store_true")
+    add_json_option(parser)
     arguments = parser.parse_args()
     retain_freed_memory()
     warnings.simplefilter("ignore", SceneWarning)
@@ -199,10 +201,13 @@ def main() -> None:
             print(f"{scene.name} {name}: {len(targets)} objects, {listing}", flush=True)
         print(f"{scene.name}: {time.perf_counter() - start:.0f} s", flush=True)
     print("\n| features | figure | mean | median | worst |\n|---|---|---|---|---|")
+    written: dict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for name, table in totals.items():
         for key, values in table.items():
             worst = max(values) if key == "kept" else min(values)
-            print(f"| {name} | {key} | {np.mean(values):.3f} | {np.median(values):.3f} | {worst:.3f} |")
+            written[name][key] = {"mean": np.mean(values), "median": np.median(values), "worst": worst}
+            print(f"| {name} | {key} | " + " | ".join(f"{each:.3f}" for each in written[name][key].values()) + " |")
+    write_figures(arguments.json, written)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 from PIL import Image
 
 from gsencoder.core.errors import SceneWarning
@@ -48,6 +49,7 @@ def main() -> None:
     parser.add_argument("--orbits", type=int, default=24)
     parser.add_argument("--up", help="up of the world; without it up is estimated from the Gaussians")
     parser.add_argument("--sheet", type=Path)
+    add_json_option(parser)
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
     os.environ.setdefault("GSENCODER_MODELS", str(options.scene.parents[1] / "models"))
@@ -72,11 +74,14 @@ def main() -> None:
     both = photographed.seen & rendered.seen
     true, given = (classes_of(each, teacher, words.mean)[both] for each in (photographed, rendered))
     print(f"seen in both: {both.sum():,}; the same class: {(true == given).mean():.3f}")
+    classes = {}
     for number in np.argsort(-np.bincount(true, minlength=len(teacher.names))):
         share = (true == number).mean()
         if share >= 0.01:
             agreed = (given[true == number] == number).mean()
+            classes[teacher.names[number]] = agreed
             print(f"  {teacher.names[number]}: {share:.3f} of the Gaussians, {agreed:.3f} of them by renders too")
+    write_figures(options.json, {"cameras": len(bare.views), "agree": (true == given).mean(), "classes": classes})
 
 
 if __name__ == "__main__":

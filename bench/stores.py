@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
@@ -113,6 +114,7 @@ def main() -> None:
     parser.add_argument("--splat", default="")
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--optimize", action="store_true")
+    add_json_option(parser)
     arguments = parser.parse_args()
     config = compose("fuse", FuseCommandConfig, ["-", *arguments.teacher])
     words = words_of(config.teacher, config.text)
@@ -139,6 +141,7 @@ def main() -> None:
                         row.hits += score_queries(scene, features, words, LocalizationProtocol(), LocalizeConfig())[0]
     print("| store | setting | MB a scene | bytes a Gaussian | centered cosine | Acc@0.25 | Acc@0.5 | seconds |")
     print("|---|---|---|---|---|---|---|---|")
+    figures = {}
     for (kind, setting), row in rows.items():
         scored = scores(row.hits) if row.hits else None
         accuracies = f"{scored['acc_25']:.3f} | {scored['acc_50']:.3f}" if scored else "| "
@@ -147,6 +150,8 @@ def main() -> None:
             f"| {kind} | {setting} | {size:.3g} | {each:.3g} | {np.mean(row.cosine):.4f} | {accuracies} | "
             f"{np.mean(row.seconds):.2f} |"
         )
+        figures[f"{kind}, {setting}"] = {"bytes a Gaussian": each, "cosine": np.mean(row.cosine), **(scored or {})}
+    write_figures(arguments.json, figures)
     if arguments.plot:
         plot(rows, arguments.plot)
 

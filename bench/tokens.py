@@ -10,6 +10,7 @@ import statistics
 import time
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.core.even_indices import even_indices
 from gsencoder.data.scenes import load_scene
@@ -27,6 +28,7 @@ def main() -> None:
     parser.add_argument("--channels", type=int, default=1280)
     parser.add_argument("--grid", default="27,27")
     parser.add_argument("--rank", type=int, default=128)
+    add_json_option(parser)
     chosen = parser.parse_args()
     scene = with_gaussians(load_scene(chosen.scene))
     assert scene.gaussians is not None
@@ -50,6 +52,7 @@ def main() -> None:
     start = time.perf_counter()
     blends = token_blends(scene.gaussians, cameras, (lines, columns))
     spent = time.perf_counter() - start
+    figures = {"geometry": spent}
     print(f"geometry of {len(blends)} views of {n:,} Gaussians on {lines} × {columns}: {spent:.2f} s")
     for name, features in (("in a basis", low), ("whole", whole)):
         seconds = []
@@ -57,7 +60,9 @@ def main() -> None:
             start = time.perf_counter()
             feature_tokens(blends, features)
             seconds.append(time.perf_counter() - start)
-        print(f"{d} channels {name} ({features.features.shape[1]} columns): {statistics.median(seconds):.2f} s")
+        figures[name] = statistics.median(seconds)
+        print(f"{d} channels {name} ({features.features.shape[1]} columns): {figures[name]:.2f} s")
+    write_figures(chosen.json, {**figures, "whole / basis": figures["whole"] / figures["in a basis"]})
 
 
 if __name__ == "__main__":

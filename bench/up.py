@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import SceneWarning
@@ -87,6 +88,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--rooms", type=int, default=48)
+    add_json_option(parser)
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
     words = text_table_of(LabelsConfig())
@@ -134,9 +136,13 @@ def main() -> None:
         print(f"| {name} | {np.median(values):.2f}° | {max(values):.2f}° |")
     print(f"\n{np.median(seconds):.2f} s to estimate it from cameras and depth")
     print(f"{len(as_is)} oriented boxes; room as it is: Acc@0.5 {np.mean(np.array(as_is) >= 0.5):.3f}")
+    figures = {f"degrees from {name}": {"median": np.median(each), "worst": max(each)} for name, each in angles.items()}
+    figures["room as it is"] = {"objects": len(as_is), "Acc@0.5": np.mean(np.array(as_is) >= 0.5)}
     for kind, values in same.items():
         accuracy = np.mean(np.array(back[kind]) >= 0.5)
         print(f"{kind}: median IoU with those of the room as it is {np.median(values):.3f}, Acc@0.5 {accuracy:.3f}")
+        figures[kind] = {"IoU": np.median(values), "Acc@0.5": accuracy}
+    write_figures(options.json, figures)
 
 
 if __name__ == "__main__":

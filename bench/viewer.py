@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.query_words import asked_scene
 from gsencoder.fusion.store.folder import load_features
@@ -72,8 +73,8 @@ def ask(server: ViewServer, word: str) -> tuple[float, int]:
     return 1000 * (time.perf_counter() - start), len(data)
 
 
-def in_browser(server: ViewServer) -> None:
-    """Prints the milliseconds of the page's script, and of its frames."""
+def in_browser(server: ViewServer) -> dict[str, float]:
+    """Prints and returns the milliseconds of the page's script, and of its frames."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
@@ -83,9 +84,11 @@ def in_browser(server: ViewServer) -> None:
         page.set_default_timeout(300_000)
         page.goto(server.address)
         page.wait_for_selector("body[data-state=ready]")
-        for name, values in page.evaluate(SCRIPT, list(WORDS)).items():
+        found = page.evaluate(SCRIPT, list(WORDS))
+        for name, values in found.items():
             print(f"browser, {name}: median {np.median(values):.0f} ms of {[round(value) for value in values]}")
         browser.close()
+    return {name: float(np.median(values)) for name, values in found.items()}
 
 
 def main() -> None:
@@ -93,6 +96,7 @@ def main() -> None:
     parser.add_argument("features", type=Path)
     parser.add_argument("--gaussians", type=int, default=500_000)
     parser.add_argument("--no-browser", action="store_true")
+    add_json_option(parser)
     options = parser.parse_args()
     search = enlarged(options.features, options.gaussians)
     page = served_page(load_bundle(), "bench", {"kind": "server", "scenes": 1, "notes": []})
@@ -102,8 +106,10 @@ def main() -> None:
         answers = [ask(server, word) for word in WORDS]
         print(f"{options.gaussians:,} Gaussians, {answers[0][1]:,} bytes an answer")
         print(f"server: {[round(milliseconds) for milliseconds, _ in answers]} ms")
+        figures = {"bytes": answers[0][1], "server": float(np.median([each for each, _ in answers]))}
         if not options.no_browser:
-            in_browser(server)
+            figures |= in_browser(server)
+        write_figures(options.json, figures)
         server.shutdown()
         thread.join()
 

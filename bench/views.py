@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.model_files import find_file
@@ -103,6 +104,7 @@ def main() -> None:
     parser.add_argument("--candidates", default="16,32,64")
     parser.add_argument("--weights", default="")
     parser.add_argument("--furniture", action="store_true")
+    add_json_option(parser)
     chosen = parser.parse_args()
     settings = {}
     if chosen.weights:
@@ -140,19 +142,24 @@ def main() -> None:
                     f"frames {frames['greedy'][-1]:.3f}, {frames['uniform'][-1]:.3f}",
                     flush=True,
                 )
+    figures: dict[str, dict[str, float]] = {}
     for method, ratios in frames.items():
+        good = np.mean(np.array(ratios) >= 0.9)
+        figures[f"frames, {method}"] = {"mean": np.mean(ratios), "least": min(ratios), "at 0.9": good}
         print(
             f"frames, {method}: {np.mean(ratios):.3f} of the best {COUNT}'s pixels, least {min(ratios):.3f}, "
-            f"{np.mean(np.array(ratios) >= 0.9):.2f} of {len(ratios)} objects at 0.9"
+            f"{good:.2f} of {len(ratios)} objects at 0.9"
         )
     for count in counts:
         total = len(shells[count]) + len(failed[count])
-        told = []
+        told, shares = [], {}
         for name in ("visible", "share", "alpha", "free"):
             enough = sum(each[name].sum() >= COUNT - 1 for each in shells[count])
             mean = np.concatenate([each[name] for each in shells[count]]).mean()
+            shares[name] = enough / total
             told.append(f"{name} {enough / total:.2f} ({mean:.3f} of views)")
         every = sum(np.logical_and.reduce(list(each.values())).sum() >= COUNT - 1 for each in shells[count])
+        figures[f"shells of {count}"] = {**shares, "all": every / total, "covered": np.mean(covered[count])}
         print(
             f"shells of {count}: in 7 of 8 views {', '.join(told)}; all of it {every / total:.2f} of "
             f"{total} objects; "
@@ -160,6 +167,7 @@ def main() -> None:
         )
         for line in failed[count]:
             print(f"  {line}")
+    write_figures(chosen.json, figures)
 
 
 if __name__ == "__main__":

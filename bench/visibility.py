@@ -12,6 +12,8 @@ import time
 import warnings
 from pathlib import Path
 
+from json_option import add_json_option, write_figures
+
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.data.scenes import find_scenes, load_scene
@@ -49,6 +51,7 @@ def main() -> None:
     parser.add_argument("--lifts", default="blend,center")
     parser.add_argument("--only", default="", help="names of visibility tests, separated by commas")
     parser.add_argument("--out", type=Path, default=Path("visibility.csv"))
+    add_json_option(parser)
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
     teacher = LabelsConfig(cell=options.cell)
@@ -83,6 +86,8 @@ def main() -> None:
         ]  # fmt: skip
         options.out.write_text(csv_text(rows))
     print(options.out.read_text())
+    keys = ("voxel", "lift", "visibility", "threshold")
+    write_figures(options.json, {", ".join(str(row[key]) for key in keys): row for row in rows})
 
 
 if __name__ == "__main__":
