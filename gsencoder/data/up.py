@@ -91,7 +91,8 @@ def up_of_scene(scene: Scene) -> Up | None:
     """Up of a scene, as its files state it or estimated from what it holds; None where nothing says.
 
     Surfaces are those of the Gaussians, else those of the depth images. Where the normals of Gaussians agree on little,
-    planes through their means are looked at as well, and the estimate with more confidence is taken.
+    planes through their means are looked at as well, and the estimate with more confidence is taken. Where these agree
+    on nothing either (`MIN_CONFIDENCE`), as on one soft object, level cameras alone say more.
     """
     if scene.up is not None:
         return Up(direction=scene.up, confidence=1.0, source="stated", from_cameras=None)
@@ -107,10 +108,13 @@ def up_of_scene(scene: Scene) -> Up | None:
     if scene.gaussians is None or (up is not None and up.confidence >= ENOUGH_CONFIDENCE):
         return up
     planes = planes_of_gaussians(scene.gaussians)
-    if not planes.areas.sum() > 0:
-        return up
-    other = estimate_up(planes, cameras)
-    return other if up is None or other.confidence > up.confidence else up
+    if planes.areas.sum() > 0:
+        other = estimate_up(planes, cameras)
+        up = other if up is None or other.confidence > up.confidence else up
+    if up is not None and cameras is not None and up.confidence < MIN_CONFIDENCE:
+        level = estimate_up(None, cameras)
+        return level if level.confidence > up.confidence else up
+    return up
 
 
 def with_up(scene: Scene) -> tuple[Scene, Up | None]:

@@ -219,6 +219,23 @@ def test_a_fitted_splat_whose_gaussians_are_turned_anyhow_has_the_up_of_its_surf
         assert degrees(up.direction, rotation @ UP) < 1
 
 
+def test_level_cameras_decide_where_gaussians_lean_nowhere(room: Scene) -> None:
+    """As around one soft object: neither normals nor planes through means agree on anything."""
+    assert room.views is not None
+    made = np.random.default_rng(0)
+    ball = made.normal(size=(3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    gaussians = with_gaussians(room).gaussians
+    assert gaussians is not None
+    anyhow = Rotation.random(3000, random_state=1).as_quat(scalar_first=True).astype(np.float32)
+    soft = replace(gaussians.select(np.arange(3000)), means=ball.astype(np.float32), quats=anyhow)
+    up = up_of_scene(replace(room, gaussians=soft))
+    assert up is not None
+    assert up.source == "cameras"
+    assert up.confidence > 0.99
+    np.testing.assert_allclose(up.direction, up_of_cameras(room.views.cameras), atol=1e-9)
+
+
 def test_of_two_floors_the_one_below_the_usual_up_counts_twice_as_much() -> None:
     """A floor across -y, and across z one of 1.5 or 3 times its area."""
     made = np.random.default_rng(0)
