@@ -11,7 +11,7 @@ from gsencoder.fusion.budget.config import BudgetConfig, exact_config
 from gsencoder.fusion.budget.limits import Measure, Pace, within_megabytes, within_seconds
 from gsencoder.fusion.budget.model import Predicted, measure_scatter, sample_features, setting_weights
 from gsencoder.fusion.budget.rank import RankErrors, rank_errors, with_rank
-from gsencoder.fusion.budget.settings import SIDES, Setting, all_settings, cheapest, most_exact
+from gsencoder.fusion.budget.settings import Setting, all_settings, cheapest, most_exact
 from gsencoder.fusion.coverage.order import view_order
 from gsencoder.fusion.coverage.sight import LatticeOf, Sight, look
 from gsencoder.fusion.fuse import FuseConfig
@@ -25,6 +25,8 @@ FIRST_MAPS, MAPS_SHARE = 4, 8
 """The scatter of the teacher's vectors is first measured on so many views, or on one of so many if that is more."""
 START_SCATTER = 0.05
 """ρ by which the first views are chosen."""
+SAFETY = 1.5
+"""ρ counts so many times, since views are not independent of each other."""
 MINIMAL_SCATTER = 1e-4
 """ρ is not taken for less: what a few views show alike, others may not."""
 
@@ -36,6 +38,7 @@ class Choice:
     Attributes:
         config: of the fusion.
         rows: numbers of its views, ascending.
+        order: all views, those that are used first.
         knobs: values that were chosen, by name.
         predicted: its error.
         cost: of the fusion, in views that are blended at the exact rays.
@@ -50,7 +53,8 @@ class Choice:
 
     config: FuseConfig
     rows: tuple[int, ...]
-    knobs: Mapping[str, float]
+    order: tuple[int, ...]
+    knobs: Mapping[str, int | float]
     predicted: Predicted
     cost: float
     seconds: float | None
@@ -98,10 +102,9 @@ def choose(
     # Maps of a costly teacher are all used: the first one, whose cells tell where rays are, is of a view of the middle.
     probe = 0 if teacher.cheap else len(views) // 2
     known = _Known(maps={probe: map_of(probe)})
-    lattice_of, exact_side = _lattices(views, known.maps[probe], exact)
-    sides = tuple(side for side in SIDES if side < exact_side)
+    lattice_of = _lattices(views, known.maps[probe], exact)
     visibility = resolve(base.visibility, views, base.lift)
-    sight = look(gaussians, views, lattice_of, visibility, exact.blend, sides=sides, seed=budget.seed)
+    sight = look(gaussians, views, lattice_of, visibility, exact.blend, seed=budget.seed)
     order = view_order(sight.weights, sight.singles, START_SCATTER, () if teacher.cheap else (probe,))
     wanted = min(max(FIRST_MAPS, math.ceil(len(views) / MAPS_SHARE)), len(views))
     while True:
@@ -115,9 +118,7 @@ def choose(
             sight,
             order,
             known.ranks,
-            exact_side=exact_side,
-            sides=sides,
-            scatter=known.scatter,
+            scatter=SAFETY * known.scatter,
             exact_stop=exact.blend.stop_transmittance,
             cheap=teacher.cheap,
             coded=teacher.table is not None,
@@ -137,7 +138,7 @@ def choose(
         chosen, seconds, said = within_seconds(chosen, settings, budget, pace)
         notes += said
     if budget.megabytes is not None:
-        weights = setting_weights(sight, chosen.side, chosen.stop, exact.blend.stop_transmittance)
+        weights = setting_weights(sight, chosen.stop, exact.blend.stop_transmittance)
         basis = base.basis and teacher.space.channels > base.narrow
         chosen, size, said = within_megabytes(
             chosen,
@@ -149,7 +150,7 @@ def choose(
             basis=basis,
         )
         notes += said
-    return _choice(chosen, base, teacher, known, sight, order[: chosen.views], exact_side, seconds, size, notes)
+    return _choice(chosen, base, teacher, known, sight, order, seconds, size, notes)
 
 
 def _choice(
@@ -158,21 +159,21 @@ def _choice(
     teacher: Teacher,
     known: _Known,
     sight: Sight,
-    rows: np.ndarray,
-    exact_side: int,
+    order: np.ndarray,
     seconds: float | None,
     size: int | None,
     notes: list[str],
 ) -> Choice:
-    rays = (chosen.side or exact_side) ** 2
+    rays = exact_config(base).blend.rays_per_patch
     blend = replace(base.blend, stop_transmittance=chosen.stop, rays_per_patch=rays)
     config = with_rank(replace(base, blend=blend), chosen.rank, known.ranks, teacher)
-    knobs = {"views": chosen.views, "rays_per_patch": rays, "stop_transmittance": chosen.stop}
+    knobs: dict[str, int | float] = {"views": chosen.views, "stop_transmittance": chosen.stop}
     if chosen.rank or known.ranks.fitted:
         knobs["rank"] = chosen.rank or known.ranks.full
     return Choice(
         config=config,
-        rows=tuple(sorted(rows.tolist())),
+        rows=tuple(sorted(order[: chosen.views].tolist())),
+        order=tuple(order.tolist()),
         knobs=knobs,
         predicted=Predicted(error=chosen.error, deviation=chosen.deviation),
         cost=chosen.cost,
@@ -186,8 +187,8 @@ def _choice(
     )
 
 
-def _lattices(views: Views, probe: FeatureMap, exact: FuseConfig) -> tuple[LatticeOf, int]:
-    """The rays of the exact settings in each view, by the map of one, and their number along the side of a cell."""
+def _lattices(views: Views, probe: FeatureMap, exact: FuseConfig) -> LatticeOf:
+    """The rays of the exact settings in each view, by the map of one."""
     rays = capped(exact.blend, probe).rays_per_patch
     lattice = grid_lattice(probe.grid_from_image, probe.width, probe.height, rays)
     cell_x, cell_y = lattice.dx * lattice.side, lattice.dy * lattice.side
@@ -200,7 +201,7 @@ def _lattices(views: Views, probe: FeatureMap, exact: FuseConfig) -> tuple[Latti
         # A picture of another size: cells of as many pixels.
         return replace(lattice, width=max(1, round(columns)), height=max(1, round(lines)))
 
-    return of, lattice.side
+    return of
 
 
 def _learn(known: _Known, sight: Sight, teacher: Teacher, base: FuseConfig, budget: BudgetConfig) -> None:

@@ -6,7 +6,7 @@ view to view, with a mean squared distance σ² about it, then the means with no
 
     E |Δ|² = σ² c,   c = Σ_v (a_v − b_v)²,   and   1 − cosine ≈ ρ c   with   ρ = σ² / 2|f|²  (across f).
 
-c is geometry. ρ is measured on a few views: leave one out, and see how far the mean turns.
+c is geometry. ρ is measured on a few views: leave some out, and see how far the mean turns.
 """
 
 from collections.abc import Mapping
@@ -23,6 +23,8 @@ from gsencoder.types import FeatureMap
 
 UNKNOWN_SCATTER = 1.0
 """ρ where no Gaussian of the sample is seen twice: whatever is not measured counts in full."""
+NEGLIGIBLE_STOP = 1e-4
+"""Rays that end at no more of their light than this leave out next to nothing, whatever a sample says."""
 TINY = 1e-30
 
 
@@ -39,14 +41,17 @@ class Predicted:
     deviation: float
 
 
-def setting_weights(sight: Sight, side: int, stop: float, exact_stop: float) -> Float32[np.ndarray, "V n"]:
-    """The blending weights of the sample with so many rays along a cell, which end at `stop`; side 0 = the exact
-    rays."""
-    weights = np.where(sight.remains > max(stop, exact_stop), sight.weights, 0)
-    if side:
-        exact, areas = sight.areas[0], sight.areas[side]
-        weights = weights * np.divide(areas, exact, out=np.zeros_like(areas), where=exact > 0)
-    return np.asarray(weights, np.float32)
+def setting_weights(sight: Sight, stop: float, exact_stop: float) -> Float32[np.ndarray, "V n"]:
+    """The blending weights of the sample where rays end at `stop`: of those that were followed to a Gaussian, the ones
+    count that still reach it."""
+    if stop <= exact_stop:
+        return np.where(sight.remains > exact_stop, sight.weights, np.float32(0))
+    weights, m = sight.weights.copy(), len(sight.groups)
+    for view, rays in enumerate(sight.rays):
+        whole = np.bincount(rays.owners, rays.weights, m)
+        reached = np.bincount(rays.owners, np.where(rays.remains > stop, rays.weights, 0), m)
+        weights[view, sight.singles :] *= reached / np.maximum(whole, TINY)
+    return weights
 
 
 @kernel
@@ -61,7 +66,7 @@ def _curve(order, setting, exact, scatter, out):
             x = np.float64(exact[v, g])
             total += x
             squares += x * x
-        s, q, mixed = 0.0, 0.0, 0.0
+        s, q, mixed, reachable = 0.0, 0.0, 0.0, 0.0
         for k in range(len(order)):
             if total <= 0:
                 out[k, g] = np.nan
@@ -70,40 +75,43 @@ def _curve(order, setting, exact, scatter, out):
             s += x
             q += x * x
             mixed += x * np.float64(exact[order[k], g])
+            reachable += np.float64(exact[order[k], g])
             out[k, g] = 1.0
             if s > 0:
                 c = q / (s * s) - 2 * mixed / (s * total) + squares / (total * total)
-                out[k, g] = min(1.0, scatter * max(c, 0.0))
+                # The share of the weight that is lost within the views scatters like what is left.
+                lost = 1 - s / reachable
+                out[k, g] = min(1.0, scatter * (max(c, 0.0) + 2 * lost * lost))
 
 
 def predict_curve(
     sight: Sight,
     order: Int64[np.ndarray, " V"],
     *,
-    side: int,
     stop: float,
     exact_stop: float,
     scatter: float,
 ) -> list[Predicted]:
     """The error with the first 1, 2, … views of an order.
 
-    Single Gaussians tell which share no view sees, were there nothing in front of them; the groups, to which rays were
-    followed, what that leaves out, and how the features of those that are seen differ.
+    Single Gaussians tell which share no view sees, were there nothing in front of them; the groups, to which rays
+    were followed, what that leaves out, and how the features of those that are seen differ.
     """
-    exact, setting = setting_weights(sight, 0, exact_stop, exact_stop), setting_weights(sight, side, stop, exact_stop)
+    exact, setting = setting_weights(sight, exact_stop, exact_stop), setting_weights(sight, stop, exact_stop)
     errors = np.empty((len(order), exact.shape[1]), np.float32)
     _curve(order, setting, exact, scatter, errors)
     n = sight.singles
     single = np.where(np.isnan(errors[:, :n]), np.nan, errors[:, :n] >= 1) if n else errors[:, :0]
     alone = np.empty_like(errors[:, n:])
-    area = sight.areas[0][:, n:]
-    _curve(order, area if not side else sight.areas[side][:, n:], area, 0.0, alone)
+    _curve(order, sight.areas[:, n:], sight.areas[:, n:], 0.0, alone)
     beyond = errors[:, n:] - alone
     numbers = sight.groups
-    return [_mean(single[k], beyond[k], numbers, sight) for k in range(len(order))]
+    # What so many groups show nothing of may still be in the rest of the scene.
+    unknown = 1 / max(len(np.unique(numbers)), 1) ** 2 if stop > NEGLIGIBLE_STOP else 0.0
+    return [_mean(single[k], beyond[k], numbers, sight, unknown) for k in range(len(order))]
 
 
-def _mean(single: np.ndarray, beyond: np.ndarray, numbers: np.ndarray, sight: Sight) -> Predicted:
+def _mean(single: np.ndarray, beyond: np.ndarray, numbers: np.ndarray, sight: Sight, unknown: float) -> Predicted:
     seen, of_group = single[np.isfinite(single)], np.isfinite(beyond)
     error, variance = 0.0, 0.0
     if len(seen):
@@ -118,7 +126,7 @@ def _mean(single: np.ndarray, beyond: np.ndarray, numbers: np.ndarray, sight: Si
         variance += float(means.var()) / len(means)
     elif not len(seen):
         return Predicted(error=0.0, deviation=0.0)
-    return Predicted(error=min(max(error, 0.0), 1.0), deviation=float(np.sqrt(variance)))
+    return Predicted(error=min(max(error, 0.0), 1.0), deviation=float(np.sqrt(variance)) + unknown)
 
 
 def rows_at(feature_map: FeatureMap, rows: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n D"]:
@@ -172,20 +180,33 @@ def sample_features(sight: Sight, maps: Mapping[int, FeatureMap]) -> SampleFeatu
 
 
 def measure_scatter(features: SampleFeatures, mean: Float64[np.ndarray, " D"]) -> float:
-    """ρ: over all Gaussians and views, how far the mean turns if the view is left out, per c."""
+    """ρ: over all Gaussians, how far the mean turns if some of the views are left out, per c. Each view is left out for
+    itself, and then the later half of them at once; the larger ρ counts, since views that are alike hide from the first
+    how much lies between views that are far apart."""
     count = len(features.weights)
-    total, squares = features.weights.sum(axis=0), np.square(features.weights).sum(axis=0)
+    alone = [np.arange(count) != view for view in range(count)]
+    half = np.arange(count) < (count + 1) // 2
+    found = [_scatter(features, mean, kept) for kept in (alone, [half])]
+    known = [turned / geometry for turned, geometry in found if geometry > 0]
+    return max(known) if known else UNKNOWN_SCATTER
+
+
+def _scatter(
+    features: SampleFeatures, mean: Float64[np.ndarray, " D"], kept_views: list[Bool[np.ndarray, " M"]]
+) -> tuple[float, float]:
+    """Sums of 1 − cosine and of c, of the means over some views with those over all."""
+    weights, vectors = features.weights, features.vectors
+    total, squares = weights.sum(axis=0), np.square(weights).sum(axis=0)
     whole, _ = features.fused()
     turned, geometry = 0.0, 0.0
-    for view in range(count):
-        w = features.weights[view]
-        rest = total - w
-        rows = np.flatnonzero((w > 0) & (rest > 1e-6 * total))
+    for kept in kept_views:
+        part = weights[kept].sum(axis=0)
+        rows = np.flatnonzero((part > 1e-6 * total) & (part < (1 - 1e-6) * total))
         if not len(rows):
             continue
-        w, rest, all_ = w[rows], rest[rows], total[rows]
-        without = (whole[rows] * all_[:, None] - w[:, None] * features.vectors[view, rows]) / rest[:, None]
-        turned += float((1 - row_cosines(without - mean, whole[rows] - mean)).sum())
-        others = squares[rows] - w * w
-        geometry += float((np.square(w / all_) + others * np.square(1 / rest - 1 / all_)).sum())
-    return turned / geometry if geometry > 0 else UNKNOWN_SCATTER
+        w, s, all_ = weights[kept][:, rows], part[rows], total[rows]
+        some = np.einsum("vm,vmd->md", w, vectors[kept][:, rows]) / s[:, None]
+        turned += float((1 - row_cosines(some - mean, whole[rows] - mean)).sum())
+        q = np.square(w).sum(axis=0)
+        geometry += float((q * (1 / s**2 - 2 / (s * all_)) + squares[rows] / all_**2).sum())
+    return turned, geometry

@@ -12,8 +12,6 @@ from gsencoder.fusion.coverage.sight import Sight
 
 STOPS = {1e-6: 1.05, 1e-4: 1.0, 1e-3: 0.95, 1e-2: 0.88, 0.1: 0.75}
 """Transmittances at which rays end, and what following them costs, relative to the default; as measured in rooms."""
-SIDES = (8, 6, 4, 3, 2, 1)
-"""Numbers of rays along the side of a cell that are tried, if they are fewer than those of the exact settings."""
 FIXED = 0.3
 """Share of the cost of a view that does not depend on its rays: projection and sorting."""
 TEACHER_COST, CHEAP_COST = 30.0, 0.1
@@ -27,11 +25,10 @@ DEVIATIONS = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """A number of views, rays and a rank, with what is predicted of them.
+    """A number of views, an end of rays and a rank, with what is predicted of them.
 
     Attributes:
         views: the first so many of the order.
-        side: rays along the side of a cell; 0 = those of the exact settings.
         stop: transmittance at which rays end.
         rank: of the basis; 0 = all channels.
         error: predicted.
@@ -41,7 +38,6 @@ class Setting:
     """
 
     views: int
-    side: int
     stop: float
     rank: int
     error: float
@@ -60,8 +56,6 @@ def all_settings(
     order: Int64[np.ndarray, " V"],
     ranks: RankErrors,
     *,
-    exact_side: int,
-    sides: Sequence[int],
     scatter: float,
     exact_stop: float,
     cheap: bool,
@@ -74,8 +68,6 @@ def all_settings(
         sight: of the sample.
         order: of the views.
         ranks: worth trying.
-        exact_side: rays along the side of a cell at the exact settings.
-        sides: fewer ones.
         scatter: ρ of the teacher.
         exact_stop: where rays end at the exact settings.
         cheap: whether the teacher is.
@@ -84,25 +76,21 @@ def all_settings(
     """
     map_cost = CHEAP_COST if cheap else TEACHER_COST
 
-    def setting(views: int, side: int, stop: float, rank: int, error: float, deviation: float) -> Setting:
-        rays = (side / exact_side) ** 2 if side else 1.0
-        lifting = FIXED + (1 - FIXED) * rays * STOPS[stop]
+    def setting(views: int, stop: float, rank: int, error: float, deviation: float) -> Setting:
+        lifting = FIXED + (1 - FIXED) * STOPS[stop]
         lifting += 0.0 if coded else COORDINATE_COST * (rank or ranks.full)
         cost = views * (map_cost + lifting)
-        return Setting(
-            views=views, side=side, stop=stop, rank=rank, error=error, deviation=deviation, lifting=lifting, cost=cost
-        )
+        return Setting(views=views, stop=stop, rank=rank, error=error, deviation=deviation, lifting=lifting, cost=cost)
 
     settings = []
-    for side in (0, *sides):
-        for stop in STOPS:
-            curve = predict_curve(sight, order, side=side, stop=stop, exact_stop=exact_stop, scatter=scatter)
-            for number, predicted in enumerate(curve, 1):
-                for rank, error in ranks.errors.items():
-                    if number >= least:
-                        total = min(predicted.error + error, 1.0)
-                        settings.append(setting(number, side, stop, rank, total, predicted.deviation))
-    return [*settings, setting(len(order), 0, min(STOPS), 0, 0.0, 0.0)]
+    for stop in STOPS:
+        curve = predict_curve(sight, order, stop=stop, exact_stop=exact_stop, scatter=scatter)
+        for number, predicted in enumerate(curve, 1):
+            for rank, error in ranks.errors.items():
+                if number >= least:
+                    total = min(predicted.error + error, 1.0)
+                    settings.append(setting(number, stop, rank, total, predicted.deviation))
+    return [*settings, setting(len(order), min(STOPS), 0, 0.0, 0.0)]
 
 
 def cheapest(settings: Sequence[Setting], error: float) -> Setting:

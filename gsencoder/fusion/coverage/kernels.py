@@ -19,19 +19,15 @@ ACROSS = 10
 
 @kernel
 @no_type_check
-def count_rays(projected, index, depths, least, most, shape, ratio, counts):
-    """How many rays meet each Gaussian within their rows' depths, into `counts`, on a lattice of the same cells whose
-    rays are `ratio` times as far apart as those in whose units `projected` is. Of a large Gaussian some rays are looked
-    at, and stand for all."""
+def count_rays(projected, index, depths, least, most, shape, counts):
+    """How many rays meet each Gaussian within their rows' depths, into `counts`. Of a large Gaussian some rays are
+    looked at, and stand for all."""
     height, width, side = shape
     last_x, last_y = float(width * side - 1), float(height * side - 1)
-    offset = 0.5 * (ratio - 1.0)
     for k in range(len(index)):
         g = index[k]
-        u, v = (projected[g, 0] - offset) / ratio, (projected[g, 1] - offset) / ratio
-        hu, hv = projected[g, 2] / ratio, projected[g, 3] / ratio
-        a, b, c = projected[g, 4], projected[g, 5], projected[g, 6]
-        limit = projected[g, 7] / (ratio * ratio)
+        u, v, hu, hv = projected[g, 0], projected[g, 1], projected[g, 2], projected[g, 3]
+        a, b, c, r2 = projected[g, 4], projected[g, 5], projected[g, 6], projected[g, 7]
         x0, x1 = max(np.ceil(u - hu), 0.0), min(np.floor(u + hu), last_x)
         y0, y1 = max(np.ceil(v - hv), 0.0), min(np.floor(v + hv), last_y)
         if x0 > x1 or y0 > y1:
@@ -41,7 +37,7 @@ def count_rays(projected, index, depths, least, most, shape, ratio, counts):
         for y in range(int(y0) + step // 2, int(y1) + 1, step):
             for x in range(int(x0) + step // 2, int(x1) + 1, step):
                 dx, dy = x - u, y - v
-                if a * dx * dx + 2 * b * dx * dy + c * dy * dy <= limit:
+                if a * dx * dx + 2 * b * dx * dy + c * dy * dy <= r2:
                     row = (y // side) * width + x // side
                     if depths[k] >= least[row] and depths[k] <= most[row]:
                         count += 1
@@ -88,9 +84,9 @@ def list_rays(projected, index, depths, least, most, shape, counts, limit, rays,
 @kernel
 @no_type_check
 def near_rays(centers, reaches, slack, parts, pose, K, near, lattice, ends, shape, out):
-    """The balls that may touch a square of rays, of the ranges [first, last) of `parts`, into `out`; returns
-    their number. `ends` are the depths behind which the rays of each square meet nothing; a ball lies up to slack · its reach before
-    its center."""
+    """The balls that may touch a square of rays, of the ranges [first, last) of `parts`, into `out`; returns their
+    number. `ends` are the depths behind which the rays of each square meet nothing; a ball lies up to slack · its reach
+    before its center."""
     x0, y0, dx, dy = lattice
     count_x, count_y = shape
     fx, fy, cx, cy = K[0, 0] / dx, K[1, 1] / dy, (K[0, 2] - x0) / dx, (K[1, 2] - y0) / dy

@@ -1,6 +1,6 @@
 """What each view sees of a sample of Gaussians, by following a few rays to each: no teacher, and no whole pictures."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +23,9 @@ GROUPS, GROUP = 48, 16
 Gaussians, and all others need not be projected."""
 RAYS_EACH = 2
 """At most so many rays are followed to a Gaussian in one view."""
-RAY_SHARE = 0.005
-"""At most this share of the rays of all views is followed; there are fewer groups where they would take more."""
+RAY_SHARE, FEW_RAYS, FEW_SHARE = 0.005, 4000, 0.05
+"""At most this share of the rays of all views is followed, or so many rays if they are a small share, too; there are
+fewer groups where they would take more."""
 
 LatticeOf = Callable[[int], Lattice]
 
@@ -61,7 +62,7 @@ class Sight:
             single one as if it were alone.
         remains: largest transmittance behind it on any ray of the view, 0 = not seen: of rays that end where less than
             `stop` of their light is left, those see it for which this is above `stop`.
-        areas: for each number of rays along the side of a cell, how much of the rows those rays cover that meet it.
+        areas: how much of the rows those rays cover that would meet it alone.
         rays: that were followed, by view.
         all_rays: of whole views.
     """
@@ -72,7 +73,7 @@ class Sight:
     gaussians: int
     weights: Float32[np.ndarray, "V n"]
     remains: Float32[np.ndarray, "V n"]
-    areas: dict[int, Float32[np.ndarray, "V n"]]
+    areas: Float32[np.ndarray, "V n"]
     rays: tuple[Rays, ...]
     all_rays: int
 
@@ -94,7 +95,6 @@ def look(
     visibility: VisibilityConfig,
     config: BlendConfig,
     *,
-    sides: Sequence[int] = (),
     size: int = SAMPLE,
     seed: int = 0,
 ) -> Sight:
@@ -106,7 +106,6 @@ def look(
         lattice_of: the rays that the exact settings have in a view.
         visibility: resolved; against sensor depth, or nothing.
         config: of the exact settings.
-        sides: smaller numbers of rays along the side of a cell, of which areas are wanted.
         size: of the sample.
         seed: of the sample.
     """
@@ -122,24 +121,25 @@ def look(
     chosen = Shapes.of(gaussians, sample)
 
     def prepare(view: int) -> _ViewRays:
-        return _view_rays(chosen, views, view, lattice_of(view), visibility, config, sides, len(singles))
+        return _view_rays(chosen, views, view, lattice_of(view), visibility, config, len(singles))
 
     prepared = parallel(prepare, range(len(views)))
     all_rays = sum(each.lattice.rows * each.lattice.side**2 for each in prepared)
     number = sum((np.bincount(groups[each.owners], minlength=len(around)) for each in prepared), np.zeros(len(around)))
-    fits = int(np.searchsorted(np.cumsum(number), max(RAY_SHARE * all_rays, RAYS_EACH), side="right"))
+    allowed = max(RAY_SHARE * all_rays, min(FEW_SHARE * all_rays, FEW_RAYS))
+    fits = int(np.searchsorted(np.cumsum(number), allowed, side="right"))
     groups = groups[groups < max(fits, 1)]
     sample = sample[: len(singles) + len(groups)]
     rays = parallel(
         lambda view: _follow(prepared[view], blocks, views, view, sample[len(singles) :], config), range(len(views))
     )
-    areas = {side: np.stack([each.areas[side][: len(sample)] for each in prepared]) for side in (0, *sides)}
-    remains = (areas[0] > 0).astype(np.float32)
-    weights = areas[0] * gaussians.opacities[sample]
+    areas = np.stack([each.areas[: len(sample)] for each in prepared])
+    remains = (areas > 0).astype(np.float32)
+    weights = areas * gaussians.opacities[sample]
     for view, each in enumerate(rays):
         followed, behind = np.maximum(np.bincount(each.owners, minlength=len(groups)), 1), remains[view, len(singles) :]
         weights[view, len(singles) :] = (
-            np.bincount(each.owners, each.weights, len(groups)) / followed * areas[0][view, len(singles) :]
+            np.bincount(each.owners, each.weights, len(groups)) / followed * areas[view, len(singles) :]
         )
         behind[:] = 0
         np.maximum.at(behind, each.owners, each.remains)
@@ -165,7 +165,7 @@ class _ViewRays:
     most: Float32[np.ndarray, " P"]
     rays: Int64[np.ndarray, " n"]
     owners: Int32[np.ndarray, " n"]
-    areas: dict[int, Float32[np.ndarray, " n"]]
+    areas: Float32[np.ndarray, " s"]
 
 
 def _view_rays(
@@ -175,7 +175,6 @@ def _view_rays(
     lattice: Lattice,
     visibility: VisibilityConfig,
     config: BlendConfig,
-    sides: Sequence[int],
     singles: int,
 ) -> _ViewRays:
     if visibility.against:
@@ -188,22 +187,14 @@ def _view_rays(
     projected, index, depths = _project(chosen, views, view, lattice, config)
     depths = depths.astype(np.float32)
 
-    def counted(side: int) -> np.ndarray:
-        counts = np.zeros(len(chosen), np.int32)
-        shape = lattice.height, lattice.width, side
-        count_rays(projected, index, depths, least, most, shape, lattice.side / side, counts)
-        return counts
-
-    counts = counted(lattice.side)
-    areas = {0: (counts / lattice.side**2).astype(np.float32)}
-    for side in sides:
-        same = side >= lattice.side
-        areas[side] = areas[0] if same else (counted(side) / side**2).astype(np.float32)
+    counts = np.zeros(len(chosen), np.int32)
+    shape = lattice.height, lattice.width, lattice.side
+    count_rays(projected, index, depths, least, most, shape, counts)
+    areas = (counts / lattice.side**2).astype(np.float32)
     first = int(np.searchsorted(index, singles))
     index, depths = index[first:], depths[first:]
     limit = int(np.minimum(counts[singles:], RAYS_EACH).sum())
     rays, owners = np.empty(limit, np.int64), np.empty(limit, np.int32)
-    shape = lattice.height, lattice.width, lattice.side
     number = list_rays(projected, index, depths, least, most, shape, counts, RAYS_EACH, rays, owners)
     owners = owners[:number] - np.int32(singles)
     return _ViewRays(lattice=lattice, least=least, most=most, rays=rays[:number], owners=owners, areas=areas)
