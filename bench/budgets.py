@@ -77,10 +77,10 @@ class CountedTeacher:
         return self._teacher.settings()
 
 
-def teacher_config(name: str) -> TeacherConfig:
+def teacher_config(name: str, skip_tokens: int) -> TeacherConfig:
     if name in ("labels", "palette"):
         return LabelsConfig() if name == "labels" else PaletteConfig()
-    return OnnxConfig(model=name)
+    return OnnxConfig(model=name, skip_tokens=skip_tokens)
 
 
 def opened(path: Path, config: TeacherConfig) -> tuple[Scene, Teacher]:
@@ -151,12 +151,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--teacher", default="labels")
+    parser.add_argument("--skip-tokens", type=int, default=0, help="of an ONNX model, before those of patches")
     parser.add_argument("--error", type=float, default=0.01)
     parser.add_argument("--grid", action="store_true")
     parser.add_argument("--cold", action="store_true", help="measure the first scene at once, compilation included")
     parser.add_argument("--out", type=Path, default=Path("budgets.csv"))
     chosen = parser.parse_args()
-    config = teacher_config(chosen.teacher)
+    config = teacher_config(chosen.teacher, chosen.skip_tokens)
     with chosen.out.open("a", newline="") as file:
         writer = None
         for number, path in enumerate(chosen.scenes):

@@ -76,7 +76,7 @@ def test_a_loose_promise_takes_fewer_views_and_each_of_their_maps_is_used(
 ) -> None:
     scene, teacher = make_scene(count=24), FixedTeacher(alike(24, 0.1, rng))
     teacher.cheap = not costly
-    made = fuse_within(scene, teacher, BASE, BudgetConfig(error=0.05))
+    made = fuse_within(scene, teacher, BASE, BudgetConfig(error=0.3))
     assert len(made.choice.rows) < 24
     assert made.fusion.views == made.choice.rows
     if costly:

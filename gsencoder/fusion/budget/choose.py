@@ -9,7 +9,14 @@ import numpy as np
 from gsencoder.fusion.basis import Moments
 from gsencoder.fusion.budget.config import BudgetConfig, exact_config
 from gsencoder.fusion.budget.limits import Measure, Pace, within_megabytes, within_seconds
-from gsencoder.fusion.budget.model import Predicted, measure_scatter, sample_features, setting_weights
+from gsencoder.fusion.budget.model import (
+    UNKNOWN_SCATTER,
+    Predicted,
+    measure_drift,
+    measure_scatter,
+    sample_features,
+    setting_weights,
+)
 from gsencoder.fusion.budget.rank import RankErrors, rank_errors, with_rank
 from gsencoder.fusion.budget.settings import Setting, all_settings, cheapest, most_exact
 from gsencoder.fusion.coverage.order import view_order
@@ -23,8 +30,6 @@ from gsencoder.types import FeatureMap, Gaussians, Views
 
 FIRST_MAPS, MAPS_SHARE = 4, 8
 """The scatter of the teacher's vectors is first measured on so many views, or on one of so many if that is more."""
-START_SCATTER = 0.05
-"""ρ by which the first views are chosen."""
 SAFETY = 1.5
 """ρ counts so many times, since views are not independent of each other."""
 MINIMAL_SCATTER = 1e-4
@@ -45,6 +50,7 @@ class Choice:
         seconds: that are predicted; None without a budget of seconds.
         bytes: of the file of features that are predicted; None without a budget of megabytes.
         scatter: ρ of the teacher.
+        drift: of the mean of its vectors.
         maps: that were made on the way, by view.
         followed: rays that were followed on the way.
         all_rays: rays of the fusion at its exact settings.
@@ -60,6 +66,7 @@ class Choice:
     seconds: float | None
     bytes: int | None
     scatter: float
+    drift: float
     maps: Mapping[int, FeatureMap]
     followed: int
     all_rays: int
@@ -71,7 +78,8 @@ class _Known:
     """Maps that were made, and what they say about the teacher."""
 
     maps: dict[int, FeatureMap] = field(default_factory=dict)
-    scatter: float = START_SCATTER
+    scatter: float = UNKNOWN_SCATTER
+    drift: float = 0.0
     ranks: RankErrors = field(default_factory=RankErrors)
 
 
@@ -100,25 +108,26 @@ def choose(
     """
     exact = exact_config(base)
     # Maps of a costly teacher are all used: the first one, whose cells tell where rays are, is of a view of the middle.
-    probe = 0 if teacher.cheap else len(views) // 2
+    spread = spread_out(len(views))
+    probe = spread[0]
     known = _Known(maps={probe: map_of(probe)})
     lattice_of = _lattices(views, known.maps[probe], exact)
     visibility = resolve(base.visibility, views, base.lift)
     sight = look(gaussians, views, lattice_of, visibility, exact.blend, seed=budget.seed)
-    order = view_order(sight.weights, sight.singles, START_SCATTER, () if teacher.cheap else (probe,))
     wanted = min(max(FIRST_MAPS, math.ceil(len(views) / MAPS_SHARE)), len(views))
     while True:
-        for view in order[:wanted].tolist():
+        for view in spread[:wanted]:
             if view not in known.maps:
                 known.maps[view] = map_of(view)
         _learn(known, sight, teacher, base, budget)
-        first = () if teacher.cheap else tuple(order[:wanted].tolist())
+        first = () if teacher.cheap else spread[:wanted]
         order = view_order(sight.weights, sight.singles, known.scatter, first)
         settings = all_settings(
             sight,
             order,
             known.ranks,
             scatter=SAFETY * known.scatter,
+            drift=SAFETY * known.drift,
             exact_stop=exact.blend.stop_transmittance,
             cheap=teacher.cheap,
             coded=teacher.table is not None,
@@ -180,11 +189,22 @@ def _choice(
         seconds=seconds,
         bytes=size,
         scatter=known.scatter,
+        drift=known.drift,
         maps=known.maps,
         followed=sight.followed,
         all_rays=sight.all_rays,
         notes=tuple(notes),
     )
+
+
+def spread_out(count: int) -> tuple[int, ...]:
+    """Numbers of views, the first so many of which are spread over all of them however many that are: the middle one,
+    those at a quarter and three quarters, and so on."""
+    order, parts = dict.fromkeys([count // 2]), 2
+    while parts < 2 * count:
+        parts *= 2
+        order.update(dict.fromkeys(part * count // parts for part in range(1, parts, 2)))
+    return tuple({**order, **dict.fromkeys(range(count))})
 
 
 def _lattices(views: Views, probe: FeatureMap, exact: FuseConfig) -> LatticeOf:
@@ -208,13 +228,19 @@ def _learn(known: _Known, sight: Sight, teacher: Teacher, base: FuseConfig, budg
     """Measures ρ, and what ranks leave out, on the maps that were made."""
     fits = teacher.table is None and (budget.megabytes is not None or teacher.space.channels > base.narrow)
     moments = Moments(teacher.space.channels, second=fits)
-    for feature_map in known.maps.values():
-        moments.add(distinct_rows(feature_map))
+    means = []
+    for _, feature_map in sorted(known.maps.items()):
+        rows = distinct_rows(feature_map)
+        moments.add(rows)
+        if len(rows):
+            means.append(rows.mean(axis=0, dtype=np.float64))
     if moments.count == 0:
         return
     features = sample_features(sight, known.maps)
-    mean = np.asarray(teacher.mean if teacher.mean is not None else moments.mean, np.float64)
+    known_mean = teacher.table.mean(axis=0) if teacher.mean is None and teacher.table is not None else teacher.mean
+    mean = np.asarray(moments.mean if known_mean is None else known_mean, np.float64)
     known.scatter = max(measure_scatter(features, mean), MINIMAL_SCATTER)
+    known.drift = measure_drift(features, np.stack(means)) if known_mean is None else 0.0
     known.ranks = rank_errors(teacher, moments, features, mean, base, needed=budget.megabytes is not None)
 
 

@@ -25,6 +25,8 @@ UNKNOWN_SCATTER = 1.0
 """ρ where no Gaussian of the sample is seen twice: whatever is not measured counts in full."""
 NEGLIGIBLE_STOP = 1e-4
 """Rays that end at no more of their light than this leave out next to nothing, whatever a sample says."""
+SMALL_CHANGE = 0.1
+"""ρ is also measured where c is at most this: cosines of vectors that are turned far grow more slowly than c."""
 TINY = 1e-30
 
 
@@ -91,11 +93,13 @@ def predict_curve(
     stop: float,
     exact_stop: float,
     scatter: float,
+    drift: float = 0.0,
 ) -> list[Predicted]:
     """The error with the first 1, 2, … views of an order.
 
-    Single Gaussians tell which share no view sees, were there nothing in front of them; the groups, to which rays
-    were followed, what that leaves out, and how the features of those that are seen differ.
+    Single Gaussians tell which share no view sees, were there nothing in front of them; the groups, to which rays were
+    followed, what that leaves out, and how the features of those that are seen differ. The mean of the space, which
+    centered cosines take off, adds `drift` (`measure_drift`) times 1/n − 1/V with n of V views.
     """
     exact, setting = setting_weights(sight, exact_stop, exact_stop), setting_weights(sight, stop, exact_stop)
     errors = np.empty((len(order), exact.shape[1]), np.float32)
@@ -108,6 +112,8 @@ def predict_curve(
     numbers = sight.groups
     # What so many groups show nothing of may still be in the rest of the scene.
     unknown = 1 / max(len(np.unique(numbers)), 1) ** 2 if stop > NEGLIGIBLE_STOP else 0.0
+    for k in range(len(order)):
+        beyond[k] += np.where(errors[k, n:] < 1, drift * (1 / (k + 1) - 1 / len(order)), 0)
     return [_mean(single[k], beyond[k], numbers, sight, unknown) for k in range(len(order))]
 
 
@@ -167,7 +173,7 @@ def sample_features(sight: Sight, maps: Mapping[int, FeatureMap]) -> SampleFeatu
     """Reads maps where the rays to the Gaussians of the groups meet them."""
     m = len(sight.groups)
     vectors, weights = [], []
-    for view, feature_map in maps.items():
+    for view, feature_map in sorted(maps.items()):
         rays = sight.rays[view]
         found = rows_at(feature_map, rays.rows)
         weight = np.where(np.isfinite(found[:, 0]), rays.weights, 0).astype(np.float64)
@@ -181,20 +187,29 @@ def sample_features(sight: Sight, maps: Mapping[int, FeatureMap]) -> SampleFeatu
 
 def measure_scatter(features: SampleFeatures, mean: Float64[np.ndarray, " D"]) -> float:
     """ρ: over all Gaussians, how far the mean turns if some of the views are left out, per c. Each view is left out for
-    itself, and then the later half of them at once; the larger ρ counts, since views that are alike hide from the first
-    how much lies between views that are far apart."""
-    count = len(features.weights)
-    alone = [np.arange(count) != view for view in range(count)]
-    half = np.arange(count) < (count + 1) // 2
-    found = [_scatter(features, mean, kept) for kept in (alone, [half])]
-    known = [turned / geometry for turned, geometry in found if geometry > 0]
-    return max(known) if known else UNKNOWN_SCATTER
+    itself, and then each half of a recording at once; the larger ρ counts: neighboring views are alike, so that leaving
+    out one of them hides how much lies between views that are far apart.
+
+    Args:
+        features: of views in ascending order.
+        mean: of the teacher's vectors.
+    """
+    parts = _parts(len(features.weights))
+    known = [_scatter(features, mean, kept, largest) for kept in parts for largest in (SMALL_CHANGE, np.inf)]
+    found = [turned / geometry for turned, geometry in known if geometry > 0]
+    return max(found) if found else UNKNOWN_SCATTER
+
+
+def _parts(count: int) -> list[list[Bool[np.ndarray, " M"]]]:
+    """Views that are left, where each is left out in turn, and the first and the second half of them."""
+    views, half = np.arange(count), (count + 1) // 2
+    return [[views != view for view in views], [views < half], [views >= count - half]]
 
 
 def _scatter(
-    features: SampleFeatures, mean: Float64[np.ndarray, " D"], kept_views: list[Bool[np.ndarray, " M"]]
+    features: SampleFeatures, mean: Float64[np.ndarray, " D"], kept_views: list[Bool[np.ndarray, " M"]], largest: float
 ) -> tuple[float, float]:
-    """Sums of 1 − cosine and of c, of the means over some views with those over all."""
+    """Sums of 1 − cosine and of c, where c is at most `largest`, of the means over some views with those over all."""
     weights, vectors = features.weights, features.vectors
     total, squares = weights.sum(axis=0), np.square(weights).sum(axis=0)
     whole, _ = features.fused()
@@ -206,7 +221,32 @@ def _scatter(
             continue
         w, s, all_ = weights[kept][:, rows], part[rows], total[rows]
         some = np.einsum("vm,vmd->md", w, vectors[kept][:, rows]) / s[:, None]
-        turned += float((1 - row_cosines(some - mean, whole[rows] - mean)).sum())
         q = np.square(w).sum(axis=0)
-        geometry += float((q * (1 / s**2 - 2 / (s * all_)) + squares[rows] / all_**2).sum())
+        c = q * (1 / s**2 - 2 / (s * all_)) + squares[rows] / all_**2
+        small = c <= largest
+        turned += float((1 - row_cosines(some - mean, whole[rows] - mean))[small].sum())
+        geometry += float(c[small].sum())
     return turned, geometry
+
+
+def measure_drift(features: SampleFeatures, means: Float64[np.ndarray, "M D"]) -> float:
+    """How far centered features turn if the mean of the space is that of the maps of fewer views, per 1/n − 1/M; those
+    that `measure_scatter` leaves out are left out.
+
+    Args:
+        features: of the sample.
+        means: of the map of each view.
+    """
+    count = len(means)
+    whole, seen = features.fused()
+    if count < 2 or not seen.any():
+        return UNKNOWN_SCATTER
+    fused, mean = whole[seen], means.mean(axis=0)
+    found = []
+    for kept_views in _parts(count):
+        turned = [
+            float((1 - row_cosines(fused - means[kept].mean(axis=0), fused - mean)).mean()) for kept in kept_views
+        ]
+        geometry = [1 / kept.sum() - 1 / count for kept in kept_views]
+        found.append(sum(turned) / sum(geometry))
+    return max(found)

@@ -57,6 +57,7 @@ def all_settings(
     ranks: RankErrors,
     *,
     scatter: float,
+    drift: float,
     exact_stop: float,
     cheap: bool,
     coded: bool,
@@ -69,6 +70,7 @@ def all_settings(
         order: of the views.
         ranks: worth trying.
         scatter: ρ of the teacher.
+        drift: of the mean of its vectors.
         exact_stop: where rays end at the exact settings.
         cheap: whether the teacher is.
         coded: whether sums are by the rows of a table, so that a rank costs nothing.
@@ -84,7 +86,7 @@ def all_settings(
 
     settings = []
     for stop in STOPS:
-        curve = predict_curve(sight, order, stop=stop, exact_stop=exact_stop, scatter=scatter)
+        curve = predict_curve(sight, order, stop=stop, exact_stop=exact_stop, scatter=scatter, drift=drift)
         for number, predicted in enumerate(curve, 1):
             for rank, error in ranks.errors.items():
                 if number >= least:
