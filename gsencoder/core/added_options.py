@@ -17,6 +17,7 @@ ADDED_OPTIONS: Mapping[str, Any] = {
     "loss.contrast_clusters": True,
     "loss.teacher_weights": [],
     "prepare.fusion.view_share": 1.0,
+    "prepare.fusion.view_choice": "even",
     "prepare.center": True,
     "prepare.scale": True,
     "prepare.render_views": 0,

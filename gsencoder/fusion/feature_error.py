@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
@@ -33,13 +33,20 @@ class FieldError:
         return 1 - self.covered * (1 - self.centered)
 
 
-def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, sample: int = DEFAULT_SAMPLE) -> FieldError:
+def field_error(
+    features: GaussianFeatures,
+    reference: GaussianFeatures,
+    *,
+    sample: int = DEFAULT_SAMPLE,
+    rows: Int64[np.ndarray, " n"] | None = None,
+) -> FieldError:
     """Compares two fields in the full space.
 
     Args:
         features: what is judged.
         reference: what is taken for right.
         sample: at most so many Gaussians, evenly spaced over those that the reference saw; 0 = all.
+        rows: the Gaussians that are compared, of those that the reference saw; None = a sample.
 
     Raises:
         InputError: fields of different splats or spaces, or a reference that saw nothing.
@@ -49,10 +56,11 @@ def field_error(features: GaussianFeatures, reference: GaussianFeatures, *, samp
             f"field_error: expected {len(reference)} Gaussians in ({reference.space.describe()}), "
             f"got {len(features)} in ({features.space.describe()})"
         )
-    rows = np.flatnonzero(reference.seen)
+    given = rows is not None
+    rows = np.flatnonzero(reference.seen) if rows is None else rows
     if not len(rows):
         raise InputError("field_error: the reference saw no Gaussian")
-    if sample:
+    if sample and not given:
         rows = rows[even_indices(len(rows), sample)]
     both = rows[features.seen[rows]]
     centered = raw = 0.0

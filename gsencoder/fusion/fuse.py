@@ -8,7 +8,7 @@ does not grow with the number of views or with the teacher's width.
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.fusion.cell_sample import CellSample
 from gsencoder.fusion.checkpoint import open_checkpoint
+from gsencoder.fusion.coverage.covering import covering_views
 from gsencoder.fusion.lift import FeatureSums, distinct_rows, view_matrix
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
@@ -59,9 +60,11 @@ class FuseConfig:
     max_rank: int = field(default=128, metadata={"help": "largest rank of the basis; 0 = as many as the energy asks"})
     basis: bool = field(default=True, metadata={"help": "fuse in a low-rank basis; false = in all channels"})
     narrow: int = field(default=64, metadata={"help": "teachers with no more channels than this keep all of them"})
-    views: int = field(default=0, metadata={"help": "views used, evenly spaced; 0 = all"})
-    view_share: float = field(
-        default=1.0, metadata={"help": "share of the views used, evenly spaced; with views= the fewer of both"}
+    views: int = field(default=0, metadata={"help": "views used; 0 = all"})
+    view_share: float = field(default=1.0, metadata={"help": "share of the views used; with views= the fewer of both"})
+    view_choice: Literal["even", "coverage"] = field(
+        default="even",
+        metadata={"help": "which views are used: evenly spaced ones, or those that show most of the Gaussians"},
     )
 
     def __post_init__(self) -> None:
@@ -87,6 +90,7 @@ class Fusion:
         projections: how well a basis that was given represents the teacher's vectors in the views that this call added;
             None if the scene has a basis of its own, or none.
         sample: cells of the teacher's maps of all views; None if they were not asked for.
+        config: that was asked for.
     """
 
     features: GaussianFeatures
@@ -96,6 +100,7 @@ class Fusion:
     truncation: float
     projections: ProjectionSums | None = None
     sample: CellSample | None = None
+    config: FuseConfig = FuseConfig()
 
 
 def fuse(
@@ -104,6 +109,7 @@ def fuse(
     config: FuseConfig = FuseConfig(),
     *,
     basis: FeatureBasis | None = None,
+    rows: Sequence[int] | None = None,
     work: Path | None = None,
     sample_cells: bool = False,
     device: Device | torch.device = "auto",
@@ -121,6 +127,7 @@ def fuse(
         config: see there.
         basis: fuse in the coordinates of this basis, which scenes that are trained on together share; None = one of the
             scene's own, where `config` asks for one.
+        rows: numbers of the views that are lifted, in this order; None = those that `config` chooses.
         work: folder for maps and running sums; an interrupted run is continued from it.
         sample_cells: whether cells of the maps of all views are collected, for `Fusion.sample`.
         device: where B is made, held against depth maps, and multiplied; "auto" = a GPU if torch sees one. Features of
@@ -131,10 +138,13 @@ def fuse(
         InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, no such device, or
             `work` holds another run.
     """
+    asked = config
     chosen = device if isinstance(device, torch.device) else choose_device(device)
-    gaussians, views = _checked(scene, teacher, basis)
+    gaussians, views = checked_scene(scene, teacher, basis)
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))
-    rows = chosen_views(len(views), config)
+    if rows is None and config.view_choice == "coverage":
+        rows = covering_views(gaussians, views, config.visibility, config.blend, number_of_views(len(views), config))
+    rows = chosen_views(len(views), config) if rows is None else tuple(rows)
     checkpoint = None
     if work is not None:
         checkpoint = open_checkpoint(work, asdict(config), teacher, gaussians, views, rows, basis)
@@ -203,6 +213,7 @@ def fuse(
         features=GaussianFeatures(
             features=features, weights=weights, mean=mean, space=teacher.space, basis=subspace.basis
         ),
+        config=asked,
         views=rows,
         tested=config.visibility.against,
         seconds=clock.seconds,
@@ -213,13 +224,22 @@ def fuse(
 
 
 def chosen_views(count: int, config: FuseConfig) -> tuple[int, ...]:
-    """Row numbers of the views that are used, out of so many."""
+    """Row numbers of the views that are used, out of so many, where they are evenly spaced."""
+    return tuple(int(view) for view in even_indices(count, number_of_views(count, config)))
+
+
+def number_of_views(count: int, config: FuseConfig) -> int:
+    """How many views are used, out of so many."""
     share = max(1, math.ceil(config.view_share * count - 1e-9))
-    return tuple(int(view) for view in even_indices(count, min(config.views or count, share)))
+    return min(config.views or count, share, count)
 
 
-def _checked(scene: Scene, teacher: Teacher, basis: FeatureBasis | None) -> tuple[Gaussians, Views]:
-    """The Gaussians and views of a scene that can be fused."""
+def checked_scene(scene: Scene, teacher: Teacher, basis: FeatureBasis | None = None) -> tuple[Gaussians, Views]:
+    """The Gaussians and views of a scene that can be fused.
+
+    Raises:
+        InputError: it lacks them, or the basis is of another space than the teacher's maps.
+    """
     if basis is not None and basis.space != teacher.space:
         raise InputError(f"fuse: the basis is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
     if scene.gaussians is None or len(scene.gaussians) == 0:

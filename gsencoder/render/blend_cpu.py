@@ -1,7 +1,7 @@
 """Blending weights on a CPU: numba kernels that project, bin and composite; the plain twin is reference.py."""
 
 import math
-from typing import no_type_check
+from typing import Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -9,13 +9,27 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from gsencoder.core.runtime.threads import PIECES, even_cuts, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render.rays import Lattice
-from gsencoder.types import Gaussians
 
 _ENTRIES = 48
 """Room for so many entries a row is set aside; memory that is not touched costs nothing."""
 
 _SCRATCH_KEPT = 1 << 24
 """Rooms of up to so many entries (200 MB) are kept for the next call."""
+
+
+@runtime_checkable
+class Shapes(Protocol):
+    """What is projected, such as `Gaussians`: attributes as there."""
+
+    @property
+    def means(self) -> Float32[np.ndarray, "N 3"]: ...
+    @property
+    def quats(self) -> Float32[np.ndarray, "N 4"]: ...
+    @property
+    def scales(self) -> Float32[np.ndarray, "N 3"]: ...
+    @property
+    def opacities(self) -> Float32[np.ndarray, " N"]: ...
+    def __len__(self) -> int: ...
 
 
 @kernel
@@ -75,7 +89,7 @@ def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d,
 
 
 def project(
-    gaussians: Gaussians,
+    gaussians: Shapes,
     pose: np.ndarray,
     K: np.ndarray,
     width: int,

@@ -15,6 +15,8 @@ from gsencoder.app.settings.options import options_by_key
 from gsencoder.app.settings.presets import PRESET_OPTIONS, PRESETS, describe_presets, preset_node, preset_values
 from gsencoder.core.errors import InputError
 from gsencoder.core.knobs import value_at
+from gsencoder.fusion.budget.config import exact_config
+from gsencoder.fusion.fuse import FuseConfig
 
 
 def composed(*words: str) -> FuseCommandConfig:
@@ -100,3 +102,15 @@ def test_presets_can_be_swept(tmp_path: Path) -> None:
     run_many("fuse", FuseCommandConfig, words, lambda config: seen.append(config) or "")
     assert [each.preset for each in seen] == ["fast", "exact"]
     assert [each.fusion for each in seen] == [composed("preset=fast").fusion, composed("preset=exact").fusion]
+
+
+def test_errors_of_budgets_are_held_against_the_exact_preset() -> None:
+    assert exact_config(FuseConfig()) == composed("preset=exact").fusion
+
+
+@pytest.mark.parametrize("preset", ["fast", "exact"])
+def test_a_preset_that_sets_what_a_budget_chooses_is_refused(preset: str) -> None:
+    with pytest.raises(InputError, match=r"fusion\.\S+: is chosen by budget.error; leave it \(or the preset"):
+        composed(f"preset={preset}", "budget.error=0.01")
+    with pytest.raises(InputError, match="basis=: budget.error chooses a rank"):
+        composed("basis=weights", "budget.error=0.01")

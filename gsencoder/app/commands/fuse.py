@@ -9,6 +9,7 @@ import numpy as np
 
 from gsencoder.app.commands.basis_figures import describe_basis
 from gsencoder.app.commands.fusable_scene import load_fusable
+from gsencoder.app.commands.fuse_budget import check_promises, fuse_in_budget
 from gsencoder.app.commands.head_figures import describe_heads, head_figures
 from gsencoder.app.reports.results import report_fusion
 from gsencoder.app.runs.output_folder import output_folder
@@ -22,13 +23,14 @@ from gsencoder.core.runtime.device_names import Device
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
+from gsencoder.fusion.budget.config import BudgetConfig, check_budget
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.heads.measure import measure_heads
 from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import save_heads
 from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits
-from gsencoder.fusion.store.folder import WORDS_FILE, save_features
+from gsencoder.fusion.store.folder import FEATURES_FILE, WORDS_FILE, save_features
 from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
@@ -76,11 +78,13 @@ class FuseCommandConfig(CommonConfig):
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
     teacher: TeacherConfig = field(default_factory=LabelsConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
         check_orbits(self.orbits)
+        check_budget(self.budget, self.fusion, basis=bool(self.basis))
 
 
 def run(config: FuseCommandConfig, summary: Summary) -> None:
@@ -110,8 +114,13 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             with one.step("teacher"):
                 teacher = build_teacher(config.teacher, scene, words)
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
-            fusion = fuse_scene(scene, teacher, config, one, out, basis=basis, sample_cells=bool(heads))
+            if config.budget.given:
+                within = fuse_in_budget(scene, teacher, config, one, work_folder(out), sample_cells=bool(heads))
+                fusion, kept = within.fusion, within
+            else:
+                fusion, kept = fuse_scene(scene, teacher, config, one, out, basis=basis, sample_cells=bool(heads)), None
             write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
+            promises = [] if kept is None else check_promises(kept, folder / FEATURES_FILE, config, one)
             lines = write_heads(folder, heads, fusion, one)
             if config.report:
                 with one.step("report"):
@@ -123,7 +132,7 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             f"({describe_basis(one.results, 'this scene')}), "
             f"from {one.results['views']} views"
         )
-        for line in lines:
+        for line in (*promises, *lines):
             screen.print(f"{out}: {line}")
 
     run_scenes(
@@ -197,7 +206,7 @@ def write_features(
     """Writes features, scene and words, and adds the figures of the fusion to the summary."""
     features = fusion.features
     with summary.step("write"):
-        chosen = {"teacher": settings(config.teacher), "fusion": settings(config.fusion)}
+        chosen = {"teacher": settings(config.teacher), "fusion": settings(fusion.config)}
         save_features(folder, scene, features, chosen)
         if words is not None:
             save_text_table(folder / WORDS_FILE, words)

@@ -1,0 +1,105 @@
+"""The budgets of `fuse`: what was promised, and what became of it, for people and for the summary."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.summary import Summary
+from gsencoder.core.errors import SceneWarning
+from gsencoder.core.knobs import describe_values, shown_value
+from gsencoder.core.runtime.device_names import Device
+from gsencoder.fusion.budget.config import BudgetConfig
+from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within, realised_error
+from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.types import Scene
+
+
+@runtime_checkable
+class BudgetOptions(Protocol):
+    """The options of a command that fuses within a budget."""
+
+    @property
+    def fusion(self) -> FuseConfig: ...
+    @property
+    def budget(self) -> BudgetConfig: ...
+    @property
+    def device(self) -> Device: ...
+    @property
+    def quiet(self) -> bool: ...
+
+
+def fuse_in_budget(
+    scene: Scene, teacher: Teacher, config: BudgetOptions, summary: Summary, work: Path, *, sample_cells: bool
+) -> BudgetFusion:
+    """Chooses a setting and fuses; says which setting that is, and what is predicted of it."""
+    made = fuse_within(
+        scene,
+        teacher,
+        config.fusion,
+        config.budget,
+        work=None if teacher.cheap else work,
+        sample_cells=sample_cells,
+        device=config.device,
+        track=Progress(quiet=config.quiet),
+    )
+    choice = made.choice
+    summary.add_seconds({"choose": made.choosing, **made.fusion.seconds})
+    summary.results["budget"] = {
+        "chosen": dict(choice.knobs),
+        "of_views": len(scene.views) if scene.views is not None else 0,
+        "predicted": {name: value for name, value in _predicted(made).items() if value is not None},
+        "scatter": choice.scatter,
+        "rays_followed": choice.followed,
+        "rays_exact": choice.all_rays,
+        "notes": list(choice.notes),
+    }
+    screen = console(config.quiet)
+    screen.print(f"{scene.name}: budget: {describe_values(choice.knobs)}, of {len(made.scene.views or ())} views")
+    for note in choice.notes:
+        warnings.warn(note, SceneWarning, stacklevel=2)
+    return made
+
+
+def _predicted(made: BudgetFusion) -> Mapping[str, float | None]:
+    choice = made.choice
+    size = None if choice.bytes is None else choice.bytes / 1e6
+    return {
+        "error": choice.predicted.error,
+        "error_deviation": choice.predicted.deviation,
+        "seconds": choice.seconds,
+        "megabytes": size,
+    }
+
+
+def check_promises(made: BudgetFusion, file: Path, config: BudgetOptions, summary: Summary) -> list[str]:
+    """Measures what was promised; returns a line for each promise, and warns of those that are broken."""
+    budget, realised = config.budget, dict[str, float]()
+    if budget.error is not None and budget.check:
+        with summary.step("check"):
+            track = Progress(quiet=config.quiet)
+            error = realised_error(made, config.fusion, seed=budget.seed, device=config.device, track=track)
+        realised["error"] = error.total
+        summary.results["budget"]["covered"] = error.covered
+    if budget.seconds is not None:
+        realised["seconds"] = made.seconds
+    if budget.megabytes is not None:
+        realised["megabytes"] = file.stat().st_size / 1e6
+    promised = {name: float(getattr(budget, name)) for name in budget.given}
+    summary.results["budget"].update(promised=promised, realised=realised)
+    lines = []
+    for name, promise in promised.items():
+        if name not in realised:
+            lines.append(f"budget.{name}: promised {shown_value(promise)}, not measured (budget.check=false)")
+            continue
+        lines.append(f"budget.{name}: promised {shown_value(promise)}, realised {realised[name]:.4g}")
+        if realised[name] > promise:
+            warnings.warn(
+                f"budget.{name}: promised {shown_value(promise)}, and it became {realised[name]:.4g}; the summary says "
+                "what was predicted",
+                SceneWarning,
+                stacklevel=2,
+            )
+    return lines

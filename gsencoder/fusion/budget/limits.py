@@ -1,0 +1,102 @@
+"""Budgets of seconds and of megabytes: what they leave of the settings."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from gsencoder.core.knobs import shown_value
+from gsencoder.fusion.budget.config import BudgetConfig
+from gsencoder.fusion.budget.rank import RankErrors, file_bytes, rank_of_bytes
+from gsencoder.fusion.budget.settings import Setting, most_exact
+from gsencoder.fusion.coverage.sight import Sight
+
+PLANNED = 0.85
+"""Share of the seconds that is planned with: times vary, and what comes before and after the views takes some, too."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pace:
+    """Seconds of one view, as measured.
+
+    Attributes:
+        map: making its map.
+        lift: blending and lifting it at `Setting.lifting` = 1.
+        passes: how often each map is made: twice by cheap teachers whose basis is fitted first.
+        made: maps that have been made and are not made again.
+        spent: seconds since the choice began.
+    """
+
+    map: float
+    lift: float
+    passes: int
+    made: int
+    spent: float
+
+    def seconds(self, setting: Setting) -> float:
+        """From the beginning of the choice to the features."""
+        maps = max(setting.views * self.passes - self.made, 0)
+        return self.spent + maps * self.map + setting.views * setting.lifting * self.lift
+
+
+def within_seconds(
+    chosen: Setting, settings: Sequence[Setting], budget: BudgetConfig, pace: Pace
+) -> tuple[Setting, float, tuple[str, ...]]:
+    """The most exact setting that takes no longer; where an error is promised too, the one that keeps that.
+
+    Returns:
+        The setting, its seconds, and what is to be said.
+    """
+    assert budget.seconds is not None
+    if budget.error is not None:
+        needed = pace.seconds(chosen)
+        note = (
+            f"budget.error={shown_value(budget.error)} takes about {needed:.3g} s, more than "
+            f"budget.seconds={shown_value(budget.seconds)}; budget.error comes first"
+        )
+        return chosen, needed, (note,) if needed > budget.seconds else ()
+    fitting = [each for each in settings if pace.seconds(each) <= PLANNED * budget.seconds]
+    if fitting:
+        best = most_exact(fitting)
+        return best, pace.seconds(best), ()
+    fastest = min(settings, key=lambda each: (pace.seconds(each), each.error))
+    needed = pace.seconds(fastest)
+    note = f"budget.seconds={shown_value(budget.seconds)}: the fastest setting takes about {needed:.3g} s; it is used"
+    return fastest, needed, (note,)
+
+
+def within_megabytes(
+    chosen: Setting, share: float, sight: Sight, ranks: RankErrors, channels: int, budget: BudgetConfig, *, basis: bool
+) -> tuple[Setting, int, tuple[str, ...]]:
+    """The setting with the largest rank whose file is small enough; where an error is promised, with what that needs.
+
+    Args:
+        chosen: the setting so far.
+        share: of the Gaussians that are seen.
+        sight: of the sample.
+        ranks: of the teacher.
+        channels: of the teacher.
+        budget: of megabytes, and perhaps of error.
+        basis: whether the fusion has a basis without a limit of its rank.
+
+    Returns:
+        The setting, bytes of its file, and what is to be said.
+    """
+    assert budget.megabytes is not None
+    rows = math.ceil(min(share, 1.0) * sight.gaussians)
+    own = chosen.rank or (ranks.full if basis else channels)
+    size = file_bytes(rows, own, channels, basis=basis or chosen.rank > 0)
+    if size <= budget.megabytes * 1e6:
+        return chosen, size, ()
+    asked = f"budget.megabytes={shown_value(budget.megabytes)}"
+    if budget.error is not None:
+        note = f"budget.error={shown_value(budget.error)} takes about {size / 1e6:.3g} MB, more than {asked}"
+        return chosen, size, (f"{note}; budget.error comes first",)
+    rank = min(rank_of_bytes(budget.megabytes * 1e6, rows, channels), ranks.full)
+    size = file_bytes(rows, max(rank, 1), channels, basis=True)
+    note = f"{asked}: one coordinate of each Gaussian takes about {size / 1e6:.3g} MB; it is used"
+    error = min(chosen.error + ranks.error_of(max(rank, 1)), 1.0)
+    return replace(chosen, rank=max(rank, 1), error=error), size, () if rank else (note,)
+
+
+Measure = Callable[[int], tuple[float, float]]
+"""Seconds of making the map of a view, and of blending and lifting it at the exact rays."""

@@ -1,0 +1,70 @@
+"""What views see of a sample, against B; and the choice of views by what they show."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fixed_teachers import EXACT, FixedTeacher, make_scene
+
+from gsencoder.fusion.coverage.covering import covering_views
+from gsencoder.fusion.coverage.order import view_order
+from gsencoder.fusion.coverage.sight import look, pixels_of
+from gsencoder.fusion.fuse import chosen_views, fuse
+from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
+from gsencoder.render import BlendConfig, blend
+
+OPEN = VisibilityConfig(against=())
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_rays_that_are_followed_have_the_weights_of_b(depth: bool, rng: np.random.Generator) -> None:
+    depths = [rng.uniform(1.5, 3.0, (24, 32)).astype(np.float32) for _ in range(5)]
+    scene = make_scene(n=400, **({"depths": depths} if depth else {}))
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    config = BlendConfig(stop_transmittance=1e-6)
+    visibility = VisibilityConfig(against=("sensor",), relative=0.2) if depth else OPEN
+    sight = look(scene.gaussians, scene.views, pixels_of(scene.views), visibility, config)
+    assert sight.followed > 50
+    for view, rays in enumerate(sight.rays):
+        b = blend(scene.gaussians, scene.views.cameras, view, config=config)
+        b = keep_visible(b, depths[view], visibility) if depth else b
+        dense = np.zeros((b.rows, b.gaussians), np.float32)
+        dense[np.repeat(np.arange(b.rows), b.crow.diff().numpy()), b.col.numpy()] = b.weight.numpy()
+        owners = sight.sample[sight.singles :][rays.owners]
+        np.testing.assert_allclose(rays.weights, dense[rays.rows, owners], rtol=1e-4, atol=1e-6)
+
+
+def test_the_first_views_cover_most_and_one_that_adds_nothing_comes_last() -> None:
+    weights = np.array([[1, 1, 0, 0, 0], [0, 0, 0, 0, 0], [1, 1, 1, 0, 0], [0, 0, 0, 1, 1]], np.float32)
+    order = view_order(weights, 5, 0.05)
+    assert order[0] == 2
+    assert order[1] == 3
+    assert order[-1] == 1
+
+
+def test_views_by_coverage_see_more_than_evenly_spaced_ones() -> None:
+    """All but two cameras stand together and look at one end; evenly spaced ones are of these."""
+    scene = make_scene(n=600, count=9)
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    poses = scene.views.cameras.cam_from_world.copy()
+    poses[:, 0, 3] = 2.0
+    poses[[3, 5], 0, 3] = [0.0, -2.0]
+    scene = replace(scene, views=replace(scene.views, cameras=replace(scene.views.cameras, cam_from_world=poses)))
+    teacher = FixedTeacher([np.ones((6, 8, 6), np.float32)] * 9)
+    even, covering = (
+        fuse(scene, teacher, replace(EXACT, views=3, view_choice=choice)) for choice in ("even", "coverage")
+    )
+    assert covering.features.seen.sum() > even.features.seen.sum()
+    assert {3, 5} <= set(covering.views)
+
+
+def test_all_views_need_no_choice_and_rows_are_those_that_are_given() -> None:
+    scene, teacher = make_scene(), FixedTeacher([np.ones((6, 8, 6), np.float32)] * 5)
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    assert covering_views(scene.gaussians, scene.views, OPEN, BlendConfig(), 9) == (0, 1, 2, 3, 4)
+    given, even = fuse(scene, teacher, EXACT, rows=(0, 2, 4)), fuse(scene, teacher, replace(EXACT, views=3))
+    assert given.views == even.views == chosen_views(5, replace(EXACT, views=3))
+    np.testing.assert_array_equal(given.features.features, even.features.features)
