@@ -68,3 +68,23 @@ def test_all_views_need_no_choice_and_rows_are_those_that_are_given() -> None:
     given, even = fuse(scene, teacher, EXACT, rows=(0, 2, 4)), fuse(scene, teacher, replace(EXACT, views=3))
     assert given.views == even.views == chosen_views(5, replace(EXACT, views=3))
     np.testing.assert_array_equal(given.features.features, even.features.features)
+
+
+def test_views_are_judged_by_gaussians_that_they_were_not_chosen_by() -> None:
+    scene = make_scene(n=400)
+    splat, views = scene.gaussians, scene.views
+    assert splat is not None
+    assert views is not None
+    sight = look(splat, views, pixels_of(views), OPEN, BlendConfig(), size=100)
+    choosing, judging = sight.halves()
+    first, second = (set(each.sample[: each.singles].tolist()) for each in (choosing, judging))
+    assert (len(first), len(second), first & second) == (50, 50, set())
+    assert first | second == set(sight.sample[:100].tolist())
+    for each in (choosing, judging):
+        np.testing.assert_array_equal(each.sample[each.singles :], sight.sample[100:])
+        columns = [sight.sample[:100].tolist().index(row) for row in each.sample[: each.singles]]
+        np.testing.assert_array_equal(each.weights[:, : each.singles], sight.weights[:, columns])
+        np.testing.assert_array_equal(each.areas[:, each.singles :], sight.areas[:, 100:])
+    whole = look(splat, views, pixels_of(views), OPEN, BlendConfig())
+    assert whole.complete
+    assert whole.halves() == (whole, whole)

@@ -114,6 +114,7 @@ def choose(
     lattice_of = _lattices(views, known.maps[probe], exact)
     visibility = resolve(base.visibility, views, base.lift)
     sight = look(gaussians, views, lattice_of, visibility, exact.blend, seed=budget.seed)
+    choosing, judging = sight.halves()
     wanted = min(max(FIRST_MAPS, math.ceil(len(views) / MAPS_SHARE)), len(views))
     while True:
         for view in spread[:wanted]:
@@ -121,9 +122,9 @@ def choose(
                 known.maps[view] = map_of(view)
         _learn(known, sight, teacher, base, budget)
         first = () if teacher.cheap else spread[:wanted]
-        order = view_order(sight.weights, sight.singles, known.scatter, first)
+        order = view_order(choosing.weights, choosing.singles, known.scatter, first)
         settings = all_settings(
-            sight,
+            judging,
             order,
             known.ranks,
             scatter=SAFETY * known.scatter,
