@@ -19,6 +19,7 @@ from gsencoder.fusion.checkpoint import open_checkpoint
 from gsencoder.fusion.feature_error import FieldError, field_error
 from gsencoder.fusion.fuse import FuseConfig, Fusion, checked_scene, fuse
 from gsencoder.fusion.lift import FeatureSums, view_matrix
+from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import resolve
 from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Scene, Views
@@ -98,9 +99,9 @@ def fuse_within(
         visibility = resolve(config.visibility, views, config.lift)
         blend = exact_config(config).blend
         begun = clock()
-        feature_map = map_of(view) if teacher.cheap or view not in made else made[view]
-        if view in made and not teacher.cheap:
-            feature_map = teacher.teacher.feature_map(views, view) if hasattr(teacher, "teacher") else feature_map
+        # What a map takes is measured even where it was made before.
+        maker = teacher.teacher if isinstance(teacher, CachedTeacher) else teacher
+        feature_map = maker.feature_map(views, view) if view in made else map_of(view)
         between = clock()
         matrix = view_matrix(gaussians, views, view, feature_map, lift=config.lift, visibility=visibility, config=blend)
         FeatureSums(len(gaussians), 1, None, None).add(matrix, _one_channel(feature_map), None)
