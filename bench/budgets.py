@@ -24,7 +24,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -32,16 +31,16 @@ from gsencoder.fusion.budget.config import BudgetConfig, exact_config
 from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within, judge
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teacher_maps import CachedTeacher
+from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.onnx import OnnxConfig
 from gsencoder.fusion.teachers.palette import PaletteConfig
-from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Scene, Views
+from gsencoder.types import FeatureMap, GaussianFeatures, Scene, Views
 
 
-class CountedTeacher:
+class CountedTeacher(WrappedTeacher):
     """A teacher that counts the CPU seconds of its maps.
 
     Attributes:
@@ -50,31 +49,16 @@ class CountedTeacher:
     """
 
     def __init__(self, teacher: Teacher) -> None:
-        self._teacher, self.seconds, self.made = teacher, 0.0, 0
-        self.needs_images, self.cheap = teacher.needs_images, teacher.cheap
-
-    @property
-    def space(self) -> FeatureSpace:
-        return self._teacher.space
-
-    @property
-    def table(self) -> Float32[np.ndarray, "C D"] | None:
-        return self._teacher.table
-
-    @property
-    def mean(self) -> Float32[np.ndarray, " D"] | None:
-        return self._teacher.mean
+        super().__init__(teacher)
+        self.seconds, self.made = 0.0, 0
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         start = time.process_time()
         try:
-            return self._teacher.feature_map(views, view)
+            return self.teacher.feature_map(views, view)
         finally:
             self.seconds += time.process_time() - start
             self.made += 1
-
-    def settings(self) -> dict[str, Any]:
-        return self._teacher.settings()
 
 
 def teacher_config(name: str, skip_tokens: int) -> TeacherConfig:

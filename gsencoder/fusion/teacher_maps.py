@@ -78,24 +78,16 @@ def read_map(path: Path, space: FeatureSpace, table: Float32[np.ndarray, "C D"] 
     return FeatureMap(features=features, grid_from_image=grid, space=space)
 
 
-class CachedTeacher:
-    """A teacher with its maps cached as files; those of cheap teachers, and codes into a table that all its maps share,
-    are made each time.
+class WrappedTeacher:
+    """A teacher that gives another one's maps in its own way; all else is as the other has it.
 
     Attributes:
-        space, table, mean, needs_images, cheap: as the teacher has them.
+        teacher: the other one.
+        space, table, mean, needs_images, cheap: as that has them.
     """
 
-    def __init__(
-        self, teacher: Teacher, folder: Path, *, before_write: Callable[[], None] = lambda: None, advice: str = ""
-    ) -> None:
-        """Args:
-        teacher: whose maps.
-        folder: of one scene's maps of this teacher and no other; whoever gives it sees to that.
-        before_write: called before a file is written.
-        advice: what to do about a damaged file, for the error.
-        """
-        self.teacher, self._folder, self._before_write, self._advice = teacher, folder, before_write, advice
+    def __init__(self, teacher: Teacher) -> None:
+        self.teacher = teacher
         self.needs_images, self.cheap = teacher.needs_images, teacher.cheap
 
     @property
@@ -109,6 +101,29 @@ class CachedTeacher:
     @property
     def mean(self) -> Float32[np.ndarray, " D"] | None:
         return self.teacher.mean
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        return self.teacher.feature_map(views, view)
+
+    def settings(self) -> dict[str, Any]:
+        return self.teacher.settings()
+
+
+class CachedTeacher(WrappedTeacher):
+    """A teacher with its maps cached as files; those of cheap teachers, and codes into a table that all its maps share,
+    are made each time."""
+
+    def __init__(
+        self, teacher: Teacher, folder: Path, *, before_write: Callable[[], None] = lambda: None, advice: str = ""
+    ) -> None:
+        """Args:
+        teacher: whose maps.
+        folder: of one scene's maps of this teacher and no other; whoever gives it sees to that.
+        before_write: called before a file is written.
+        advice: what to do about a damaged file, for the error.
+        """
+        super().__init__(teacher)
+        self._folder, self._before_write, self._advice = folder, before_write, advice
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         """The map of a view, from its file where there is one.
@@ -127,6 +142,3 @@ class CachedTeacher:
             write_map(path, made, with_table=made.table is not None and self.table is None)
         with advised(self._advice or f"remove {path}, and it is made again"):
             return read_map(path, self.space, self.table)
-
-    def settings(self) -> dict[str, Any]:
-        return self.teacher.settings()

@@ -19,7 +19,7 @@ from gsencoder.fusion.checkpoint import open_checkpoint
 from gsencoder.fusion.feature_error import FieldError, field_error
 from gsencoder.fusion.fuse import FuseConfig, Fusion, checked_scene, fuse
 from gsencoder.fusion.lift import FeatureSums, view_matrix
-from gsencoder.fusion.teacher_maps import CachedTeacher
+from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import resolve
 from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Scene, Views
@@ -119,7 +119,7 @@ def fuse_within(
     )
     chosen = clock()
     scene = replace(scene, views=views)
-    ready = _Made(teacher, made)
+    ready = _MadeMaps(teacher, made)
     fusion = fuse(scene, ready, choice.config, rows=choice.rows, sample_cells=sample_cells, device=device, track=track)
     return BudgetFusion(
         fusion=fusion, choice=choice, choosing=chosen - start, seconds=clock() - start, scene=scene, teacher=ready
@@ -175,28 +175,13 @@ class _Remembered(Sequence[Float32[np.ndarray, "_ _"]]):
         return depth
 
 
-class _Made:
+class _MadeMaps(WrappedTeacher):
     """A teacher some of whose maps have been made."""
 
     def __init__(self, teacher: Teacher, made: dict[int, FeatureMap]) -> None:
-        self._teacher, self._made = teacher, made
-        self.needs_images, self.cheap = teacher.needs_images, teacher.cheap
-
-    @property
-    def space(self) -> FeatureSpace:
-        return self._teacher.space
-
-    @property
-    def table(self) -> Float32[np.ndarray, "C D"] | None:
-        return self._teacher.table
-
-    @property
-    def mean(self) -> Float32[np.ndarray, " D"] | None:
-        return self._teacher.mean
+        super().__init__(teacher)
+        self._made = made
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         """The map of a view, made anew where it was not made for the choice."""
-        return self._made[view] if view in self._made else self._teacher.feature_map(views, view)
-
-    def settings(self) -> dict[str, Any]:
-        return self._teacher.settings()
+        return self._made[view] if view in self._made else self.teacher.feature_map(views, view)
