@@ -8,10 +8,7 @@ CPU.
 """
 
 import argparse
-import importlib.metadata
 import json
-import os
-import platform
 import subprocess
 import sys
 import time
@@ -27,17 +24,18 @@ import gpu_networks  # noqa: E402
 import gpu_render  # noqa: E402
 import torch  # noqa: E402
 from gpu_measure import Row, Setting, Skipped, broken_limits  # noqa: E402
+from machine import machine_of_now, version_of  # noqa: E402
 
 from gsencoder.core.runtime.device import choose_device  # noqa: E402
 
 Part = Callable[[Setting], Iterator[Row]]
-PACKAGES = ("torch", "triton", "gsplat", "numba", "numpy", "transformers", "onnxruntime", "onnxruntime-gpu")
+GPU_PACKAGES = ("triton", "gsplat", "onnxruntime-gpu")
 
 
 def environment(setting: Setting) -> Iterator[Row]:
     """Machine, card, driver and versions."""
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    yield {"what": "machine", "value": machine}
+    for name, value in machine_of_now(BENCH.parent).items():
+        yield {"what": name, "value": value}
     if setting.cuda:
         properties = torch.cuda.get_device_properties(setting.device)
         card = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, compute capability {properties.major}."
@@ -46,12 +44,8 @@ def environment(setting: Setting) -> Iterator[Row]:
         query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
         done = subprocess.run(query, capture_output=True, text=True, check=False, timeout=30)
         yield {"what": "driver", "value": done.stdout.strip() or done.stderr.strip()}
-    for name in PACKAGES:
-        try:
-            version = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            version = "not installed"
-        yield {"what": name, "value": version}
+    for name in GPU_PACKAGES:
+        yield {"what": name, "value": version_of(name)}
 
 
 PARTS: dict[str, Part] = {

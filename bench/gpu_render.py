@@ -66,7 +66,7 @@ def product_rows(made: Blend, expected: Blend, most: float, most_mean: float) ->
 def sparse_products(setting: Setting) -> Iterator[Row]:
     """The same matrix multiplied by numba and on the device: sums in another order."""
     made = blend(random_gaussians(400 if setting.small else 50_000), front_camera(160, 120, 130.0))
-    moved = Blend(*(each for each in (made.crow, made.col, made.weight)), made.depths, made.lattice, made.config)
+    moved = Blend(made.crow, made.col, made.weight, made.depths, made.lattice, made.config)
     moved = moved.to(setting.device)
     moved.config = replace(moved.config, backend="torch")
     yield from product_rows(moved, made, 1e-5, 1e-5)

@@ -25,7 +25,7 @@ def machine_of_now(checkout: Path) -> dict[str, str]:
         "threads": ", ".join(threads) or "as the libraries choose",
         "priority": f"nice {os.nice(0)}",
         "python": platform.python_version(),
-        **{name: _version(name) for name in PACKAGES},
+        **{name: version_of(name) for name in PACKAGES},
     }
 
 
@@ -44,7 +44,8 @@ def commit_of(checkout: Path) -> str:
     return f"{commit or 'unknown'}{' with changes' if changed else ''}"
 
 
-def _version(name: str) -> str:
+def version_of(name: str) -> str:
+    """The version of an installed package."""
     try:
         return version(name)
     except PackageNotFoundError:
