@@ -138,7 +138,7 @@ def fuse(
         InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, no such device, or
             `work` holds another run.
     """
-    asked = config
+    stated = config
     chosen = device if isinstance(device, torch.device) else choose_device(device)
     gaussians, views = checked_scene(scene, teacher, basis)
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))
@@ -213,7 +213,7 @@ def fuse(
         features=GaussianFeatures(
             features=features, weights=weights, mean=mean, space=teacher.space, basis=subspace.basis
         ),
-        config=asked,
+        config=stated,
         views=rows,
         tested=config.visibility.against,
         seconds=clock.seconds,

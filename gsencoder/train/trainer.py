@@ -261,9 +261,11 @@ class Trainer:
         first, saved = self.state.step, time.monotonic()
         if not self.state.closed:
             self._close_step()
-        batches = iter(self._loader(first))
+        loader = self._loader(first)
+        batches, threads = iter(loader), torch.get_num_threads()
+        sample_threads = threads if loader.num_workers else min(SAMPLE_THREADS, threads)
         for step in track(range(first, config.steps), "training"):
-            with threads_of_torch(min(SAMPLE_THREADS, torch.get_num_threads())):
+            with threads_of_torch(sample_threads):
                 items = [next(batches) for _ in range(config.accumulate)]
             with lost_processes(self.process, distributed.STEP_MINUTES):
                 losses = self._gradients(step, items)

@@ -24,6 +24,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.budget.config import BudgetConfig, check_budget
+from gsencoder.fusion.budget.fuse_within import BudgetFusion
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.heads.measure import measure_heads
 from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
@@ -114,13 +115,16 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
             with one.step("teacher"):
                 teacher = build_teacher(config.teacher, scene, words)
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
+            in_budget: BudgetFusion | None = None
             if config.budget.given:
-                within = fuse_in_budget(scene, teacher, config, one, work_folder(out), sample_cells=bool(heads))
-                fusion, kept = within.fusion, within
+                in_budget = fuse_in_budget(scene, teacher, config, one, work_folder(out), sample_cells=bool(heads))
+                fusion = in_budget.fusion
             else:
-                fusion, kept = fuse_scene(scene, teacher, config, one, out, basis=basis, sample_cells=bool(heads)), None
+                fusion = fuse_scene(scene, teacher, config, one, out, basis=basis, sample_cells=bool(heads))
             write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
-            promises = [] if kept is None else check_promises(kept, folder / FEATURES_FILE, config, one)
+            promises = []
+            if in_budget is not None:
+                promises = check_promises(in_budget, folder / FEATURES_FILE, config, one)
             lines = write_heads(folder, heads, fusion, one)
             if config.report:
                 with one.step("report"):

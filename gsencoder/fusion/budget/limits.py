@@ -83,8 +83,8 @@ def within_megabytes(
     """
     assert budget.megabytes is not None
     rows = math.ceil(min(share, 1.0) * sight.gaussians)
-    own = chosen.rank or (ranks.full if basis else channels)
-    size = file_bytes(rows, own, channels, basis=basis or chosen.rank > 0)
+    rank = chosen.rank or (ranks.full if basis else channels)
+    size = file_bytes(rows, rank, channels, basis=basis or chosen.rank > 0)
     if size <= budget.megabytes * 1e6:
         return chosen, size, ()
     asked = f"budget.megabytes={shown_value(budget.megabytes)}"

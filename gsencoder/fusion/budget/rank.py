@@ -78,9 +78,9 @@ def rank_errors(
     full = max(int((energies > energies.max(initial=0) * 1e-7).sum()), 1)
     fused, seen = features.fused()
     centered = fused[seen] - mean
-    kept = np.square(centered @ components[:full].T).cumsum(axis=1)
+    energy = np.square(centered @ components[:full].T).cumsum(axis=1)
     total = np.square(centered).sum(axis=1, keepdims=True)
-    shares = np.sqrt(np.minimum(kept / np.maximum(total, 1e-30), 1)) if seen.any() else np.ones((1, full))
+    shares = np.sqrt(np.minimum(energy / np.maximum(total, 1e-30), 1)) if seen.any() else np.ones((1, full))
     choices = (*(rank for rank in RANKS if rank < full), 0) if fitted else (0,)
     return RankErrors(
         full=full,

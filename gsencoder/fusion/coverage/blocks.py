@@ -16,7 +16,7 @@ BLOCKS = 24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Shapes:
+class ShapeRows:
     """Gaussians without colors, as `Gaussians` has them; rows of checked ones are not checked again."""
 
     means: Float32[np.ndarray, "N 3"]
@@ -25,7 +25,7 @@ class Shapes:
     opacities: Float32[np.ndarray, " N"]
 
     @classmethod
-    def of(cls, gaussians: Gaussians, rows: Int64[np.ndarray, " n"]) -> "Shapes":
+    def of(cls, gaussians: Gaussians, rows: Int64[np.ndarray, " n"]) -> "ShapeRows":
         return cls(
             means=gaussians.means[rows],
             quats=gaussians.quats[rows],

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from gsencoder.core.runtime.threads import parallel
-from gsencoder.fusion.coverage.blocks import Blocks, Shapes
+from gsencoder.fusion.coverage.blocks import Blocks, ShapeRows
 from gsencoder.fusion.coverage.kernels import TILE, count_rays, follow_rays, list_rays
 from gsencoder.fusion.visibility import VisibilityConfig, row_mask, visible_depths
 from gsencoder.geometry import ALPHA_MIN
@@ -143,7 +143,7 @@ def look(
     around = [rows[gaussians.opacities[rows] > ALPHA_MIN] for rows in around]
     groups = np.repeat(np.arange(len(around), dtype=np.int32), [len(rows) for rows in around])
     sample = np.concatenate([singles, *around]).astype(np.int64)
-    chosen = Shapes.of(gaussians, sample)
+    chosen = ShapeRows.of(gaussians, sample)
 
     def prepare(view: int) -> _ViewRays:
         return _view_rays(chosen, views, view, lattice_of(view), visibility, config, len(singles))
@@ -195,7 +195,7 @@ class _ViewRays:
 
 
 def _view_rays(
-    chosen: Shapes,
+    chosen: ShapeRows,
     views: Views,
     view: int,
     lattice: Lattice,
@@ -227,7 +227,7 @@ def _view_rays(
 
 
 def _project(
-    gaussians: Shapes, views: Views, view: int, lattice: Lattice, config: BlendConfig
+    gaussians: ShapeRows, views: Views, view: int, lattice: Lattice, config: BlendConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     cameras = views.cameras
     size = int(cameras.widths[view]), int(cameras.heights[view])
@@ -237,29 +237,29 @@ def _project(
 
 
 def _follow(
-    found: _ViewRays,
+    meeting: _ViewRays,
     blocks: Blocks,
     views: Views,
     view: int,
     sample: Int64[np.ndarray, " n"],
     config: BlendConfig,
 ) -> Rays:
-    lattice = found.lattice
+    lattice = meeting.lattice
     line = lattice.width * lattice.side
     count_x, count_y = -(-line // TILE), -(-lattice.height * lattice.side // TILE)
-    tile = (found.rays // line // TILE) * count_x + found.rays % line // TILE
+    tile = (meeting.rays // line // TILE) * count_x + meeting.rays % line // TILE
     order = np.argsort(tile, kind="stable")
-    order = order[found.owners[order] < len(sample)]
-    rays, owners, tile = found.rays[order], found.owners[order], tile[order]
+    order = order[meeting.owners[order] < len(sample)]
+    rays, owners, tile = meeting.rays[order], meeting.owners[order], tile[order]
     row = (rays // line // lattice.side) * lattice.width + rays % line // lattice.side
     starts = np.searchsorted(tile, np.arange(count_x * count_y + 1))
     weights, remains = np.zeros(len(rays), np.float32), np.zeros(len(rays), np.float32)
     if len(rays):
         ends = np.full(count_x * count_y, -np.inf, np.float32)
-        np.maximum.at(ends, tile, found.most[row])
+        np.maximum.at(ends, tile, meeting.most[row])
         rows = blocks.near(views.cameras, view, lattice, ends, (count_x, count_y), config.near)
-        projected, index, depths = _project(Shapes.of(blocks.gaussians, rows), views, view, lattice, config)
-        between, shape = (found.least, found.most), (lattice.height, lattice.width, lattice.side)
+        projected, index, depths = _project(ShapeRows.of(blocks.gaussians, rows), views, view, lattice, config)
+        between, shape = (meeting.least, meeting.most), (lattice.height, lattice.width, lattice.side)
         follow_rays(
             np.argsort(depths, kind="stable"),
             index,
