@@ -15,6 +15,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
+from gsencoder.core.row_numbers import rise_within
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 MAX_BITS = 8
@@ -79,7 +80,7 @@ class CompactFeatures:
                 f"CompactFeatures: {len(self.rows)} seen rows, {len(self.codes)} codes and {len(self.weight_codes)} "
                 "weights; expected as many of each"
             )
-        if self.rows[0] < 0 or self.rows[-1] >= self.total or (np.diff(self.rows) <= 0).any():
+        if not rise_within(self.rows, self.total):
             raise InputError(f"CompactFeatures: expected rows that rise from 0 to at most {self.total - 1}")
         tiny, largest = np.finfo(np.float32).tiny, np.finfo(np.float32).max
         if not tiny <= self.lightest <= self.heaviest <= largest or not 0 <= self.error <= 2:
