@@ -26,7 +26,7 @@ from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.train.dataset_space import sampled_maps
 from gsencoder.train.losses import AdapterHead
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.types import Scene
 
 

@@ -9,11 +9,14 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
+from gsencoder.core.files.archive import write_archive
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import distinct_rows
 from gsencoder.fusion.teachers import MissingInput, Teacher
-from gsencoder.models.output_space import OutputSpace
+from gsencoder.models.output_space import OutputSpace, output_space_parts
+from gsencoder.train.prepare import PrepareConfig
+from gsencoder.train.prepared_dataset import SPACE_FILE, PreparedDataset
 from gsencoder.types import FeatureMap, Scene
 
 MAX_CELLS_PER_MAP = 4096
@@ -33,6 +36,46 @@ class DatasetSpace:
     outputs: OutputSpace
     codebook: Float32[np.ndarray, "C channels"] | None = None
     kinds: tuple[str, ...] = ()
+
+
+def fit_space(
+    dataset: PreparedDataset,
+    scenes: Sequence[Path],
+    open_scene: Callable[[Path], tuple[Scene, Teacher]],
+    config: PrepareConfig,
+    *,
+    optional: bool = False,
+) -> None:
+    """Computes and stores the output space of the training scenes of a dataset, unless it is stored already.
+
+    With `optional`, scenes that lack what the teacher needs are left out.
+
+    Raises:
+        InputError: the dataset's folder holds scenes without their space, or see `dataset_space`.
+    """
+    path = dataset.folder / SPACE_FILE
+    if path.is_file():
+        return
+    if dataset.holds_scenes():
+        raise InputError(
+            f"{dataset.folder}: holds scenes, but not the space that they were prepared for ({SPACE_FILE}); give "
+            "another folder as prepared="
+        )
+    space = dataset_space(
+        scenes,
+        open_scene,
+        config.fusion,
+        views=config.basis_views,
+        center=config.center,
+        scale=config.scale,
+        optional=optional,
+    )
+    arrays, header = output_space_parts(space.outputs)
+    if space.codebook is not None:
+        arrays["codebook"] = space.codebook
+    # Another run that prepares the same scenes may have stored a space in the meantime, and scenes in it.
+    if not path.is_file():
+        write_archive(path, arrays, {**header, "kinds": list(space.kinds)})
 
 
 def dataset_space(

@@ -30,8 +30,10 @@ from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.models.output_space import check_distinct
 from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
+from gsencoder.train.dataset_space import fit_space
 from gsencoder.train.distributed import check_agreement, fail_together
-from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PrepareConfig, PreparedDataset
+from gsencoder.train.prepare import PrepareConfig
+from gsencoder.train.prepared_dataset import DATASET_SETTINGS_FILE, PreparedDataset
 from gsencoder.types import Scene
 
 
@@ -146,7 +148,7 @@ def prepare_scenes(
                 with about(f"teacher {name}") if several else nullcontext(), config.typed_options(name):
                     # Read first, since a head that is not there is an error before the teacher has made a map.
                     unmeasured = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
-                    dataset.fit_space(training, open_scene, config.prepare, optional=several)
+                    fit_space(dataset, training, open_scene, config.prepare, optional=several)
                     measure_dataset_heads(dataset, unmeasured, training, open_scene, views, optional=several)
             # Before hours of preparation, since the encoder could not have such columns.
             check_distinct({name: PreparedDataset(path).load_space()[0].space for name, path in folders.items()})

@@ -29,7 +29,7 @@ from gsencoder.train.adapter_heads import (
     teacher_of_heads,
 )
 from gsencoder.train.dataset_space import sampled_maps, views_of_scenes
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=6)

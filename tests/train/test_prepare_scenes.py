@@ -15,8 +15,8 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.onnx import OnnxConfig
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.train import prepare_scenes as module
-from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.types import Scene
 
 LACKING = {"coded": {"wall_1"}, "dense": {"wall_0", "wall_3"}}

@@ -27,7 +27,7 @@ from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.data_workers import automatic_workers, silence_connection_errors
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.trainer import (
     Trainer,
@@ -399,7 +399,7 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.distill import encoder_trainer
 
