@@ -16,7 +16,7 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.render import blend
-from gsencoder.train.prepared_scene import ViewRows, write_prepared
+from gsencoder.train.prepared_file import Precision, ViewRows, write_prepared
 from gsencoder.types import FeatureMap, Scene
 
 
@@ -49,6 +49,14 @@ class PrepareConfig:
     scale: bool = field(
         default=True,
         metadata={"help": "divide targets by their typical distance from the mean; false = in the teacher's units"},
+    )
+
+    targets: Precision = field(
+        default="float16",
+        metadata={
+            "help": "how targets and the teacher's vectors of the render loss are stored: float16, or int8 with a "
+            "scale for each column, in half the bytes"
+        },
     )
 
     def __post_init__(self) -> None:
@@ -97,7 +105,16 @@ def prepare_scene(
     chosen = even_indices(len(scene.views), config.render_views or len(scene.views))
     rows = view_rows(scene, teacher, outputs, config, chosen, device)
     with_rows = replace(scene, views=scene.views.select(chosen))
-    write_prepared(path, with_rows, fused.features, outputs, rows, source=source, projections=fused.projections)
+    write_prepared(
+        path,
+        with_rows,
+        fused.features,
+        outputs,
+        rows,
+        source=source,
+        precision=config.targets,
+        projections=fused.projections,
+    )
 
 
 def view_rows(

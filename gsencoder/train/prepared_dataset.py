@@ -25,7 +25,8 @@ from gsencoder.models.output_space import OutputSpace, read_output_space
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets
 from gsencoder.train.distributed import fail_together, summed_array, value_of_first
 from gsencoder.train.prepare import PrepareConfig, prepare_scene
-from gsencoder.train.prepared_scene import PreparedScene, digest_of_files
+from gsencoder.train.prepared_file import Precision, digest_of_files, stored_precision
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import Scene
 
 SPACE_FILE, DATASET_SETTINGS_FILE, CLASS_BALANCE_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
@@ -122,6 +123,12 @@ class PreparedDataset:
             codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
         return outputs, codebook
 
+    @property
+    def precision(self) -> Precision:
+        """How the targets of its scenes are stored."""
+        prepare = self.settings.get("prepare")
+        return "int8" if isinstance(prepare, dict) and prepare.get("targets") == "int8" else "float16"
+
     def scene_path(self, name: str) -> Path:
         """The path of a scene's file, which exists once the scene is prepared."""
         return self.folder / "scenes" / f"{name}.safetensors"
@@ -135,7 +142,7 @@ class PreparedDataset:
         """Whether the scene at this path is prepared, from this path or from another one with the same files.
 
         Raises:
-            InputError: another scene with the same name is.
+            InputError: another scene with the same name is, or its targets are not of the precision of this dataset.
         """
         path = self.scene_path(source.name)
         if not path.is_file():
@@ -143,6 +150,9 @@ class PreparedDataset:
         with advised("remove the file to prepare the scene again"), open_archive(path) as file:
             made_from = file.value("source", str)
             files = file.value("source_files", str) if "source_files" in file else ""
+            precision, expected = stored_precision(file), self.precision
+            if precision != expected:
+                raise InputError(f"expected targets of {expected}, as the settings of its folder say, got {precision}")
         # A data set that was moved, or is mounted elsewhere on another machine, holds the same files.
         if made_from != str(source.resolve()) and not (files and files == digest_of_files(source)):
             raise InputError(

@@ -313,7 +313,7 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
     one = encoder_trainer(small_encoder(), data, LOSSES, SHORT, folder=tmp_path, settings={})
     before = {name: value.clone() for name, value in one.network.state_dict().items()}
     spoiled = lambda scene, rows: np.full((len(rows), scene.channels), np.inf, np.float16)  # noqa: E731
-    monkeypatch.setattr(PreparedScene, "stored_targets", spoiled)
+    monkeypatch.setattr(PreparedScene, "float16_targets", spoiled)
     with pytest.raises(
         InputError, match=r"the field loss of wall_\d \((near, far|far, near)\) is not finite at step 0"
     ):
