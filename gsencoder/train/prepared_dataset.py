@@ -126,8 +126,7 @@ class PreparedDataset:
     @property
     def precision(self) -> Precision:
         """How the targets of its scenes are stored."""
-        prepare = self.settings.get("prepare")
-        return "int8" if isinstance(prepare, dict) and prepare.get("targets") == "int8" else "float16"
+        return "int8" if dict(self.settings.get("prepare") or {}).get("targets") == "int8" else "float16"
 
     def scene_path(self, name: str) -> Path:
         """The path of a scene's file, which exists once the scene is prepared."""
@@ -135,8 +134,7 @@ class PreparedDataset:
 
     def holds_scenes(self) -> bool:
         """Whether any scene is prepared."""
-        folder = self.folder / "scenes"
-        return folder.is_dir() and any(folder.iterdir())
+        return any((self.folder / "scenes").glob("*"))
 
     def has_scene(self, source: Path) -> bool:
         """Whether the scene at this path is prepared, from this path or from another one with the same files.
@@ -150,9 +148,8 @@ class PreparedDataset:
         with advised("remove the file to prepare the scene again"), open_archive(path) as file:
             made_from = file.value("source", str)
             files = file.value("source_files", str) if "source_files" in file else ""
-            precision, expected = stored_precision(file), self.precision
-            if precision != expected:
-                raise InputError(f"expected targets of {expected}, as the settings of its folder say, got {precision}")
+            if (got := stored_precision(file)) != self.precision:
+                raise InputError(f"expected targets of {self.precision}, as the settings of its folder say, got {got}")
         # A data set that was moved, or is mounted elsewhere on another machine, holds the same files.
         if made_from != str(source.resolve()) and not (files and files == digest_of_files(source)):
             raise InputError(

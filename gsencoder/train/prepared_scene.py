@@ -11,7 +11,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float16, Float32, Float64
+import torch
+from jaxtyping import Float, Float16, Float32, Float64, Int8
 
 from gsencoder.core.errors import InputError, about, advised
 from gsencoder.core.files.archive import open_archive
@@ -20,6 +21,9 @@ from gsencoder.data.archive_records import read_cameras
 from gsencoder.fusion.basis_fit import BINS, ProjectionSums
 from gsencoder.train.prepared_file import SCALES, Precision, ViewRows, array_types, check_arrays, stored_precision
 from gsencoder.types import Cameras, Gaussians
+
+BLOCK_ROWS = 512
+"""Rows of eight bits that are converted at a time."""
 
 
 class PreparedScene:
@@ -138,12 +142,14 @@ class PreparedScene:
 
     def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
         """Reads targets of the encoder by row, standard units; zero for Gaussians without a target."""
-        return self.float16_targets(rows).astype(np.float32)
+        with self._error_context():
+            return self._scaled("targets", self._arrays.rows("targets", rows)).astype(np.float32, copy=False)
 
     def float16_targets(self, rows: np.ndarray) -> Float16[np.ndarray, "n channels"]:
         """The same in float16, as samples hold them."""
         with self._error_context():
-            return self._scaled("targets", self._arrays.rows("targets", rows)).astype(np.float16, copy=False)
+            stored = self._arrays.rows("targets", rows)
+        return _as_float16(stored, self._scales["targets"]) if self._scales else stored
 
     def _scaled(self, name: str, stored: np.ndarray) -> Float[np.ndarray, "n channels"]:
         """Rows of an array in standard units: float16 as they are stored, or float32 of integers."""
@@ -167,3 +173,15 @@ class PreparedScene:
             if not in_range.all() or not (view_rows.weight >= 0).all() or not np.isfinite(view_rows.targets).all():
                 raise InputError(f"view {self.view_names[view]!r}: its columns, weights or targets are out of range")
         return view_rows
+
+
+def _as_float16(
+    integers: Int8[np.ndarray, "n channels"], scales: Float32[np.ndarray, " channels"]
+) -> Float16[np.ndarray, "n channels"]:
+    """Integers times the scales of their columns. In torch, which converts to float16 several times faster than numpy,
+    and in blocks that stay in the cache."""
+    result, given, factors = np.empty(integers.shape, np.float16), torch.from_numpy(integers), torch.from_numpy(scales)
+    rows = torch.from_numpy(result)
+    for start in range(0, len(integers), BLOCK_ROWS):
+        rows[start : start + BLOCK_ROWS] = given[start : start + BLOCK_ROWS].float().mul_(factors)
+    return result
