@@ -37,7 +37,7 @@ from gsencoder.models.grid.plan import plan_cloud
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.train import samples
 from gsencoder.train.distill import Distillation
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.samples import SampleDataset, SampleRecipe
 from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import FeatureSpace, Gaussians

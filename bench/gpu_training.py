@@ -21,7 +21,7 @@ from gsencoder.core.runtime.device_names import Precision
 from gsencoder.models.blocks import DropPath
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 
 STEPS = 3
 

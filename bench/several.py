@@ -20,7 +20,7 @@ from gsencoder.core.runtime.device import autocast_dtype
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.distill import Distillation
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.samples import Batch, SampleDataset, SampleRecipe, TeacherRecipe, join_samples
 from gsencoder.train.training_scene import TrainingScene
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from training_scenes import SMALL, DenseSideTeacher, SideTeacher, prepared, samples
 
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.samples import Batch, SampleDataset, SampleRecipe, TeacherRecipe, join_samples
 from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import FeatureMap, FeatureSpace, Views

@@ -45,7 +45,7 @@ from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE
+from gsencoder.train.prepared_dataset import CLASS_BALANCE_FILE, SPACE_FILE
 from gsencoder.types import FeatureSpace, Scene, Views
 
 FLIPS = 60

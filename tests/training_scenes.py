@@ -13,8 +13,10 @@ from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.point_transformer import TransformerConfig
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.crops import SamplingConfig
+from gsencoder.train.dataset_space import fit_space
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepare import PrepareConfig, PreparedDataset
+from gsencoder.train.prepare import PrepareConfig
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
 from gsencoder.train.trainer import TrainerConfig
 from gsencoder.train.training_scene import TrainingScene
@@ -107,7 +109,7 @@ def prepared(folder: Path, *, count: int = 3, teacher: Teacher | None = None) ->
     dataset = PreparedDataset(folder, {"made": "for a test"})
     names = [f"wall_{number}" for number in range(count)]
     chosen: Teacher = teacher
-    dataset.fit_space([Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
+    fit_space(dataset, [Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
     for number in range(count):
         dataset.prepare(scene(number), teacher, PREPARE, source=Path(f"wall_{number}"))
     dataset.count_classes(names, untracked)

@@ -21,6 +21,7 @@ ADDED_OPTIONS: Mapping[str, Any] = {
     "prepare.center": True,
     "prepare.scale": True,
     "prepare.render_views": 0,
+    "prepare.targets": "float16",
 }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.archive import Archive
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 
@@ -20,7 +21,7 @@ class Moments:
         self.second = second
         self.sum: Float64[np.ndarray, " D"] = np.zeros(channels)
         self.outer: Float64[np.ndarray, "D D"] = np.zeros((channels, channels))
-        self._shift: np.ndarray | None = None
+        self._shift: Float32[np.ndarray, " D"] | None = None
 
     def add(self, vectors: Float[np.ndarray, "n D"]) -> None:
         """Takes more vectors into account.
@@ -33,8 +34,8 @@ class Moments:
         if self._shift is None:
             # Moments are taken about the first chunk's mean: features whose mean is large against their spread, as
             # those of vision transformers are, would otherwise lose the spread to cancellation.
-            self._shift = vectors.mean(axis=0, dtype=np.float64)
-        shifted = vectors - self._shift.astype(np.float32)
+            self._shift = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
+        shifted = vectors - self._shift
         gram = (shifted.T @ shifted).astype(np.float64) if self.second else shifted.sum(axis=0, dtype=np.float64)
         if not np.isfinite(gram).all():
             bad = int((~np.isfinite(vectors).all(axis=1)).sum())
@@ -44,12 +45,49 @@ class Moments:
         if self.second:
             self.outer += gram
 
+    def merge(self, other: "Moments") -> None:
+        """Takes all into account that was added to other moments of as many channels.
+
+        The sums depend on the order of merging within rounding, as they do on the order of `add`; the same order gives
+        the same bits.
+        """
+        assert self.second == other.second, "Moments: of both, or of neither, the second moments are needed"
+        if other._shift is None:
+            return
+        if self._shift is None:
+            self._shift = other._shift
+        offset = other._shift.astype(np.float64) - self._shift
+        if self.second:
+            mixed = np.outer(other.sum, offset)
+            self.outer += other.outer + mixed + mixed.T + other.count * np.outer(offset, offset)
+        self.sum += other.sum + other.count * offset
+        self.count += other.count
+
+    def parts(self) -> dict[str, np.ndarray]:
+        """The arrays that represent the moments in a file."""
+        shift = np.zeros(len(self.sum), np.float32) if self._shift is None else self._shift
+        return {"count": np.array([self.count]), "sum": self.sum, "outer": self.outer, "shift": shift}
+
+    @classmethod
+    def read(cls, file: Archive, channels: int) -> "Moments":
+        """Moments from the arrays of a file.
+
+        Raises:
+            InputError: the file is damaged, or of another number of channels.
+        """
+        moments = cls(channels)
+        moments.count = float(file.array("count", "float64", (1,))[0])
+        moments.sum = file.array("sum", "float64", (channels,))
+        moments.outer = file.array("outer", "float64", (channels, channels))
+        moments._shift = file.array("shift", "float32", (channels,)) if moments.count else None
+        return moments
+
     @property
     def mean(self) -> Float64[np.ndarray, " D"]:
         """Mean of everything added."""
         if self._shift is None or self.count == 0:
             raise InputError("features: no view has any cell with features; nothing to fit a basis to")
-        return self._shift.astype(np.float32) + self.sum / self.count
+        return self._shift + self.sum / self.count
 
     def covariance(self) -> Float64[np.ndarray, "D D"]:
         """Second moment about the mean."""

@@ -5,7 +5,7 @@ outputs (SplatDistill Eq. 4). Both sides of the loss are decoded from the datase
 teacher's vectors without what the basis drops; the dataset's file of heads states what that costs each of them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,12 @@ from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import choose_heads, has_head, load_heads, save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE, check_heads_space
-from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.dataset_space import sampled_maps
 from gsencoder.train.losses import AdapterHead
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.types import Scene
+from gsencoder.train.prepared_dataset import PreparedDataset
+from gsencoder.train.sampled_maps import OpenScene, sampled_maps
 
 
 class FeatureDecoder(nn.Module):
@@ -100,7 +98,7 @@ def measure_dataset_heads(
     dataset: PreparedDataset,
     heads: Sequence[Head],
     scenes: Sequence[Path],
-    open_scene: Callable[[Path], tuple[Scene, Teacher]],
+    open_scene: OpenScene,
     views: int,
     *,
     optional: bool = False,

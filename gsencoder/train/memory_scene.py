@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
 from gsencoder.core.files.json_values import plain
@@ -29,7 +30,8 @@ from gsencoder.memory.bank import BankConfig, build_bank
 from gsencoder.memory.raw_features import MapStream, RawSample, draw_sample
 from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 from gsencoder.train.prepare import PrepareConfig, view_rows
-from gsencoder.train.prepared_scene import PreparedScene, write_prepared
+from gsencoder.train.prepared_file import write_prepared
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, Scene
 
 BANK_FILE, SCENE_FILE, MAPS_FOLDER = "bank.safetensors", "scene.safetensors", "maps"
@@ -102,6 +104,8 @@ def prepare_memory(
         raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
     if prepare.render_views:
         raise InputError("prepare.render_views: expected 0: a memory is trained on all views of its scene")
+    if prepare.targets != "float16":
+        raise InputError("prepare.targets: expected float16: the fused features of a memory are read from its targets")
     if predicted is not None and predicted.space != teacher.space:
         raise InputError(
             f"memory: the predicted features are of ({predicted.space.describe()}), and the teacher's of "
@@ -141,7 +145,7 @@ def open_memory_scene(folder: Path, made_with: Mapping[str, Any] | None = None) 
     """
     advice = advised(f"give resume=false, or remove {folder}, to prepare the scene again")
     with advice, open_archive(folder / BANK_FILE) as file:
-        stored = file.value("made_with", dict)
+        stored = with_added_options(file.value("made_with", dict))
         if made_with is not None and stored != made_with:
             raise InputError(f"was prepared with {first_difference(stored, dict(made_with))}")
         outputs = read_output_space(file)

@@ -1,11 +1,9 @@
 """Preparation of all scenes of a training from disk: reading, seeding and fusing, shared among processes."""
 
 import hashlib
-import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,76 +15,16 @@ from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
-from gsencoder.data.splats import READABLE
-from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_views
-from gsencoder.fusion.store.folder import TEACHER_NAME
+from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.teachers import MissingInput, Teacher
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, options_of_member
-from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.regions.config import RegionsConfig
+from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.models.output_space import check_distinct
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
+from gsencoder.text.build import Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
+from gsencoder.train.dataset_space import fit_space
 from gsencoder.train.distributed import check_agreement, fail_together
-from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PrepareConfig, PreparedDataset
-from gsencoder.types import Scene
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SourceConfig:
-    """The source of a training's targets: settings of reading, seeding, the teacher and preparation."""
-
-    splat: str = field(
-        default="",
-        metadata={
-            "help": "file of the Gaussians of scenes with views, where {scene} stands for the name of its folder; "
-            f"empty = make seeds. {READABLE}"
-        },
-    )
-    orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
-    cameras: CamerasOfSplat = field(
-        default="auto",
-        metadata={"help": "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"},
-    )
-    data: SceneConfig = field(default_factory=SceneConfig)
-    seeds: SeedConfig = field(default_factory=SeedConfig)
-    teacher: TeacherConfig = field(default_factory=LabelsConfig)
-    teachers: Mapping[str, TeacherConfig] = field(
-        default_factory=dict,
-        metadata={
-            "help": "several teachers instead of one, by the names that teacher= takes, or NAME:TEACHER; options of "
-            "one of them are teachers.NAME.OPTION",
-            "several": "teacher",
-        },
-    )
-    text: TextConfig = field(default_factory=TableTextConfig)
-    prepare: PrepareConfig = field(default_factory=PrepareConfig)
-
-    def __post_init__(self) -> None:
-        check_orbits(self.orbits)
-        wrong = [name for name in self.teachers if not re.fullmatch(TEACHER_NAME, name)]
-        if wrong:
-            raise InputError(f"teachers: expected names of letters, digits, _ and -, got {wrong[0]!r}")
-        spelled: dict[str, str] = {}
-        for name in self.teachers:
-            other = spelled.setdefault(name.lower(), name)
-            if other != name:
-                raise InputError(
-                    f"teachers: {other} and {name} differ only in case, and their files would overwrite each other "
-                    f"where a file system ignores it; give another name, such as {name}_2"
-                )
-
-    @property
-    def teachers_by_name(self) -> dict[str, TeacherConfig]:
-        """The teachers of the training, one or several."""
-        return dict(self.teachers) or {self.teacher.name: self.teacher}
-
-    def typed_options(self, name: str) -> AbstractContextManager[None]:
-        """Names options of a teacher in errors by the keys that are typed: teachers.NAME.OPTION with `teachers`."""
-        return options_of_member(name, self.teachers[name]) if name in self.teachers else nullcontext()
+from gsencoder.train.prepared_dataset import DATASET_SETTINGS_FILE, PreparedDataset
+from gsencoder.train.source import SceneReader, SourceConfig
 
 
 def prepare_scenes(
@@ -134,23 +72,28 @@ def prepare_scenes(
     made_with = {
         name: _made_with(training, words.get(name), teacher, config, voxel) for name, teacher in teachers.items()
     }
-    reader = _SceneReader(config, words, voxel)
+    reader = SceneReader(config, words, voxel)
     several = len(teachers) > 1
+    unmeasured: dict[str, list[Head]] = {}
     with fail_together():
         if process.is_first:
             with_heads = teacher_of_heads(teachers, heads)
             for name, path in folders.items():
                 dataset = PreparedDataset(path, made_with[name])
                 dataset.remove_stale_maps()
-                open_scene, views = partial(reader.with_views, name), config.prepare.basis_views
-                with about(f"teacher {name}") if several else nullcontext(), config.typed_options(name):
-                    # Read first, since a head that is not there is an error before the teacher has made a map.
-                    unmeasured = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
-                    dataset.fit_space(training, open_scene, config.prepare, optional=several)
-                    measure_dataset_heads(dataset, unmeasured, training, open_scene, views, optional=several)
-            # Before hours of preparation, since the encoder could not have such columns.
-            check_distinct({name: PreparedDataset(path).load_space()[0].space for name, path in folders.items()})
+                # Read first, since a head that is not there is an error before the teacher has made a map.
+                with _about_teacher(config, name):
+                    unmeasured[name] = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
     datasets = {name: PreparedDataset(path, made_with[name]) for name, path in folders.items()}
+    for name, dataset in datasets.items():
+        open_scene, views = partial(reader.with_views, name), config.prepare.basis_views
+        with _about_teacher(config, name):
+            fit_space(dataset, training, open_scene, config.prepare, optional=several, process=process, track=track)
+            with fail_together():
+                if process.is_first:
+                    measure_dataset_heads(dataset, unmeasured[name], training, open_scene, views, optional=several)
+    # Before hours of preparation, since the encoder could not have such columns.
+    check_distinct({name: dataset.load_space()[0].space for name, dataset in datasets.items()})
     missing = {
         path: [name for name, dataset in datasets.items() if not dataset.has_scene(path)]
         for path in [*training, *held_out]
@@ -179,6 +122,13 @@ def prepare_scenes(
     for dataset in datasets.values():
         dataset.count_classes([path.name for path in training], track, process)
     return datasets
+
+
+@contextmanager
+def _about_teacher(config: SourceConfig, name: str) -> Iterator[None]:
+    """Names a teacher, where there are several, and its options as they are typed in errors of the block."""
+    with about(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
+        yield
 
 
 def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -224,7 +174,7 @@ def _prepare_scene(
     path: Path,
     names: Sequence[str],
     datasets: Mapping[str, PreparedDataset],
-    reader: "_SceneReader",
+    reader: "SceneReader",
     config: SourceConfig,
     device: torch.device,
     *,
@@ -282,59 +232,6 @@ def _check_teachers(
                 SceneWarning,
                 stacklevel=3,
             )
-
-
-class _SceneReader:
-    """Reads scenes and builds teachers for them."""
-
-    def __init__(self, config: SourceConfig, words: Mapping[str, Words], voxel: float) -> None:
-        """Args:
-        config: settings of reading, seeding and the teachers.
-        words: the words of teachers that have any, by teacher.
-        voxel: see `prepare_scenes`.
-        """
-        self.config, self.words, self.voxel = config, words, voxel
-        self._shared: dict[str, Teacher] = {}
-
-    def teacher(self, name: str, scene: Scene) -> Teacher:
-        """The teacher of a scene. Objects and masks belong to a scene; any other teacher is built once for all."""
-        config = self.config.teachers_by_name[name]
-        if isinstance(config, (LabelsConfig, RegionsConfig)):
-            return build_teacher(config, scene, self.words.get(name))
-        if name not in self._shared:
-            self._shared[name] = build_teacher(config, scene, self.words.get(name))
-        return self._shared[name]
-
-    def with_views(self, name: str, path: Path) -> tuple[Scene, Teacher]:
-        """A scene with views, which is enough for maps, and the teacher of this name."""
-        with about(path):
-            scene = self.load(path)
-            return scene, self.teacher(name, scene)
-
-    def weights_of_teachers(self, path: Path) -> dict[str, str]:
-        """The digests of the weights of the teachers that a scene has, by their names."""
-        with about(path):
-            scene, weights = self.load(path), dict[str, str]()
-            for name in self.config.teachers_by_name:
-                try:
-                    with self.config.typed_options(name):
-                        weights[name] = self.teacher(name, scene).space.weights
-                except MissingInput:
-                    continue
-        return weights
-
-    def with_gaussians(self, scene: Scene, path: Path) -> Scene:
-        """A scene that `load` read, with Gaussians, of known unit, named by its path."""
-        scene = with_gaussians(scene, self.config.seeds)
-        return replace(scene, name=path.name, metres_per_unit=unit_of(scene, self.voxel))
-
-    def load(self, path: Path) -> Scene:
-        """A scene with views, as it is on disk; cameras are placed in a splat without any."""
-        config = self.config
-        scene = load_scene(path, splat=config.splat or None, options=config.data)
-        if scene.views is None:
-            scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)
-        return scene
 
 
 def _words_digest(words: Words | None) -> str:

@@ -12,7 +12,7 @@ from gsencoder.render import Blend, BlendConfig
 from gsencoder.render.rays import Lattice
 from gsencoder.train.class_balance import ClassBalance
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepared_scene import ViewRows
+from gsencoder.train.prepared_file import ViewRows
 
 MIN_REMAINING_WEIGHT = 0.5
 """Smallest share of a row's weight that must remain after Gaussians are dropped at random."""

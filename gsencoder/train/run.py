@@ -29,10 +29,11 @@ from gsencoder.train.crops import SamplingConfig
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.distributed import check_agreement, cpu_share, digest_of, fail_together, join_processes
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
+from gsencoder.train.prepare_scenes import prepare_scenes
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
+from gsencoder.train.source import SourceConfig
 from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, TrainerConfig, ValidationResult
 from gsencoder.train.training_scene import TrainingScene
 

@@ -36,7 +36,7 @@ class TeacherTargets(NamedTuple):
     """What one teacher says of the Gaussians and views of a sample or a batch.
 
     Attributes:
-        targets: targets of the Gaussians, standard units; in float16, as they are stored, since samples that are made
+        targets: targets of the Gaussians, standard units; in float16, since samples that are made
             ahead fill shared memory.
         codes: class of each Gaussian's target, a row of the teacher's codebook; −1 without a target.
         loss_weights: weight of each Gaussian in the loss; 0 without a target.
@@ -329,7 +329,7 @@ def _targets_of(
         view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
         rows.append(make_render_rows(view_rows, balance, losses.rarity))
     return TeacherTargets(
-        targets=torch.from_numpy(scene.stored_targets(remaining)),
+        targets=torch.from_numpy(scene.float16_targets(remaining)),
         codes=torch.from_numpy(codes[remaining].astype(np.int64)),
         loss_weights=torch.from_numpy(_weights_of(codes, balance, losses.rarity)[remaining]),
         rows=join_rows(rows, [0] * len(rows)),

@@ -2,6 +2,9 @@
 
 from gsencoder.core.added_options import ADDED_OPTIONS, TRAINED, with_added_options
 
+ADDED = {"center": True, "scale": True, "render_views": 0, "targets": "float16"}
+"""What settings of scenes that an earlier version prepared lack."""
+
 
 def test_sections_get_the_options_that_they_lack_and_keep_those_that_they_have() -> None:
     stored = {"model": {"transformer": {"patch": 8}}, "loss": {"confidence": False}}
@@ -19,7 +22,7 @@ def test_sections_get_the_options_that_they_lack_and_keep_those_that_they_have()
 def test_settings_of_prepared_scenes_inside_those_of_a_training_are_completed_too() -> None:
     completed = with_added_options({"prepared": {"prepare": {"render_cell": 8}}, "run": 1})
     assert completed == {
-        "prepared": {"prepare": {"render_cell": 8, "center": True, "scale": True, "render_views": 0}},
+        "prepared": {"prepare": {"render_cell": 8, **ADDED}},
         "run": 1,
     }
 
@@ -47,8 +50,8 @@ def test_each_added_option_exists_and_its_default_is_what_was_done_before_unless
 def test_settings_of_scenes_that_were_prepared_for_several_teachers_are_completed() -> None:
     completed = with_added_options({"prepared": {"labels": {"prepare": {"center": False}}, "dino": {"prepare": {}}}})
     assert completed["prepared"] == {
-        "labels": {"prepare": {"center": False, "scale": True, "render_views": 0}},
-        "dino": {"prepare": {"center": True, "scale": True, "render_views": 0}},
+        "labels": {"prepare": {**ADDED, "center": False}},
+        "dino": {"prepare": ADDED},
     }
 
 

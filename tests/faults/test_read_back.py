@@ -38,7 +38,7 @@ from gsencoder.data.video.frames import RECORD_FILE, _taken
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, FusionCheckpoint
 from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers
-from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PreparedDataset
+from gsencoder.train.prepared_dataset import DATASET_SETTINGS_FILE, PreparedDataset
 
 FLIPS = 60
 SETTINGS = {"fuse": {"views": 3, "rays": 1.5}, "teacher": {"name": "palette"}}

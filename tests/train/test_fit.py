@@ -23,7 +23,7 @@ from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train import run
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.run import TrainConfig, fit
 from gsencoder.train.samples import SampleDataset
 from gsencoder.train.trainer import ValidationResult

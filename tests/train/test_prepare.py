@@ -17,15 +17,9 @@ from gsencoder.core.files.archive import write_archive
 from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets, nearest_codes
-from gsencoder.train.dataset_space import dataset_space
-from gsencoder.train.prepare import (
-    CLASS_BALANCE_FILE,
-    DATASET_SETTINGS_FILE,
-    SPACE_FILE,
-    PrepareConfig,
-    PreparedDataset,
-    prepare_scene,
-)
+from gsencoder.train.dataset_space import dataset_space, fit_space
+from gsencoder.train.prepare import PrepareConfig, prepare_scene
+from gsencoder.train.prepared_dataset import CLASS_BALANCE_FILE, DATASET_SETTINGS_FILE, SPACE_FILE, PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -91,7 +85,7 @@ def test_what_is_prepared_is_not_prepared_again(tmp_path: Path) -> None:
     files = (tmp_path / SPACE_FILE, tmp_path / CLASS_BALANCE_FILE)
     before = [path.read_bytes() for path in files]
     again = PreparedDataset(tmp_path, {"made": "for a test"})
-    again.fit_space([], lambda path: (scene(0), SideTeacher()), PREPARE)
+    fit_space(again, [], lambda path: (scene(0), SideTeacher()), PREPARE)
     again.count_classes([], untracked)
     assert [path.read_bytes() for path in files] == before
     assert again.has_scene(Path(names[0]))
@@ -227,7 +221,7 @@ def test_scenes_whose_settings_or_space_are_gone_are_not_taken_for_new_ones(tmp_
     dataset, _ = prepared(tmp_path, count=1)
     (tmp_path / SPACE_FILE).unlink()
     with pytest.raises(InputError, match="not the space that they were prepared for"):
-        dataset.fit_space([Path("wall_0")], lambda path: (scene(0), SideTeacher()), PREPARE)
+        fit_space(dataset, [Path("wall_0")], lambda path: (scene(0), SideTeacher()), PREPARE)
     (tmp_path / DATASET_SETTINGS_FILE).unlink()
     with pytest.raises(InputError, match=rf"something else than prepared scenes \(no {DATASET_SETTINGS_FILE}\)"):
         PreparedDataset(tmp_path, {"made": "for a test"})

@@ -15,8 +15,9 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.onnx import OnnxConfig
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.train import prepare_scenes as module
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
+from gsencoder.train.prepare_scenes import prepare_scenes
+from gsencoder.train.prepared_dataset import PreparedDataset
+from gsencoder.train.source import SceneReader, SourceConfig
 from gsencoder.types import Scene
 
 LACKING = {"coded": {"wall_1"}, "dense": {"wall_0", "wall_3"}}
@@ -26,7 +27,7 @@ WALLS = [Path(f"wall_{number}") for number in range(4)]
 TEACHERS: dict[str, Any] = {"coded": SideTeacher(), "dense": DenseTeacher()}
 
 
-class Reader:
+class Reader(SceneReader):
     """Makes scenes instead of reading them; some lack what a teacher needs."""
 
     def __init__(self, *_: object) -> None: ...
@@ -48,7 +49,7 @@ class Reader:
 
 @pytest.fixture(autouse=True)
 def _reader(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_SceneReader", Reader)
+    monkeypatch.setattr(module, "SceneReader", Reader)
     for each in TEACHERS.values():
         monkeypatch.setattr(type(each), "needs_images", False)
 
@@ -92,7 +93,7 @@ class PathOfModel(Reader):
 def test_errors_name_the_options_of_one_of_several_teachers_as_they_are_typed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    monkeypatch.setattr(module, "_SceneReader", PathOfModel)
+    monkeypatch.setattr(module, "SceneReader", PathOfModel)
     typed = rf"teachers\.{name}\.model: no file at teacher\.onnx or a/teacher\.model; lower teachers\.{name}\.size="
     config = SourceConfig(teachers={name: OnnxConfig(), "dense": PaletteConfig()}, prepare=PREPARE)
     with pytest.raises(InputError, match=typed):

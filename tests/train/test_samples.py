@@ -19,8 +19,9 @@ from gsencoder.render import BlendConfig, blend
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.crops import SamplingConfig, choose_crop
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepared_scene import PreparedScene, ViewRows
+from gsencoder.train.prepared_dataset import PreparedDataset
+from gsencoder.train.prepared_file import ViewRows
+from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.render_rows import restrict_rows
 from gsencoder.train.samples import SampleDataset, StepSampler, join_samples, make_sample, target_codes
 from gsencoder.train.training_scene import TrainingScene

@@ -36,8 +36,8 @@ from gsencoder.train.checkpoint import (
 )
 from gsencoder.train.dataset_space import dataset_space
 from gsencoder.train.distill import Distillation, encoder_trainer
-from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.run import TrainConfig, resume_settings, train
 from gsencoder.train.samples import SampleDataset
 from gsencoder.train.training_scene import TrainingScene

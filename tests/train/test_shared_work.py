@@ -17,7 +17,7 @@ from gsencoder.core.runtime.tracking import untracked
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train.distributed import cpu_share, value_of_first, values_of_all
-from gsencoder.train.prepare import CLASS_BALANCE_FILE, PreparedDataset
+from gsencoder.train.prepared_dataset import CLASS_BALANCE_FILE, PreparedDataset
 from gsencoder.train.training_scene import TrainingScene
 
 SCRIPT = """
@@ -30,7 +30,7 @@ sys.path.insert(0, {tests!r})
 from test_shared_work import counted, scores_of
 
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 
 if __name__ == "__main__":
     with join_processes("cpu") as (process, _):

@@ -27,7 +27,7 @@ from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.data_workers import automatic_workers, silence_connection_errors
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.trainer import (
     Trainer,
@@ -313,7 +313,7 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
     one = encoder_trainer(small_encoder(), data, LOSSES, SHORT, folder=tmp_path, settings={})
     before = {name: value.clone() for name, value in one.network.state_dict().items()}
     spoiled = lambda scene, rows: np.full((len(rows), scene.channels), np.inf, np.float16)  # noqa: E731
-    monkeypatch.setattr(PreparedScene, "stored_targets", spoiled)
+    monkeypatch.setattr(PreparedScene, "float16_targets", spoiled)
     with pytest.raises(
         InputError, match=r"the field loss of wall_\d \((near, far|far, near)\) is not finite at step 0"
     ):
@@ -399,7 +399,7 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.distill import encoder_trainer
 

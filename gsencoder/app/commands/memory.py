@@ -38,8 +38,8 @@ from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.memory import memory_training, train_memory, untrained_memory
 from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import MemoryScene, open_memory_scene, open_raw_sample, prepare_memory
-from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.train.render_rows import sample_rows
+from gsencoder.train.source import SourceConfig
 from gsencoder.train.trainer import TrainerConfig
 from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 

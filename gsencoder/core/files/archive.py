@@ -31,13 +31,14 @@ DTYPES = {
     "F16": "float16",
     "F32": "float32",
     "F64": "float64",
+    "I8": "int8",
     "I32": "int32",
     "I64": "int64",
     "U8": "uint8",
     "U16": "uint16",
 }
 """The types of arrays that archives may hold, by their names in safetensors."""
-ORDER = ("I64", "F64", "F32", "I32", "F16", "U16", "U8")
+ORDER = ("I64", "F64", "F32", "I32", "F16", "U16", "I8", "U8")
 """The types in the order in which safetensors writes arrays: those first that are aligned to more bytes."""
 DAMAGED = "the file is damaged"
 
