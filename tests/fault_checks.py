@@ -147,6 +147,8 @@ class Checker:
                 wrong.append(f"ended well, and results differ: {difference(state(folder), ref.whole)}")
         else:
             wrong += self.message(done, folder, action)
+            if left := [name for name in contents(folder) if ".partial-" in name or name.endswith(".tmp")]:
+                wrong.append(f"temporary files are left: {sorted(map(role, left))[:4]}")
         if self.inputs() != ref.inputs:
             wrong.append("inputs were changed")
         # What a killed run left in hidden folders is removed by the next, whatever it is.
