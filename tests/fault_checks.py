@@ -78,9 +78,9 @@ class Checker:
         self.drop(first)
 
     def new(self) -> Path:
-        """An empty folder."""
+        """An empty folder; the names of all are of one length, since some files hold them."""
         self._turn += 1
-        path = self.folder / f"{self.name.replace(' ', '_')}-{self._turn}"
+        path = self.folder / f"{self.name.replace(' ', '_')}-{self._turn:04}"
         path.mkdir()
         return path
 

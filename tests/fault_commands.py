@@ -96,13 +96,13 @@ CASES: dict[str, Case] = {
         _of_features("ask", f"question={QUESTION}", *VIEWS),
         server=True,
         packages=("openai",),
-        other=("vlm.image_side=64",),
+        other=("vlm.max_tokens=9",),
     ),
     "ask of a file": Case(
         _of_features("ask", "questions=GIVEN/questions.jsonl", *VIEWS),
         server=True,
         packages=("openai",),
-        other=("vlm.image_side=64",),
+        other=("vlm.max_tokens=9",),
     ),
     "export of a memory": Case(
         lambda given: ["export", f"memory={given / 'remembered'}"], out="out.onnx", packages=("onnx", "onnxscript")

@@ -18,7 +18,7 @@ from typing import Any
 SHIM = ctypes.CDLL(None)
 
 
-PATIENCE = 5.0
+PATIENCE = 2.0
 """Seconds after which a run that stands still goes on: the other may be waiting for it."""
 
 

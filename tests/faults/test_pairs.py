@@ -13,7 +13,7 @@ from fault_pairs import Pairs
 from fault_runs import FaultServer
 
 
-@pytest.mark.parametrize("name", ["encode", "train", "pack", "repair"])
+@pytest.mark.parametrize("name", ["train", "repair"])
 def test_of_two_runs_in_one_folder_one_writes_it(name: str, server: FaultServer, tmp_path: Path) -> None:
     pairs = Pairs(Checker(server, tmp_path, name))
     last = len(pairs.checker.reference.calls)
