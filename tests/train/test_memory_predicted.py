@@ -86,9 +86,10 @@ def test_a_preparation_that_was_cut_off_is_not_continued_with_others(
     def cut_off(*arguments: object, **settings: object) -> None:
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patched:
         patched.setattr("gsencoder.train.memory_scene.write_prepared", cut_off)
-        prepared(tmp_path / "made", predicted_features())
+        with pytest.raises(KeyboardInterrupt):
+            prepared(tmp_path / "made", predicted_features())
     with pytest.raises(InputError, match="was begun with predicted=.*resume=false"):
         prepared(tmp_path / "made", predicted_features(seed=1))
     made = prepared(tmp_path / "made", predicted_features())
