@@ -1,6 +1,7 @@
 """Two runs of a command in one folder: one stands still before one of its writes while the other runs. The results are
 those of one of the two, and the other run says in one line that it gave way."""
 
+import shutil
 from dataclasses import dataclass, field
 
 from fault_checks import Checker, folders, role, state
@@ -41,6 +42,8 @@ class Pairs:
         more: tuple[str, ...] = ()
         if over:
             assert checker.run(folder).code == 0
+            for each in ref.case.beside:
+                shutil.rmtree(folder / each, ignore_errors=True)
             more = ("overwrite=true",)
         words = [*ref.words, *more, f"out={folder / ref.case.out}"]
         first = checker.server.run(words, folder, at=at, action=HALT, meanwhile=[*words, *ref.case.other])

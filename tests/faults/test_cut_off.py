@@ -7,11 +7,14 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from shutil import copyfile
 
 import numpy as np
 import pytest
+from asked_rooms import save_room
 from torch.utils.data import DataLoader, Dataset
 
+from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.mapped_arrays import MappedArrays
@@ -75,6 +78,20 @@ def test_depth_that_was_read_does_not_depend_on_its_file(tmp_path: Path) -> None
     values = load_npy(tmp_path / "depth.npy")
     cut(tmp_path / "depth.npy")
     np.testing.assert_array_equal(values, ROWS)
+
+
+def test_words_that_are_cut_off_while_they_are_copied_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def cut_off(source: Path, target: Path) -> None:
+        copyfile(source, target)
+        cut(target)
+
+    save_room(tmp_path / "features")
+    monkeypatch.setattr("gsencoder.app.commands.pack.copyfile", cut_off)
+    assert cli.main(["pack", str(tmp_path / "features"), "form=npz", f"out={tmp_path / 'out'}", "quiet=true"]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {tmp_path / 'features' / 'words.safetensors'}: ")
+    assert not (tmp_path / "out").exists()
 
 
 def test_arrays_are_those_that_the_library_reads(tmp_path: Path, rng: np.random.Generator) -> None:
