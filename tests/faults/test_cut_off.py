@@ -18,7 +18,9 @@ from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.mapped_arrays import MappedArrays
+from gsencoder.core.files.model_files import check_fetched, digest_files
 from gsencoder.data.readers.images import load_npy
+from gsencoder.text.table import load_text_table
 from gsencoder.train.data_workers import lost_workers
 
 ROWS = np.arange(400_000, dtype=np.float32).reshape(-1, 4)
@@ -159,3 +161,11 @@ def test_a_data_worker_that_the_system_ends_is_one_line() -> None:
 def test_other_errors_of_torch_stay_as_they_are() -> None:
     with pytest.raises(RuntimeError, match="shapes"), lost_workers():
         raise RuntimeError("shapes differ")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a file of the system that cannot be read")
+@pytest.mark.parametrize("read", [load_text_table, digest_files, check_fetched])
+def test_a_file_whose_disk_fails_is_named(read: Callable[[Path], object]) -> None:
+    # Its first page belongs to nobody: reading it is an I/O error.
+    with pytest.raises(InputError, match="/proc/self/mem: cannot be read: Input/output error"):
+        read(Path("/proc/self/mem"))
