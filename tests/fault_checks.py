@@ -176,7 +176,8 @@ class Checker:
             action: the fault.
         """
         folder, wrong, ref = self.new(), [], self.reference
-        given = self.folder / "given copy"
+        # Of the same length, since some files hold paths.
+        given = self.server.given.with_name("taken")
         shutil.copytree(self.server.given, given)
         words = [word.replace(str(self.server.given), str(given)) for word in ref.words]
         done = self.server.run([*words, f"out={folder / ref.case.out}"], folder, reads=given, at=at, action=action)
@@ -253,7 +254,7 @@ def hidden(files: dict[str, str]) -> dict[str, str]:
 def tidy(files: dict[str, str]) -> dict[str, str]:
     """Digests without those of pictures of time and logs of TensorBoard, which differ in each run."""
     files = {re.sub(r"tfevents[^/]*", "tfevents", name): value for name, value in files.items()}
-    unlike = ("report.html", "tfevents", "tradeoff.csv", "tradeoff.png", "page.html")
+    unlike = ("report.html", "tfevents", "tradeoff.csv", "tradeoff.png", "tradeoff.html", "page.html")
     return {name: "" if name.endswith(unlike) else value for name, value in files.items()}
 
 

@@ -136,9 +136,10 @@ CASES: dict[str, Case] = {
         packages=("peft", "transformers"),
     ),
     "tradeoff": Case(
-        lambda given: ["tradeoff", str(given / "room"), _words(given), "sweep.views=[2]", "sweep.rays_per_patch=[]",
-            "sweep.min_weight=[]", "sweep.stop_transmittance=[]", "sweep.energy=[]", "sweep.max_rank=[]",
-            "sweep.rounds=1", "seeds.voxel=0.15",]
+        lambda given: [
+            "tradeoff", str(given / "room"), _words(given), "sweep.knobs=views", "sweep.values=views:2",
+            "sweep.rounds=1", "seeds.voxel=0.15",
+        ]
     ),
     "view": Case(_of_features("view", "photographs=1"), out="out.html", other=("max_gaussians=50",)),
     "inspect": Case(_of_room("inspect")),
