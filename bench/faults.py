@@ -1,6 +1,6 @@
 """Every write of every command, and a fault at each: what is lost, and what is said.
 
-    python bench/faults.py [--cases fuse train …] [--faults kill tear full error short] [--jobs 2] [--every 1]
+    python bench/faults.py [--cases fuse train …] [--faults kill tear full error short two] [--jobs 2] [--every 1]
     python bench/faults.py --kills 25 --scene SCENE [--cases fuse train reconstruct] [--seed 0]
 
 The calls of each command that change files (open, write, rename, unlink, fsync …) are counted. Then the command is run
@@ -8,7 +8,9 @@ once for each of them and each fault: killed (SIGKILL) before the call, or in th
 that call on; one error (EIO) at it; a write that writes half of what it was given. After each, out= holds whole
 results, the earlier ones or nothing; an error is one line that names the file; and the same command, given again, ends
 with what a run without a fault writes, and leaves nothing else. `--faults inputs`: each file that is read is refused,
-gone, cut off or unreadable as it is opened. `tests/faults` does the same with a sample of the calls.
+gone, cut off or unreadable as it is opened. `--faults two`: the run stands still before each of its writes while a
+second one, with other settings where the case has some, runs in the same folder; the results are of one of the two.
+`tests/faults` does the same with a sample of the calls.
 
 With --kills, commands of real size on a labeled RGB-D scene are killed at random moments instead: each is run once to
 its end, then again, killed (SIGKILL) after a random share of the time that it took, until the kills are used up, and
@@ -32,14 +34,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from chat_server import answer, serving
 from fault_checks import Checker
 from fault_commands import CASES, EXHAUSTIVE
-from fault_runs import CUT, DENY, FULL, IO_ERROR, KILL, READ_ERROR, SHORT, SHORT_FULL, TEAR, VANISH, fault_server
+from fault_pairs import Pairs
+from fault_runs import CUT, DENY, FULL, HALT, IO_ERROR, KILL, READ_ERROR, SHORT, SHORT_FULL, TEAR, VANISH, fault_server
 from json_option import add_json_option, write_figures
 from safetensors.numpy import load_file
 
 from gsencoder.data.splats import load_splat
 
 FAULTS = {"kill": (KILL,), "tear": (TEAR,), "full": (FULL, SHORT_FULL), "error": (IO_ERROR,), "short": (SHORT,)}
-FAULTS |= {"inputs": (DENY, VANISH, CUT, READ_ERROR)}
+FAULTS |= {"inputs": (DENY, VANISH, CUT, READ_ERROR), "two": (HALT,)}
 
 
 def run_case(given: tuple[str, tuple[str, ...], int, bool]) -> tuple[str, int, Counter[str], list[str], float]:
@@ -54,12 +57,18 @@ def run_case(given: tuple[str, tuple[str, ...], int, bool]) -> tuple[str, int, C
         assert server is not None, "needs a C compiler, and Linux"
         checker = Checker(server, Path(folder), name, chat.url)
         calls = checker.reference.calls
+        pairs = Pairs(checker) if "two" in faults else None
         for kind in faults:
             for action in FAULTS[kind]:
-                for call in calls[::every]:
+                for call in (checker.count_inputs() if kind == "inputs" else calls)[::every]:
                     if action in (TEAR, SHORT, SHORT_FULL) and call.size < 2:
                         continue
-                    found = checker.check(call.number, action)
+                    if kind == "inputs":
+                        found = checker.check_input(call.number, action)
+                    elif pairs is not None and action == HALT:
+                        found = pairs.check(call.number, over=over)
+                    else:
+                        found = checker.check(call.number, action)
                     if over and action == KILL:
                         found += [
                             f"over earlier results: {each}" for each in checker.check(call.number, action, over=True)

@@ -78,9 +78,9 @@ class Checker:
         self.drop(first)
 
     def new(self) -> Path:
-        """An empty folder."""
+        """An empty folder; the names of all are of one length, since some files hold them."""
         self._turn += 1
-        path = self.folder / f"{self.name.replace(' ', '_')}-{self._turn}"
+        path = self.folder / f"{self.name.replace(' ', '_')}-{self._turn:04}"
         path.mkdir()
         return path
 
@@ -147,6 +147,8 @@ class Checker:
                 wrong.append(f"ended well, and results differ: {difference(state(folder), ref.whole)}")
         else:
             wrong += self.message(done, folder, action)
+            if left := [name for name in contents(folder) if ".partial-" in name or name.endswith(".tmp")]:
+                wrong.append(f"temporary files are left: {sorted(map(role, left))[:4]}")
         if self.inputs() != ref.inputs:
             wrong.append("inputs were changed")
         # What a killed run left in hidden folders is removed by the next, whatever it is.
@@ -174,7 +176,8 @@ class Checker:
             action: the fault.
         """
         folder, wrong, ref = self.new(), [], self.reference
-        given = self.folder / "given copy"
+        # Of the same length, since some files hold paths.
+        given = self.server.given.with_name("taken")
         shutil.copytree(self.server.given, given)
         words = [word.replace(str(self.server.given), str(given)) for word in ref.words]
         done = self.server.run([*words, f"out={folder / ref.case.out}"], folder, reads=given, at=at, action=action)
@@ -251,7 +254,7 @@ def hidden(files: dict[str, str]) -> dict[str, str]:
 def tidy(files: dict[str, str]) -> dict[str, str]:
     """Digests without those of pictures of time and logs of TensorBoard, which differ in each run."""
     files = {re.sub(r"tfevents[^/]*", "tfevents", name): value for name, value in files.items()}
-    unlike = ("report.html", "tfevents", "tradeoff.csv", "tradeoff.png", "page.html")
+    unlike = ("report.html", "tfevents", "tradeoff.csv", "tradeoff.png", "tradeoff.html", "page.html")
     return {name: "" if name.endswith(unlike) else value for name, value in files.items()}
 
 

@@ -37,6 +37,7 @@ class Case:
         server: whether it asks a server of chat.
         several: whether it is of several scenes, each with a folder in out=.
         packages: those that it needs beside the usual.
+        other: settings with which it writes other results, as a second run of it in the same folder.
     """
 
     words: Callable[[Path], list[str]]
@@ -45,6 +46,7 @@ class Case:
     server: bool = False
     several: bool = False
     packages: tuple[str, ...] = ()
+    other: tuple[str, ...] = ()
 
 
 def _fuse(given: Path, *more: str) -> list[str]:
@@ -64,37 +66,48 @@ def _words(given: Path) -> str:
 
 
 CASES: dict[str, Case] = {
-    "fuse": Case(lambda given: _fuse(given)),
+    "fuse": Case(lambda given: _fuse(given), other=("fusion.views=2",)),
     "fuse with a report": Case(lambda given: _fuse(given, "report=true")),
     "fuse several": Case(lambda given: ["fuse", str(given / "rooms"), _words(given), "seeds.voxel=0.1"], several=True),
-    "encode": Case(_of_room("encode", "weights=GIVEN/trained", "seeds.voxel=0.1")),
+    "encode": Case(_of_room("encode", "weights=GIVEN/trained", "seeds.voxel=0.1"), other=("data.max_views=2",)),
     "train": Case(
         lambda given: ["train", str(given / "room"), _words(given), "tensorboard=true", *TRAIN],
         beside=("out.prepared",),
+        other=("train.seed=1",),
     ),
     "reconstruct": Case(
         _of_room(
             "reconstruct", "optimize.steps=3", "holdout=3", "seeds.voxel=0.15", "optimize.sh_degree=0",
             "checkpoint_every=0",
-        )
+        ),
+        other=("optimize.leash=0.3",),
     ),
     "memory": Case(
         lambda given: [
             "memory", str(given / "room"), _words(given), "train.steps=3", "train.warmup=1", "memory.channels=4",
             "pictures=1", "train.checkpoint_every=0", "seeds.voxel=0.1",
-        ]
+        ],
+        other=("train.seed=1",),
     ),
     "localize": Case(_of_features("localize", "query=cube", "pictures=1", "report=true")),
     "select": Case(_of_features("select", "query=cube")),
     "views": Case(_of_features("views", "query=cube", "grid=[3,4]", *VIEWS)),
-    "ask": Case(_of_features("ask", f"question={QUESTION}", *VIEWS), server=True, packages=("openai",)),
+    "ask": Case(
+        _of_features("ask", f"question={QUESTION}", *VIEWS),
+        server=True,
+        packages=("openai",),
+        other=("vlm.max_tokens=9",),
+    ),
     "ask of a file": Case(
-        _of_features("ask", "questions=GIVEN/questions.jsonl", *VIEWS), server=True, packages=("openai",)
+        _of_features("ask", "questions=GIVEN/questions.jsonl", *VIEWS),
+        server=True,
+        packages=("openai",),
+        other=("vlm.max_tokens=9",),
     ),
     "export of a memory": Case(
         lambda given: ["export", f"memory={given / 'remembered'}"], out="out.onnx", packages=("onnx", "onnxscript")
     ),
-    "pack": Case(_of_features("pack")),
+    "pack": Case(_of_features("pack"), other=("form=npz",)),
     "pack as npz": Case(_of_features("pack", "form=npz")),
     "pack as ply": Case(_of_features("pack", "form=ply")),
     "evaluate": Case(
@@ -123,11 +136,12 @@ CASES: dict[str, Case] = {
         packages=("peft", "transformers"),
     ),
     "tradeoff": Case(
-        lambda given: ["tradeoff", str(given / "room"), _words(given), "sweep.views=[2]", "sweep.rays_per_patch=[]",
-            "sweep.min_weight=[]", "sweep.stop_transmittance=[]", "sweep.energy=[]", "sweep.max_rank=[]",
-            "sweep.rounds=1", "seeds.voxel=0.15",]
+        lambda given: [
+            "tradeoff", str(given / "room"), _words(given), "sweep.knobs=views", "sweep.values=views:2",
+            "sweep.rounds=1", "seeds.voxel=0.15",
+        ]
     ),
-    "view": Case(_of_features("view", "photographs=1"), out="out.html"),
+    "view": Case(_of_features("view", "photographs=1"), out="out.html", other=("max_gaussians=50",)),
     "inspect": Case(_of_room("inspect")),
     "repair": Case(lambda given: ["repair", str(given / "bad.ply")], out="out.ply"),
     "demo": Case(lambda given: ["demo", "views=4", "width=80", "objects=2", "seeds.voxel=0.1"]),

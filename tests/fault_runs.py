@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-COUNT, KILL, TEAR, FULL, IO_ERROR, SHORT, SHORT_FULL, DENY, VANISH, CUT, READ_ERROR = range(11)
+COUNT, KILL, TEAR, FULL, IO_ERROR, SHORT, SHORT_FULL, DENY, VANISH, CUT, READ_ERROR, HALT = range(12)
 """What `fault_shim.c` does at the call that is asked for: nothing; end the process before it, or in the middle of it;
 a disk that is full from then on; one error; a short write, alone or before a full disk; of inputs: refuse, remove or
-halve the file, and an error of reading."""
+halve the file, and an error of reading; stop before it until another run has ended."""
 VOLATILE = (
     "timings",
     "peak_memory_mb",
@@ -54,12 +54,14 @@ class Run:
         code: exit code; negative = the signal that ended it; None = it did not end in time.
         lines: what it printed.
         calls: the counted calls, in order.
+        other: the run that was started while this one stood still.
     """
 
     code: int | None
     lines: tuple[str, ...]
     calls: tuple[Call, ...]
     seconds: float
+    other: "Run | None" = None
 
     @property
     def error(self) -> str:
@@ -128,6 +130,7 @@ class FaultServer:
         clock: tuple[int, int] | None = None,
         warm: bool = False,
         environment: dict[str, str] | None = None,
+        meanwhile: list[str] | None = None,
     ) -> Run:
         """Runs a command line in a child.
 
@@ -140,6 +143,8 @@ class FaultServer:
             clock: after how many readings of the time of day it jumps, and by how many seconds.
             warm: whether to run it in the server itself, so that children have its modules and kernels.
             environment: changes to that of the server.
+            meanwhile: a command line that is run while this one stands still (`HALT`). Where it waits for this one,
+                this one goes on after some seconds.
         """
         side = folder.parent / f"{folder.name}.run"
         side.mkdir(exist_ok=True)
@@ -148,16 +153,21 @@ class FaultServer:
         asked = {
             "words": words, "folder": str(folder), "writes": "" if reads else str(folder), "reads": str(reads or ""),
             "at": at, "action": action, "trace": str(trace), "log": str(side / "log"), "warm": warm,
-            "environment": environment or {},
+            "environment": environment or {}, "meanwhile": meanwhile or [], "log of the other": str(side / "other"),
         }  # fmt: skip
+        for name in ("log", "other"):
+            (side / name).unlink(missing_ok=True)
         answer = self._ask(asked | ({"clock": clock} if clock else {}))
-        log = (side / "log").read_text(errors="replace") if (side / "log").exists() else ""
+        log, other = (
+            (side / name).read_text(errors="replace") if (side / name).exists() else "" for name in ("log", "other")
+        )
+        second = Run(answer["other"], tuple(other.splitlines()), (), 0.0) if "other" in answer else None
         calls = []
         for line in trace.read_text(errors="replace").splitlines() if trace.exists() else ():
             number, name, size, path = line.split("\t", 3)
             calls.append(Call(int(number), name, int(size), path))
         calls.sort(key=lambda call: call.number)
-        return Run(answer["code"], tuple(log.splitlines()), tuple(calls), answer["seconds"])
+        return Run(answer["code"], tuple(log.splitlines()), tuple(calls), answer["seconds"], second)
 
     def close(self) -> None:
         """Ends the server."""

@@ -9,6 +9,7 @@ import ctypes
 import gc
 import json
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -17,54 +18,82 @@ from typing import Any
 SHIM = ctypes.CDLL(None)
 
 
-def run_forked(asked: dict[str, Any]) -> dict[str, Any]:
-    """Runs a command line in a child; its exit code (negative: the signal that ended it) and seconds."""
-    began = time.perf_counter()
+PATIENCE = 2.0
+"""Seconds after which a run that stands still goes on: the other may be waiting for it."""
+
+
+def forked(asked: dict[str, Any]) -> int:
+    """Runs a command line in a child; its process."""
     sys.stdout.flush()
+    child = os.fork()
+    if child:
+        return child
+    code = 99
+    try:
+        streams = os.open(asked["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(streams, 1)
+        os.dup2(streams, 2)
+        os.environ.update(asked.get("environment", {}))
+        os.chdir(asked["folder"])
+        names = (asked["writes"], asked["reads"])
+        if "clock" in asked:
+            SHIM.fault_clock(ctypes.c_long(asked["clock"][0]), ctypes.c_long(asked["clock"][1]))
+        SHIM.fault_arm(
+            *(os.fsencode(name) for name in names),
+            ctypes.c_long(asked["at"]),
+            ctypes.c_int(asked["action"]),
+            os.fsencode(asked["trace"]),
+        )
+        from gsencoder.app import cli
+
+        code = cli.main(asked["words"])
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+        code = 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def ended(child: int, deadline: float, *, stops: bool = False) -> int | None:
+    """The status of a child once it has ended, or (`stops`) stands still; None if it does neither in time."""
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG | (os.WUNTRACED if stops else 0))
+        if done:
+            return status
+        if time.monotonic() > deadline:
+            return None
+        time.sleep(0.002)
+
+
+def run_forked(asked: dict[str, Any]) -> dict[str, Any]:
+    """Runs a command line in a child; its exit code (negative: the signal that ended it) and seconds, and the exit code
+    of another that is run while it stands still."""
+    began = time.perf_counter()
     # What the parent has is not looked at, and so not copied, by its children.
     gc.collect()
     gc.freeze()
-    child = os.fork()
-    if child == 0:
-        code = 99
-        try:
-            streams = os.open(asked["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(streams, 1)
-            os.dup2(streams, 2)
-            os.environ.update(asked.get("environment", {}))
-            os.chdir(asked["folder"])
-            names = (asked["writes"], asked["reads"])
-            if "clock" in asked:
-                SHIM.fault_clock(ctypes.c_long(asked["clock"][0]), ctypes.c_long(asked["clock"][1]))
-            SHIM.fault_arm(
-                *(os.fsencode(name) for name in names),
-                ctypes.c_long(asked["at"]),
-                ctypes.c_int(asked["action"]),
-                os.fsencode(asked["trace"]),
-            )
-            from gsencoder.app import cli
-
-            code = cli.main(asked["words"])
-        except BaseException:
-            import traceback
-
-            traceback.print_exc()
-            code = 1
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
     deadline = time.monotonic() + asked.get("timeout", 120)
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            break
-        if time.monotonic() > deadline:
-            os.kill(child, 9)
-            os.waitpid(child, 0)
-            return {"code": None, "seconds": time.perf_counter() - began}
-        time.sleep(0.002)
-    return {"code": os.waitstatus_to_exitcode(status), "seconds": time.perf_counter() - began}
+    answer: dict[str, Any] = {}
+    children = {"code": forked(asked)}
+    statuses = {"code": ended(children["code"], deadline, stops=bool(asked["meanwhile"]))}
+    if statuses["code"] is not None and os.WIFSTOPPED(statuses["code"]):
+        other = {"words": asked["meanwhile"], "log": asked["log of the other"], "at": 0, "action": 0, "trace": ""}
+        children["other"] = forked({**asked, **other, "writes": "", "reads": ""})
+        statuses["other"] = ended(children["other"], time.monotonic() + PATIENCE)
+        os.kill(children["code"], signal.SIGCONT)
+        statuses["code"] = ended(children["code"], deadline)
+        if statuses["other"] is None:
+            statuses["other"] = ended(children["other"], deadline)
+    for name, status in statuses.items():
+        if status is None:
+            os.kill(children[name], signal.SIGKILL)
+            os.waitpid(children[name], 0)
+        answer[name] = None if status is None else os.waitstatus_to_exitcode(status)
+    return answer | {"seconds": time.perf_counter() - began}
 
 
 def main() -> None:

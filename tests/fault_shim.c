@@ -20,7 +20,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum action { COUNT, KILL, TEAR, FULL, IO_ERROR, SHORT, SHORT_FULL, DENY, VANISH, CUT, READ_ERROR };
+enum action { COUNT, KILL, TEAR, FULL, IO_ERROR, SHORT, SHORT_FULL, DENY, VANISH, CUT, READ_ERROR, HALT };
 
 static char write_root[PATH_MAX], read_root[PATH_MAX];
 static atomic_long changes, inputs;
@@ -110,6 +110,7 @@ static int change(const char *call, const char *name, long size, int grows) {
         return 1;
     case SHORT: return size >= 2 ? 2 : 0;
     case IO_ERROR: errno = EIO; return 1;
+    case HALT: syscall(SYS_kill, syscall(SYS_getpid), SIGSTOP); return 0;
     }
     return 0;
 }

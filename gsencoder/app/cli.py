@@ -5,6 +5,7 @@ terminated. Warnings and errors go to standard error, one line each; results go 
 """
 
 import errno
+import faulthandler
 import os
 import signal
 import sys
@@ -13,7 +14,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from types import FrameType
 from typing import Any
@@ -40,6 +41,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command line, by default that of the process, and returns the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words[: words.index("--") if "--" in words else None]
+    if not faulthandler.is_enabled():
+        # A mapped file that was cut off, a broken disk or a library may end the process: where is said on the way.
+        with suppress(OSError, ValueError, RuntimeError, AttributeError):
+            faulthandler.enable()
     for stream in (sys.stdout, sys.stderr):
         # File names may hold bytes that the terminal's encoding cannot show.
         if hasattr(stream, "reconfigure"):

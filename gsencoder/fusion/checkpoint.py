@@ -42,6 +42,9 @@ class FusionCheckpoint:
     def __init__(self, folder: Path, settings: dict[str, Any], every_seconds: float = 20.0) -> None:
         """Opens the checkpoint of an earlier run. The folder is made when the first map or sum is written.
 
+        Maps and sums without settings are what a run left that was killed while it removed its checkpoint. Nobody knows
+        what they were made from, and they are removed.
+
         Args:
             folder: of the maps and the sums.
             settings: all that maps and sums depend on, the scene included, as JSON values.
@@ -59,6 +62,12 @@ class FusionCheckpoint:
             if earlier != self._settings:
                 difference = first_difference(earlier, self._settings)
                 raise InputError(f"{folder}: holds a fusion begun with {difference}; delete it to start anew")
+        else:
+            try:
+                for path in (folder / SUMS_FILE, *folder.glob("map_*.safetensors")):
+                    path.unlink(missing_ok=True)
+            except OSError as error:
+                raise InputError(f"{folder}: cannot be used: {error.strerror or error}; delete it") from error
 
     def _make_folder(self) -> None:
         """Makes the folder and writes its settings. Not done before the first map: a run that ends earlier, because its

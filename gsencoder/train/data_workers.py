@@ -3,11 +3,14 @@
 import shutil
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
 import torch
 
+from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.threads import available_cores
 
@@ -41,6 +44,29 @@ def start_worker(worker: int) -> None:  # noqa: ARG001
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     sys.excepthook = silence_connection_errors
+
+
+@contextmanager
+def lost_workers() -> Iterator[None]:
+    """Turns the error of torch about a data worker that the system ended into one that says what may be behind it.
+
+    It may be raised anywhere in the block, also between a step and the record of it, so that nothing is to be saved
+    on its account.
+
+    Raises:
+        InputError: a worker was ended.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if not str(error).startswith("DataLoader worker (pid"):
+            raise
+        said = " ".join(str(error).split()).partition(". ")[0]
+        raise InputError(
+            f"training: a process that makes samples was ended by the system ({said}): memory or {SHARED_MEMORY} is "
+            "full, or a prepared scene was cut off; make room and give the same command again, which continues from "
+            "the last checkpoint, with fewer train.workers if it happens again"
+        ) from error
 
 
 def silence_connection_errors(

@@ -6,6 +6,7 @@ continues with the maps and sums of its fusion.
 
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -18,7 +19,7 @@ from jaxtyping import Float32
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import first_difference, open_archive, write_archive
-from gsencoder.core.files.json_values import plain
+from gsencoder.core.files.json_values import plain, write_json
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.archive_records import bank_parts, read_bank
 from gsencoder.data.splats import fingerprint
@@ -35,7 +36,7 @@ from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, Scene
 
 BANK_FILE, SCENE_FILE, MAPS_FOLDER = "bank.safetensors", "scene.safetensors", "maps"
-SAMPLE_FILE = "sample.safetensors"
+SAMPLE_FILE, SETTINGS_FILE = "sample.safetensors", "made_with.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -117,16 +118,16 @@ def prepare_memory(
         made = open_memory_scene(folder, made_with)
         _sample_raw(folder, stream, made.outputs.space, sample)
         return made
+    _begin(folder, made_with)
     maps = folder / MAPS_FOLDER
     work = None if teacher.cheap else maps
     features = predicted or fuse(scene, teacher, prepare.fusion, work=work, device=device, track=track).features
     outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
     source = _source(teacher, folder)
-    maps.mkdir(parents=True, exist_ok=True)
+    maps.mkdir(exist_ok=True)
     components = build_bank(stream, features.space, features.mean, bank)
     assert scene.views is not None
     rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)), device)
-    folder.mkdir(parents=True, exist_ok=True)
     _sample_raw(folder, stream, features.space, sample)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())
     _write_bank(folder / BANK_FILE, components, outputs, made_with)
@@ -143,14 +144,42 @@ def open_memory_scene(folder: Path, made_with: Mapping[str, Any] | None = None) 
     Raises:
         InputError: missing, damaged, or prepared with other settings.
     """
-    advice = advised(f"give resume=false, or remove {folder}, to prepare the scene again")
-    with advice, open_archive(folder / BANK_FILE) as file:
+    with _advice(folder), open_archive(folder / BANK_FILE) as file:
         stored = with_added_options(file.value("made_with", dict))
         if made_with is not None and stored != made_with:
             raise InputError(f"was prepared with {first_difference(stored, dict(made_with))}")
         outputs = read_output_space(file)
         bank = read_bank(file, file.array("bank", "float32", ("M", outputs.space.channels)), outputs.space)
     return MemoryScene(prepared=PreparedScene(folder / SCENE_FILE), outputs=outputs, bank=bank)
+
+
+def _advice(folder: Path) -> AbstractContextManager[None]:
+    return advised(f"give resume=false, or remove {folder}, to prepare the scene again")
+
+
+def _begin(folder: Path, made_with: Mapping[str, Any]) -> None:
+    """Writes what a preparation depends on before its first map and its sample, which do not say so themselves.
+
+    Raises:
+        InputError: the folder holds those of other settings, or cannot be used.
+    """
+    path = folder / SETTINGS_FILE
+    with _advice(folder):
+        if not path.is_file():
+            if any((folder / name).exists() for name in (SAMPLE_FILE, MAPS_FOLDER)):
+                raise InputError(f"{folder}: holds parts of a preparation, and not what they were made with")
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
+            write_json(path, made_with)
+            return
+        try:
+            stored = json.loads(path.read_bytes())
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{path}: cannot be read ({type(error).__name__})") from error
+        if stored != made_with:
+            raise InputError(f"{folder}: was begun with {first_difference(stored, made_with)}")
 
 
 def open_raw_sample(folder: Path) -> RawSample:

@@ -24,7 +24,7 @@ from gsencoder.core.runtime.threads import threads_of_torch
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.train import distributed
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.data_workers import automatic_workers, start_worker
+from gsencoder.train.data_workers import automatic_workers, lost_workers, start_worker
 from gsencoder.train.distributed import (
     STOPPED_ELSEWHERE,
     check_agreement,
@@ -242,16 +242,19 @@ class Trainer:
 
         Raises:
             InputError: a sample cannot be made, or a loss or gradient is not finite; the error names the samples and
-                the loss term, and parameters are not changed.
+                the loss term, and parameters are not changed. Or a data worker was ended.
         """
-        try:
-            self._run(track)
-        except BaseException as stop:
-            can_resume = isinstance(stop, InputError) or not isinstance(stop, Exception) or stop_of(stop) is not None
-            if can_resume and self.state.step:
-                with suppress(InputError):
-                    self.save()
-            raise
+        with lost_workers():
+            try:
+                self._run(track)
+            except BaseException as stop:
+                can_resume = (
+                    isinstance(stop, InputError) or not isinstance(stop, Exception) or stop_of(stop) is not None
+                )
+                if can_resume and self.state.step:
+                    with suppress(InputError):
+                        self.save()
+                raise
         # DistributedDataParallel holds the process group, whose threads must end before the interpreter exits.
         self.objective.network, self._parallel = self.network, None
         return self.state

@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 
 from gsencoder.app.runs import output_folder as outputs
-from gsencoder.app.runs.output_folder import output_folder, refuse_existing, refuse_to_replace_inputs
+from gsencoder.app.runs.output_file import refuse_existing
+from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress
 from gsencoder.app.runs.summary import SUMMARY_NAME, Summary, peak_memory_mb
 from gsencoder.core.errors import InputError, SceneWarning

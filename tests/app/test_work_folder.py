@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gsencoder.app.runs.work_folder import MARKER_FILE, WorkFolder
+from gsencoder.app.runs.work_folder import DISCARDED_FILE, MARKER_FILE, WorkFolder
 from gsencoder.core.errors import InputError
 
 
@@ -53,6 +53,30 @@ def test_a_run_that_begins_anew_forgets_what_there_was(tmp_path: Path) -> None:
         assert contents(tmp_path / "run") == [MARKER_FILE]
 
 
+@pytest.mark.parametrize("anew", [True, False])
+def test_a_state_that_a_kill_left_half_removed_is_not_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, anew: bool
+) -> None:
+    """A run is killed while it removes its state: as it begins anew, or once its results are written."""
+
+    class Killed(BaseException):
+        pass
+
+    def killed(path: Path, **_: object) -> None:
+        raise Killed
+
+    path = tmp_path / "run"
+    cut_off(path, "checkpoint", "log")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", killed)
+        with pytest.raises(Killed):
+            run(path, anew=anew)
+    # Nothing was removed here, and any part of it may have been.
+    assert {"checkpoint", "log"} <= {*contents(path)}
+    assert cut_off(path, "checkpoint") == [MARKER_FILE]
+    assert contents(path) == ["checkpoint", MARKER_FILE]
+
+
 def test_a_folder_that_was_not_taken_is_left_alone(tmp_path: Path) -> None:
     cut_off(tmp_path / "run", "state")
     with WorkFolder(tmp_path / "run"):
@@ -98,7 +122,7 @@ def test_a_kill_while_the_folder_is_removed_leaves_one_that_is_known(
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         run(path, lambda _: patched.setattr(Path, "unlink", killed))
-    assert MARKER_FILE in contents(path)
+    assert DISCARDED_FILE in contents(path)
     run(path, anew=True)
     assert not path.exists()
 

@@ -1,5 +1,6 @@
 """Atomic files: whole or as before, with one hidden name that the next run uses again."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -42,6 +43,18 @@ def test_what_a_killed_run_left_is_written_over_by_the_next(tmp_path: Path) -> N
     write_bytes(tmp_path / "a", b"n")
     assert names(tmp_path) == ["a"]
     assert (tmp_path / "a").read_bytes() == b"n"
+
+
+def test_a_hidden_file_that_cannot_be_emptied_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(descriptor: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    write_bytes(tmp_path / "a", b"earlier")
+    monkeypatch.setattr(os, "ftruncate", refused)
+    with pytest.raises(InputError, match="no space left"):
+        write_bytes(tmp_path / "a", b"new")
+    assert names(tmp_path) == ["a"]
+    assert (tmp_path / "a").read_bytes() == b"earlier"
 
 
 def test_two_that_write_one_file_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:

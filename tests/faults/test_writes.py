@@ -14,6 +14,8 @@ from fault_runs import FULL, IO_ERROR, KILL, SHORT, SHORT_FULL, TEAR, Call, Faul
 
 QUICK = ("encode", "train", "reconstruct", "pack as npz", "score", "questions", "repair")
 """The ways in which commands write: folders, single files, folders of state that a run continues from, logs, copies."""
+ENDS = ("localize", "memory")
+"""Further commands, at fewer calls."""
 FAULTS = ((KILL, 2), (TEAR, 1), (FULL, 1), (SHORT_FULL, 1), (IO_ERROR, 1), (SHORT, 1))
 """How many calls have each fault."""
 
@@ -37,6 +39,17 @@ def test_no_fault_of_a_write_loses_anything_or_passes_for_a_result(
         torn = action in (TEAR, SHORT, SHORT_FULL)
         for number in sample(checker.reference.calls, str(tmp_path), count, rng, torn=torn):
             wrong += checker.check(number, action)
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_a_kill_at_the_first_the_last_or_another_write_loses_nothing(
+    name: str, server: FaultServer, tmp_path: Path
+) -> None:
+    checker = Checker(server, tmp_path, name)
+    last, between = len(checker.reference.calls), random.Random(name).randrange(2, len(checker.reference.calls))
+    wrong = [each for number in (1, between, last) for each in checker.check(number, KILL)]
+    wrong += checker.check(between, FULL)
     assert not wrong, "\n".join(wrong)
 
 

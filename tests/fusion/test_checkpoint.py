@@ -47,6 +47,19 @@ def test_maps_and_sums_come_back(tmp_path: Path) -> None:
     assert (sums[2] == 2).all()
 
 
+@pytest.mark.parametrize("name", [SUMS_FILE, "map_00000.safetensors"])
+def test_maps_and_sums_whose_settings_a_kill_removed_are_not_used(name: str, tmp_path: Path) -> None:
+    """The checkpoint of a finished fusion is being removed; the next one has other settings."""
+    work = tmp_path / "work"
+    a_map(work, {"a": 1})
+    FusionCheckpoint(work, {"a": 1}).save_sums(2, np.ones((5, 3), np.float32), np.full(5, 2, np.float32))
+    assert (work / name).is_file()
+    (work / SETTINGS_FILE).unlink()
+    again = FusionCheckpoint(work, {"a": 2})
+    assert not (work / name).exists()
+    assert again.load_sums(5, 3) is None
+
+
 def test_a_run_that_kept_nothing_leaves_no_folder_to_refuse_the_next(tmp_path: Path) -> None:
     FusionCheckpoint(tmp_path / "work", {"patch": 13})
     assert not (tmp_path / "work").exists()

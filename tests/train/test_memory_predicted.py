@@ -78,6 +78,27 @@ def test_a_folder_that_was_prepared_with_other_predictions_is_refused(tmp_path: 
             prepared(tmp_path / "made", other)
 
 
+def test_a_preparation_that_was_cut_off_is_not_continued_with_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Maps and a sample say nothing of what they were made from."""
+
+    def cut_off(*arguments: object, **settings: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("gsencoder.train.memory_scene.write_prepared", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            prepared(tmp_path / "made", predicted_features())
+    with pytest.raises(InputError, match="was begun with predicted=.*resume=false"):
+        prepared(tmp_path / "made", predicted_features(seed=1))
+    made = prepared(tmp_path / "made", predicted_features())
+    np.testing.assert_array_equal(made.fused_features().weights, predicted_features().weights)
+    (tmp_path / "earlier" / "maps").mkdir(parents=True)
+    with pytest.raises(InputError, match="holds parts of a preparation.*resume=false"):
+        prepared(tmp_path / "earlier", None)
+
+
 def test_predictions_of_another_space_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"the predicted features are of \(other.*, and the teacher's of \(hidden"):
         prepared(tmp_path, predicted_features("other"))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.runs.output_folder import refuse_existing
+from gsencoder.app.runs.output_file import refuse_existing, sole_writer
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
@@ -150,8 +150,6 @@ def run(config: ExportConfig, summary: Summary) -> None:
             f"{config.precision}, {len(model) / len(exact):.2f} of float32's size, mean centered cosine to it "
             f"{min(cosines.values()):.4f} or more"
         )
-    with summary.step("write"), atomic_file(config.out) as stream:
-        stream.write(model)
     sizes = {cloud.name: len(cloud.gaussians) for cloud in (*clouds, *scenes)}
     compared = [sizes[name] for name in cosines or parity]
     summary.results.update(
@@ -164,12 +162,16 @@ def run(config: ExportConfig, summary: Summary) -> None:
         gaussians=sizes,
         **space_figures(encoder),
     )
-    write_beside(config.out, summary)
-    if heads is None:
-        # Those of a file that was replaced.
-        heads_of_graph(config.out).unlink(missing_ok=True)
-    else:
-        copy_heads(heads, heads_of_graph(config.out), list(encoder.spaces.values()))
+    with sole_writer(config.out, overwrite=config.overwrite):
+        with summary.step("write"), atomic_file(config.out) as stream:
+            stream.write(model)
+        write_beside(config.out, summary)
+        if heads is None:
+            # Those of a file that was replaced.
+            heads_of_graph(config.out).unlink(missing_ok=True)
+        else:
+            copy_heads(heads, heads_of_graph(config.out), list(encoder.spaces.values()))
+    if heads is not None:
         screen.print(f"{heads_of_graph(config.out)}: the adapter heads that take its features; keep it beside the file")
     screen.print(
         f"{config.out}: {len(model) / 1e6:.1f} MB; {agreement} on {len(compared)} clouds of {min(compared):,} to "
@@ -188,10 +190,11 @@ def _export_memory(config: ExportConfig, out: Path, summary: Summary) -> None:
         memory = _memory_of(memories, config.space)
     with summary.step("export"):
         model = export_memory(memory)
-    with summary.step("write"), atomic_file(out) as stream:
-        stream.write(model)
     summary.results.update(onnx=str(out), bytes=len(model), components=len(memory.bank), space=memory.space.describe())
-    write_beside(out, summary)
+    with sole_writer(out, overwrite=config.overwrite):
+        with summary.step("write"), atomic_file(out) as stream:
+            stream.write(model)
+        write_beside(out, summary)
     console(config.quiet).print(
         f"{out}: {len(model) / 1e6:.1f} MB; features of {memory.space.channels} channels from queries of "
         f"{memory.channels}, by attention to {len(memory.bank):,} components"

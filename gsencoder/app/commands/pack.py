@@ -117,6 +117,11 @@ def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFe
         save_text_table(folder / WORDS_FILE, load_text_table(words), dtype="float16")
     elif words is not None:
         copyfile(words, folder / WORDS_FILE)
+        try:
+            # What was copied is looked at: the file may have been cut off meanwhile.
+            load_text_table(folder / WORDS_FILE)
+        except InputError as error:
+            raise InputError(str(error).replace(str(folder / WORDS_FILE), str(words))) from error
     if (source / HEADS_FILE).is_file():
         others = [each.space for each in scene.features.values() if each is not features]
         copy_heads(source / HEADS_FILE, folder / HEADS_FILE, [features.space], left_out=others)

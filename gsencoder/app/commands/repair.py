@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.app.runs.output_folder import refuse_existing
+from gsencoder.app.runs.output_file import refuse_existing, sole_writer
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
@@ -80,10 +80,11 @@ def run(config: RepairConfig, summary: Summary) -> None:
         gaussians = gaussians_from_raw(
             repaired, origin=origin, where=f"{config.paths[0]} after fix={','.join(config.fix)}"
         )
-    with summary.step("write"):
-        save_splat(config.out, gaussians, origin=origin)
-    summary.results.update(report.to_dict(), path=str(config.out))
-    write_beside(config.out, summary)
+    with sole_writer(config.out, overwrite=config.overwrite):
+        with summary.step("write"):
+            save_splat(config.out, gaussians, origin=origin)
+        summary.results.update(report.to_dict(), path=str(config.out))
+        write_beside(config.out, summary)
     screen = console(config.quiet)
     for change in report.changes:
         screen.print(f"{change.fix}: {change.count:,} rows {change.action}")
@@ -117,13 +118,14 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
         left = [finding for finding in findings_of(*checked) if finding.view is None]
         if left:
             raise InputError(f"{path}: still wrong once repaired: {left[0].message}; nothing was written")
-    with summary.step("write"):
-        write_json(config.out, content)
     before, after = fit_of(depth, matches), fit_of(*checked)
     summary.results.update(
         path=str(config.out), changes=list(repair.changes), agreement_before=before, agreement_after=after
     )
-    write_beside(config.out, summary)
+    with sole_writer(config.out, overwrite=config.overwrite):
+        with summary.step("write"):
+            write_json(config.out, content)
+        write_beside(config.out, summary)
     for change in repair.changes:
         screen.print(change, highlight=False)
     outside = (

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsencoder.app.commands.query_words import asked_scene
 from gsencoder.app.commands.words_options import WordsOptions
-from gsencoder.app.runs.output_folder import refuse_existing
+from gsencoder.app.runs.output_file import refuse_existing, sole_writer
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
@@ -192,18 +192,19 @@ def _write(
             max_gaussians=config.max_gaussians,
             max_bytes=int(config.megabytes * 1e6),
         )
-    with summary.step("write"), atomic_file(out) as stream:
-        stream.write(made.page)
-    summary.results.update(
-        page=str(out),
-        bytes=len(made.page),
-        gaussians=made.gaussians,
-        sh_degree=made.sh_degree,
-        photographs=made.photographs,
-        feature_error=made.feature_error,
-        left_out=list(made.notes),
-    )
-    write_beside(out, summary)
+    with sole_writer(out, overwrite=config.overwrite):
+        with summary.step("write"), atomic_file(out) as stream:
+            stream.write(made.page)
+        summary.results.update(
+            page=str(out),
+            bytes=len(made.page),
+            gaussians=made.gaussians,
+            sh_degree=made.sh_degree,
+            photographs=made.photographs,
+            feature_error=made.feature_error,
+            left_out=list(made.notes),
+        )
+        write_beside(out, summary)
     screen = console(config.quiet)
     for note in made.notes:
         screen.print(note)

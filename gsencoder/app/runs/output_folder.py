@@ -77,14 +77,15 @@ def _begin(path: str | Path, target: Path, overwrite: bool) -> tuple[Path, int |
 
     Raises:
         BlockingIOError: another run is writing `target`.
-        InputError: earlier results are there again, and are not to be replaced.
+        InputError: results are there by now, and are not to be replaced.
     """
     parent_lock = lock_folder(target.parent, wait=True)
     try:
         if _remove_stale(target):
             raise BlockingIOError
-        if _put_back(target):
-            _check_target(path, target, overwrite)
+        _put_back(target)
+        # Another run may have written the folder since it was looked at.
+        _check_target(path, target, overwrite)
         partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
         partial.mkdir()
         return partial, lock_folder(partial)
@@ -113,18 +114,6 @@ def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
         )
     if not overwrite:
         raise InputError(f"{path}: holds the results of an earlier run; give another out= or overwrite=true")
-
-
-def refuse_existing(path: str | Path, overwrite: bool) -> None:
-    """Checks, for commands whose result is one file, that it does not exist or may be replaced.
-
-    Raises:
-        InputError: it exists.
-    """
-    if os.path.isdir(path):
-        raise InputError(f"{path}: is a folder; give the name of a file to write")
-    if os.path.lexists(path) and not overwrite:
-        raise InputError(f"{path}: exists; give another out= or overwrite=true")
 
 
 def refuse_to_replace_inputs(out: Path | None, given: Mapping[str, Any]) -> None:
@@ -233,17 +222,15 @@ def _aside(target: Path) -> Path:
     return target.parent / f".{_short(target.name)}.earlier"
 
 
-def _put_back(target: Path) -> bool:
-    """Gives earlier results their name back that a run was replacing when it was killed; returns whether there were
-    such."""
+def _put_back(target: Path) -> None:
+    """Gives earlier results their name back that a run was replacing when it was killed."""
     aside = _aside(target)
     if not aside.is_dir():
-        return False
+        return
     if os.path.lexists(target):
         shutil.rmtree(aside, ignore_errors=True)
-        return False
-    os.rename(aside, target)
-    return True
+    else:
+        os.rename(aside, target)
 
 
 def _exchange(first: Path, second: Path) -> bool:

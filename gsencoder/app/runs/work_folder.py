@@ -3,13 +3,15 @@
 import os
 import re
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import atomic_file, lock_folder
 
-MARKER_FILE = "unfinished.txt"
+MARKER_FILE, DISCARDED_FILE = "unfinished.txt", "discarded.txt"
+"""The marker of a state that can be continued, and its name while the state is removed."""
 _PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "([0-9a-f]+[.])?tmp")
 
 
@@ -44,7 +46,9 @@ class WorkFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             names = [entry.name for entry in self.path.iterdir()]
             # A run that was killed at its start may have left an incomplete marker file alone.
-            if MARKER_FILE not in names and not all(_PARTIAL_MARKER.fullmatch(name) for name in names):
+            if not {MARKER_FILE, DISCARDED_FILE} & {*names} and not all(
+                _PARTIAL_MARKER.fullmatch(name) for name in names
+            ):
                 raise InputError(
                     f"{self.path}: this run would save its state here, and the folder holds something else "
                     f"(no {MARKER_FILE}); give another out="
@@ -55,10 +59,13 @@ class WorkFolder:
                 raise BusyError(
                     f"{self.path}: another run saves its state here now; wait for it or give another out="
                 ) from None
-            if anew:
-                self._empty()
+            stale = anew or DISCARDED_FILE in names
+            if stale:
+                self._discard()
             with atomic_file(self.path / MARKER_FILE) as stream:
                 stream.write(b"The state of a run that is not finished, which removes this folder.\n")
+            if stale:
+                (self.path / DISCARDED_FILE).unlink(missing_ok=True)
         except OSError as error:
             self._release()
             raise InputError(
@@ -69,10 +76,13 @@ class WorkFolder:
             raise
         self._taken = True
 
-    def _empty(self) -> None:
-        """Removes everything except the marker, so that after a kill the folder is still recognized."""
+    def _discard(self) -> None:
+        """Removes everything but a marker of another name: the next run removes what a kill leaves of the state, and
+        does not continue from a part of it."""
+        with suppress(FileNotFoundError):
+            os.replace(self.path / MARKER_FILE, self.path / DISCARDED_FILE)
         for entry in self.path.iterdir():
-            if entry.name != MARKER_FILE:
+            if entry.name != DISCARDED_FILE:
                 if entry.is_dir() and not entry.is_symlink():
                     shutil.rmtree(entry)
                 else:
@@ -91,8 +101,8 @@ class WorkFolder:
     ) -> None:
         try:
             if kind is None and self._taken:
-                self._empty()
-                (self.path / MARKER_FILE).unlink(missing_ok=True)
+                self._discard()
+                (self.path / DISCARDED_FILE).unlink(missing_ok=True)
                 self.path.rmdir()
             elif error is not None and self._taken and any(each.name != MARKER_FILE for each in self.path.iterdir()):
                 error.add_note(

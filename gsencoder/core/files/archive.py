@@ -7,11 +7,12 @@ when it is read. Files of version 1 have none, and are read with a warning.
 
 import hashlib
 import json
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.checksums import block_checksums, bytes_of, damaged_blocks, file_digest
 from gsencoder.core.files.model_files import check_fetched
+from gsencoder.core.files.safetensors_bytes import array_offsets, read_bytes
 
 VERSION = 2
 WITHOUT_CHECKSUMS = 1
@@ -62,10 +64,11 @@ class Archive:
         sizes: values of the letters in shapes, as set by the arrays that were read so far.
     """
 
-    def __init__(self, path: Path, file: Any, header: dict[str, Any]) -> None:
+    def __init__(self, path: Path, file: Any, stream: BinaryIO, header: dict[str, Any]) -> None:
         """Args:
         path: of the file.
-        file: the file, opened by safetensors.
+        file: the file, opened by safetensors, for names, types and shapes.
+        stream: the file, from which arrays are read.
         header: its JSON header.
 
         Raises:
@@ -73,6 +76,7 @@ class Archive:
         """
         self.path, self.sizes = path, dict[str, int]()
         self._file, self._header, self._names = file, header, frozenset(file.keys())
+        self._stream, self._offsets = stream, array_offsets(stream)
         version = header.get("version")
         self.checksums: Mapping[str, str] | None = None
         if type(version) is int and version == WITHOUT_CHECKSUMS and not {"checksums", "digest"} & set(header):
@@ -126,10 +130,22 @@ class Archive:
         return shape
 
     def _read(self, name: str) -> np.ndarray:
-        values: np.ndarray = self._file.get_tensor(name)
+        values = self._values(name)
         if self.checksums is not None and damaged_blocks(bytes_of(values), self.checksums[name]):
             raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
         return values
+
+    def _values(self, name: str) -> np.ndarray:
+        # Not through the memory map of safetensors, which ends the process where the file is cut off meanwhile.
+        dtype, shape = self._stored(name)
+        if dtype not in DTYPES.values():
+            raise InputError(
+                f"{self.path}: {name} is of the type {dtype}, expected one of {', '.join(DTYPES.values())}"
+            )
+        data = read_bytes(self._stream, self._offsets.get(name, (0, 0)))
+        if len(data) != np.dtype(dtype).itemsize * math.prod(shape):
+            raise InputError(f"{self.path}: was cut off or replaced while {name} was read; give the command again")
+        return data.view(dtype).reshape(shape)
 
     def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
         """Type and shape of an array according to the file."""
@@ -165,7 +181,7 @@ class Archive:
             for name in sorted(self._names):
                 self._read(name)
             return
-        arrays = {name: self._file.get_tensor(name) for name in self._names}
+        arrays = {name: self._values(name) for name in self._names}
         header = {key: value for key, value in self._header.items() if key not in ("version", "sum")}
         if self.value("sum", str) != _sum_of_version_1(arrays, header):
             raise InputError(f"{self.path}: {DAMAGED}: it does not have the checksum that was written with it")
@@ -287,11 +303,11 @@ def open_archive(path: Path) -> Iterator[Archive]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected one that gsencoder wrote")
     try:
-        with about(path), safe_open(path, framework="numpy") as file:
+        with about(path), path.open("rb", buffering=0) as stream, safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
             if not isinstance(header, dict):
                 raise InputError(f"{path}: expected version {VERSION} of the format, got none")
-            yield Archive(path, file, header)
+            yield Archive(path, file, stream, header)
     except InputError:
         raise
     except (SafetensorError, OSError, ValueError, RecursionError) as error:

@@ -127,7 +127,11 @@ def _locked_file(path: Path) -> int | None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         # The run that had it may have renamed it before it released the lock.
         if _is_file_of(path, descriptor):
-            os.ftruncate(descriptor, 0)
+            try:
+                os.ftruncate(descriptor, 0)
+            except OSError:
+                path.unlink(missing_ok=True)
+                raise
             return descriptor
     except OSError as error:
         if error.errno not in (errno.EAGAIN, errno.EACCES, errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL):

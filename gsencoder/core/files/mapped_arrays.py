@@ -1,6 +1,8 @@
 """Memory-mapped arrays of an archive: only the blocks that are used are read, and processes share them."""
 
 import json
+import mmap
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,6 +17,9 @@ from gsencoder.core.files.checksums import BLOCK_BYTES, damaged_blocks
 class MappedArrays:
     """Read-only arrays of a file. A block is verified against its checksum when it is first used, and not again; values
     are not validated otherwise. Files of version 1 have no checksums, and are read as they are.
+
+    The system ends a process that reads a page of the map beyond the end of the file (SIGBUS). So the size of the file
+    is compared whenever an array is asked for, which leaves the moment in which its values are used.
     """
 
     def __init__(self, path: Path, types: Mapping[str, tuple[str, int]], earlier: "MappedArrays | None" = None) -> None:
@@ -33,9 +38,12 @@ class MappedArrays:
         with open_archive(path) as file:
             shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in types.items()}
             self._checksums = file.checksums
-        state = path.stat()
+        with path.open("rb") as stream:
+            state = os.fstat(stream.fileno())
+            self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self._stamp = (state.st_ino, state.st_size, state.st_mtime_ns)
-        raw = np.memmap(path, dtype=np.uint8, mode="r")
+        self._check_size()
+        raw = np.frombuffer(self._map, np.uint8)
         begin = 8 + int.from_bytes(raw[:8].tobytes(), "little")
         entries = json.loads(raw[8:begin].tobytes())
         self._bytes: dict[str, UInt8[np.ndarray, " bytes"]] = {}
@@ -64,8 +72,9 @@ class MappedArrays:
         """A complete array, verified; a view of the map.
 
         Raises:
-            InputError: the file is damaged.
+            InputError: the file is damaged, or was cut off.
         """
+        self._check_size()
         if name in self._unchecked:
             self._check(name, np.flatnonzero(self._unchecked[name]))
         return self._arrays[name]
@@ -78,8 +87,9 @@ class MappedArrays:
             rows: indices.
 
         Raises:
-            InputError: these rows are damaged.
+            InputError: these rows are damaged, or the file was cut off.
         """
+        self._check_size()
         array = self._arrays[name]
         if name in self._unchecked and len(rows):
             size = array.dtype.itemsize * int(np.prod(array.shape[1:]))
@@ -96,14 +106,22 @@ class MappedArrays:
         """Rows `first` to `last`, exclusive, of an array; a view of the map.
 
         Raises:
-            InputError: these rows are damaged.
+            InputError: these rows are damaged, or the file was cut off.
         """
+        self._check_size()
         array = self._arrays[name]
         if name in self._unchecked and last > first:
             size = array.dtype.itemsize * int(np.prod(array.shape[1:]))
             blocks = np.arange(first * size // BLOCK_BYTES, -(-last * size // BLOCK_BYTES))
             self._check(name, blocks[self._unchecked[name][blocks]])
         return array[first:last]
+
+    def _check_size(self) -> None:
+        _, written, _ = self._stamp
+        if (now := self._map.size()) < written:
+            raise InputError(
+                f"{self.path}: was cut off while it was in use: {now:,} of {written:,} bytes are left; write it again"
+            )
 
     def _check(self, name: str, blocks: Int64[np.ndarray, " n"]) -> None:
         assert self._checksums is not None

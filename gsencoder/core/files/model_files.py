@@ -2,6 +2,8 @@
 
 import hashlib
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
@@ -12,13 +14,26 @@ POINTER = b"version https://git-lfs"
 """What files begin with that stand for large ones in a repository."""
 
 
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turns an error of the system in the block into one that names the file: an error of reading does not.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
 def check_fetched(path: Path) -> None:
     """Checks that a file is not the pointer that git keeps in the place of a large one.
 
     Raises:
-        InputError: it is.
+        InputError: it is, or cannot be read.
     """
-    with path.open("rb") as stream:
+    with readable(path), path.open("rb") as stream:
         if stream.read(len(POINTER)) == POINTER:
             raise InputError(f"{path}: is a pointer of git-lfs and not the file itself; fetch it with git lfs pull")
 
@@ -46,10 +61,14 @@ def find_file(name: str, option: str, *, folder: bool = False) -> Path:
 
 
 def digest_files(*files: Path, settings: object = None) -> str:
-    """A fingerprint of the contents of files, in this order, and of settings; 16 hexadecimal digits."""
+    """A fingerprint of the contents of files, in this order, and of settings; 16 hexadecimal digits.
+
+    Raises:
+        InputError: one cannot be read.
+    """
     digest = hashlib.sha256(b"" if settings is None else repr(settings).encode("utf-8", "backslashreplace"))
     for path in files:
-        with path.open("rb") as stream:
+        with readable(path), path.open("rb") as stream:
             while block := stream.read(BLOCK_BYTES):
                 digest.update(block)
     return digest.hexdigest()[:16]

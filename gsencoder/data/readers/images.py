@@ -94,10 +94,24 @@ def check_picture(path: Path) -> None:
         _decode(path, picture)
 
 
-def load_npy(path: Path) -> np.ndarray:
-    """Maps a .npy file, so that its header is checked before its values are read."""
+def load_npy(path: Path, *, header_only: bool = False) -> np.ndarray:
+    """The array of a .npy file; its header is checked before its values are read.
+
+    Args:
+        path: the file.
+        header_only: whether to leave the values unread, for the shape and the type. Those of a file that is cut off
+            afterwards must not be touched: the system would end the process.
+
+    Raises:
+        InputError: unreadable, no array of numbers [H, W], too large, or cut off.
+    """
+    values = _checked_npy(path, "r")
+    return values if header_only else _checked_npy(path, None)
+
+
+def _checked_npy(path: Path, mapped: Literal["r"] | None) -> np.ndarray:
     try:
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
+        values = np.load(path, mmap_mode=mapped, allow_pickle=False)
     except Exception as error:
         raise InputError(f"{path}: not a readable .npy array ({_brief(error)})") from error
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
@@ -117,7 +131,7 @@ def picture_size(path: Path) -> tuple[int, int]:
         InputError: unreadable, or more than `PIXEL_LIMIT` pixels.
     """
     if path.suffix.lower() == ".npy":
-        height, width = load_npy(path).shape
+        height, width = load_npy(path, header_only=True).shape
         return width, height
     with _open(path) as picture:
         return picture.size
@@ -365,9 +379,9 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
         if path is None:
             return np.zeros((grid.height, grid.width), np.float32)
         if path.suffix.lower() == ".npy":
-            mapped = load_npy(path)
+            read = load_npy(path)
             with np.errstate(over="ignore"):
-                values = np.where(np.isfinite(mapped), mapped, 0).astype(np.float64)
+                values = np.where(np.isfinite(read), read, 0).astype(np.float64)
             if values.size and values.min() < 0:
                 raise InputError(f"{path}: depth has negative values")
         else:

@@ -52,6 +52,12 @@ def copy_heads(
         copyfile(source, target)
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror or error}") from error
+    try:
+        # What was copied is looked at: the file may have been cut off meanwhile.
+        with open_archive(target) as file:
+            file.verify()
+    except InputError as error:
+        raise InputError(str(error).replace(str(target), str(source))) from error
 
 
 def read_heads_space(file: Archive) -> FeatureSpace:
