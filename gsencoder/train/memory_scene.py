@@ -175,8 +175,8 @@ def _begin(folder: Path, made_with: Mapping[str, Any]) -> None:
             write_json(path, made_with)
             return
         try:
-            stored = json.loads(path.read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
+            stored = with_added_options(json.loads(path.read_bytes()))
+        except (OSError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: cannot be read ({type(error).__name__})") from error
         if stored != made_with:
             raise InputError(f"{folder}: was begun with {first_difference(stored, made_with)}")
