@@ -55,6 +55,7 @@ def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, flo
     """
     promised = {name: budget.promise(name) for name in budget.given}
     summary.results["budget"].update(promised=promised, realised=dict(realised))
+    predicted = "; the summary says what was predicted" if summary.results["budget"]["predicted"] else ""
     lines = []
     for name, promise in promised.items():
         if name not in realised:
@@ -63,8 +64,7 @@ def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, flo
         lines.append(f"budget.{name}: promised {shown_value(promise)}, realised {realised[name]:.4g}")
         if realised[name] > promise:
             warnings.warn(
-                f"budget.{name}: promised {shown_value(promise)}, and it became {realised[name]:.4g}; the summary says "
-                "what was predicted",
+                f"budget.{name}: promised {shown_value(promise)}, and it became {realised[name]:.4g}{predicted}",
                 SceneWarning,
                 stacklevel=3,
             )
