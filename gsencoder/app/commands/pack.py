@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from shutil import copyfile
 
@@ -168,9 +169,10 @@ def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, confi
 
 def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
     if config.budget.given:
-        made = index_within(features, config.budget, lambda rows: index_bytes(scene, features, rows))
+        made, error = index_within(features, config.budget, partial(index_bytes, scene, features))
     else:
         made = index_features(features, config.index)
+        error = made.error
     save_index_package(folder, scene, made.features, error=made.error)
     rows, size = len(made.features.features), (folder / PACKAGE_FILE).stat().st_size
     summary.results.update(
@@ -182,7 +184,7 @@ def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config:
         lowest=made.lowest,
         share_of_float16=size / (2 * features.space.channels * len(features)),
     )
-    _report(scene, {"rows": rows, "threshold": made.threshold}, made.error, size, config, summary)
+    _report(scene, {"rows": rows, "threshold": made.threshold}, error, size, config, summary)
     return (
         f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB: the "
         f"number of one of {rows:,} rows in {'one byte' if rows < 256 else 'two bytes'}; centered cosines lose "

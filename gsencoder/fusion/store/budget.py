@@ -15,8 +15,8 @@ class PackBudget(Budget):
     error: float | None = field(
         default=None,
         metadata={
-            "help": "largest mean of 1 − centered cosine to the features that are packed, over Gaussians, and for "
-            "form=compact over kinds of features as well; without a budget 0.01 for form=compact"
+            "help": "largest mean of 1 − centered cosine to the features that are packed, over Gaussians and over "
+            "kinds of features; without a budget 0.01 for form=compact"
         },
     )
     megabytes: float | None = field(

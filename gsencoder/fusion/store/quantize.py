@@ -226,7 +226,7 @@ def _allocation(
     centered, norms = centered[norms > 0], norms[norms > 0]
     if not len(norms):
         raise InputError("compact: all features are the space's mean, which no direction tells from one another")
-    rarity = _rarity(centered, norms)
+    rarity = rarity_of(centered, norms)
     # A cosine weighs an error by what it is an error of.
     row_weight = rarity / np.maximum(norms, 1e-6 * float(norms.max())) ** 2
     _, vectors = np.linalg.eigh((centered * row_weight[:, None]).T @ centered)
@@ -239,7 +239,7 @@ def _centered(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarra
     return values if features.basis is not None else values - features.mean
 
 
-def _rarity(centered: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+def rarity_of(centered: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """1 over the number of rows that point the same way, which adds up to one for each kind of feature."""
     units = (centered / norms[:, None]).astype(np.float32)
     counts_alike = [
