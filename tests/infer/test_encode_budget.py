@@ -16,6 +16,7 @@ from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.store.folder import features_bytes, load_features, save_features
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
 from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.encode_budget import encode_within as encode_within_module
 from gsencoder.infer.encode_budget.config import EncodeBudget, check_encode_budget, exact_encoding
 from gsencoder.infer.encode_budget.encode_within import BudgetEncoding, encode_within
 from gsencoder.infer.encode_budget.principal_axes import principal_axes
@@ -35,7 +36,8 @@ def gaussians() -> Gaussians:
 
 @pytest.fixture
 def encoder(weights: Path, monkeypatch: pytest.MonkeyPatch) -> TorchEncoder:
-    """With bfloat16 among its precisions on every machine."""
+    """With bfloat16 among its precisions on every machine, and small scenes chosen for as large ones are."""
+    monkeypatch.setattr(encode_within_module, "SMALL_SCENE", 0)
     monkeypatch.setattr(TorchEncoder, "precisions", lambda *_: ("float32", "bfloat16"))
     return TorchEncoder(str(weights))
 
@@ -164,6 +166,14 @@ def test_what_axes_leave_out_is_what_is_measured(gaussians: Gaussians, encoder: 
         assert error == pytest.approx(axes.left_out(rank), abs=2e-6)
         assert axes.rank_within(axes.left_out(rank) + 1e-9) == rank
     assert axes.left_out(4) < 1e-6
+
+
+def test_a_small_scene_is_encoded_exactly_without_a_choice(
+    gaussians: Gaussians, encoder: TorchEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encode_within_module, "SMALL_SCENE", len(gaussians) + 1)
+    made = within(gaussians, encoder, EncodeConfig(), error=0.5)
+    assert (made.sampled, made.setting.config) == (0, made.exact)
 
 
 @pytest.mark.parametrize("change", [{"halo": 0.3}, {"precision": "float32"}])

@@ -27,6 +27,8 @@ EXPONENT = 0.8
 """Seconds of a chunk grow with its Gaussians to this power: measured from 7,000 to 216,000 on one thread."""
 COSTS = {"auto": 1.0, "float32": 1.0, "bfloat16": 0.55}
 """Of precisions. Stated and not measured, so that one scene makes one choice, on a busy machine too."""
+SMALL_SCENE = 20_000
+"""Scenes of fewer Gaussians that are not cut are encoded exactly: choosing would cost more than it saves."""
 SAFETY, DEVIATIONS = 1.5, 2.0
 """A predicted error counts so many times, and with so many of its standard errors."""
 PLANNED = 0.85
@@ -151,9 +153,11 @@ def all_settings(
 ) -> tuple[list[Setting], int]:
     """All settings, the exact one first, and the number of Gaussians that were encoded to predict them."""
     is_cut = bool(exact.chunk) and len(gaussians) > exact.chunk
-    precisions = encoder.precisions(exact.device)
+    precisions, timed = encoder.precisions(exact.device), budget.seconds is not None
+    if len(gaussians) < SMALL_SCENE and not is_cut and not timed:
+        precisions = precisions[:1]
     parts: list[Measured] = []
-    if is_cut or len(precisions) > 1 or budget.seconds is not None:
+    if is_cut or len(precisions) > 1 or timed:
         parts = measure_parts(
             gaussians,
             encoder,
@@ -162,6 +166,7 @@ def all_settings(
             is_cut=is_cut,
             metres_per_unit=metres_per_unit,
             seed=budget.seed,
+            timed=timed,
             clock=clock,
         )
     settings = []

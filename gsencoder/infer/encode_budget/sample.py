@@ -63,6 +63,7 @@ def measure_parts(
     is_cut: bool,
     metres_per_unit: float,
     seed: int,
+    timed: bool = True,
     clock: Callable[[], float] = time.perf_counter,
 ) -> list[Measured]:
     """Encodes parts of a scene in each precision, and in halves where the scene is cut into chunks.
@@ -75,10 +76,11 @@ def measure_parts(
         is_cut: whether the scene has several chunks.
         metres_per_unit: see `Encoder.encode`.
         seed: of the parts.
+        timed: whether seconds matter.
         clock: seconds.
     """
     rng = np.random.default_rng(seed)
-    for precision in precisions:
+    for precision in precisions if timed else ():
         # The first pass of a process loads kernels, which no later one pays for.
         first = gaussians.select(np.arange(min(WARM_ROWS, len(gaussians))))
         encoder.encode_spaces(first, replace(config, chunk=0, precision=precision), metres_per_unit=metres_per_unit)
