@@ -9,8 +9,8 @@ while choosing are used by the fusion and count to that. `cpu_exact` counts ever
 the mean of the others.
 
 --grid measures every combination of numbers of views (in the order of the choice), rays, their ends and ranks, or
-smallest weights where the teacher has few channels: the cheapest one that keeps the promise is to be held against the
-choice.
+smallest weights where the teacher has few channels, after the choice itself: the cheapest one that keeps the promise,
+maps included, is to be held against the choice.
 """
 
 import argparse
@@ -101,6 +101,7 @@ def measured(scene: Scene, teacher: Teacher, error: float, maps: Path) -> tuple[
         "choosing_of_exact": choosing / cpu_exact,
         "rays_followed": made.choice.followed / made.choice.all_rays,
         "scatter": made.choice.scatter,
+        "map_seconds": counted.seconds / max(counted.made, 1),
     }
     return line, made, exact
 
@@ -110,25 +111,28 @@ def sum_of_maps(made: BudgetFusion, counted: CountedTeacher) -> float:
     return len(made.choice.maps) * counted.seconds / max(counted.made, 1)
 
 
-def grid(made: BudgetFusion, exact: GaussianFeatures, error: float) -> Iterator[dict[str, Any]]:
-    """CPU seconds and error of every combination; maps are made before and count nothing."""
-    count = len(made.scene.views or ())
-    numbers = sorted({max(1, round(count * share)) for share in np.linspace(0.1, 1, 10)} | {len(made.choice.rows)})
+def grid(made: BudgetFusion, exact: GaussianFeatures, error: float, map_seconds: float) -> Iterator[dict[str, Any]]:
+    """CPU seconds and error of every combination, the choice first. Maps are made before and count for what they cost
+    on average."""
+    count, chosen = len(made.scene.views or ()), made.choice
     few = made.fusion.features.basis is None
-    rays = sorted({1, 4, 16, made.choice.config.blend.rays_per_patch})
-    ends, fourth = (1e-6, 1e-4, 1e-3, 1e-2, 0.1), (0.0, 1e-4, 1e-3, 1e-2) if few else (16, 32, 64, 0)
-    ready = made.teacher
-    for number, side, stop, last in product(numbers, rays, ends, fourth):
+    numbers = sorted({max(1, round(count * share)) for share in np.linspace(0.15, 1, 7)})
+    exact_rays = chosen.config.blend.rays_per_patch
+    rays, ends = sorted({1, 4, 16, exact_rays}), (1e-6, 1e-3, 1e-2)
+    fourth = (0.0, 1e-4, 1e-3, 1e-2) if few else (16, 32, 64, 0)
+    ours = (len(chosen.rows), exact_rays, chosen.config.blend.stop_transmittance)
+    last_of_ours = chosen.config.blend.min_weight if few else chosen.config.max_rank
+    for number, side, stop, last in ((*ours, last_of_ours), *product(numbers, rays, ends, fourth)):
         base = FuseConfig()
         blend = replace(base.blend, rays_per_patch=side, stop_transmittance=stop)
         config = replace(base, blend=replace(blend, min_weight=last)) if few else replace(base, blend=blend, energy=1.0)
         config = config if few else replace(config, max_rank=int(last))
         start = time.process_time()
-        features = fuse(made.scene, ready, config, rows=sorted(made.choice.order[:number])).features
+        features = fuse(made.scene, made.teacher, config, rows=sorted(chosen.order[:number])).features
         cpu = time.process_time() - start
         total = judge(features, exact).total
         setting = {"views": number, "rays": side, "stop": stop, "fourth": last}
-        yield {**setting, "cpu": cpu, "error": total, "kept": total <= error}
+        yield {**setting, "cpu": cpu, "cpu_maps": number * map_seconds, "error": total, "kept": total <= error}
 
 
 def main() -> None:
@@ -152,7 +156,7 @@ def main() -> None:
                         scene, teacher, chosen.error, Path(maps)
                     )  # Kernels are compiled, or read from their cache.
                 line, made, exact = measured(scene, teacher, chosen.error, Path(maps))
-                lines = [line] if not chosen.grid else grid(made, exact, chosen.error)
+                lines = [line] if not chosen.grid else grid(made, exact, chosen.error, line["map_seconds"])
                 for each in lines:
                     if writer is None:
                         writer = csv.DictWriter(file, list(each))

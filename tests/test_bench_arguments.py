@@ -3,6 +3,7 @@
 import json
 import runpy
 import sys
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,15 @@ def refusal(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], 
     lines = [line for line in capfd.readouterr().err.splitlines() if "error: " in line]
     assert len(lines) == 1
     return lines[0]
+
+
+def test_no_script_of_bench_hides_a_module_of_python_or_of_a_package() -> None:
+    """Python looks for imports beside the script first."""
+    names = {path.stem for path in BENCH.glob("*.py")}
+    assert not names & set(sys.stdlib_module_names)
+    path = [folder for folder in sys.path if folder != str(BENCH)]
+    specs = {name: PathFinder.find_spec(name, path) for name in names}
+    assert [name for name, spec in specs.items() if spec is not None and spec.origin is not None] == []
 
 
 def test_rooms_are_copied_without_a_kind_and_never_over_others(

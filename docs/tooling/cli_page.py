@@ -52,6 +52,7 @@ REST = """\
 | 1 | a bug of gsencoder, with its traceback |
 | 2 | wrong input, a missing file or a full disk: one line on standard error says what was wrong and what to do |
 | 130, 143 | interrupted (Ctrl-C), terminated |
+| 128 + n | ended by the system with signal n, such as 137 (killed, often because memory is full) or 135 (a bus error: a file that was mapped into memory was cut off, or its disk failed); where the system leaves time for it, standard error has the place |
 
 Results go to standard output, warnings and errors to standard error.
 

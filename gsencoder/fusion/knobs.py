@@ -9,6 +9,7 @@ from gsencoder.fusion.store.package import Form
 FUSION_KNOBS = (
     Knob(name="view_share", key="view_share", values=(0.17, 0.33, 0.5, 0.67), exact=1.0),
     Knob(name="views", key="views", values=(4, 8, 16), exact=0),
+    Knob(name="view_choice", key="view_choice", values=("coverage",), needs={"view_share": 0.5}),
     Knob(name="rays_per_patch", key="blend.rays_per_patch", values=(1, 4, 9, 16, 36), exact=196),
     Knob(name="min_weight", key="blend.min_weight", values=(1e-4, 1e-3, 1e-2), exact=0.0),
     Knob(name="stop_transmittance", key="blend.stop_transmittance", values=(1e-3, 1e-2, 0.1), exact=1e-6),

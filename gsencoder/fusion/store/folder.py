@@ -18,6 +18,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import LONGEST_NUMBER, Archive, archive_bytes, open_archive, write_archive
+from gsencoder.core.row_numbers import rise_within
 from gsencoder.core.runtime.threads import parallel
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint
@@ -255,7 +256,7 @@ def _load_rows(folder: Path, name: str, gaussians: Gaussians) -> GaussianFeature
     with _open(folder, name) as file:
         check_splat(file, gaussians, "fuse or encode this splat again")
         rows, n = file.array("rows", "int32", ("n",)), len(gaussians)
-        if len(rows) and (rows[0] < 0 or rows[-1] >= n or (np.diff(rows) <= 0).any()):
+        if not rise_within(rows, n):
             raise InputError(f"expected row numbers that rise from 0 to at most {n - 1}")
         scale = file.array("channel_scale", "float32", ("R",))
         seen = file.array("weights", "float32", ("n",))

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import Archive, write_archive
+from gsencoder.core.row_numbers import rise_within
 from gsencoder.data.archive_records import (
     bank_parts,
     check_splat,
@@ -69,7 +70,7 @@ def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
     check_splat(file, gaussians, "make the memory of this splat again")
     space, mean, basis = read_space(file)
     rows, count = file.array("rows", "int32", ("n",)), len(gaussians)
-    if len(rows) and (rows[0] < 0 or rows[-1] >= count or (np.diff(rows) <= 0).any()):
+    if not rise_within(rows, count):
         raise InputError(f"expected row numbers that rise from 0 to at most {count - 1}")
     seen = file.array("weights", "float32", (len(rows),))
     if (seen <= 0).any():

@@ -20,6 +20,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.knobs import shown_value
 from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.row_numbers import rise_within
 from gsencoder.fusion.store.bit_allocation import MAX_BITS, BitAllocation, cosines_of, nearest_level
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
@@ -84,7 +85,7 @@ class CompactFeatures:
                 f"CompactFeatures: {len(self.rows)} seen rows, {len(self.codes)} codes and {len(self.weight_codes)} "
                 "weights; expected as many of each"
             )
-        if self.rows[0] < 0 or self.rows[-1] >= self.total or (np.diff(self.rows) <= 0).any():
+        if not rise_within(self.rows, self.total):
             raise InputError(f"CompactFeatures: expected rows that rise from 0 to at most {self.total - 1}")
         tiny, largest = np.finfo(np.float32).tiny, np.finfo(np.float32).max
         if not tiny <= self.lightest <= self.heaviest <= largest or not 0 <= self.error <= 2:

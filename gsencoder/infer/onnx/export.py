@@ -24,6 +24,8 @@ from gsencoder.types import Gaussians
 
 TOLERANCE = 1e-4
 """Largest difference from torch, as a share of the largest output."""
+KNOWN_TORCH = "2.13"
+"""The earliest release whose exporter translates encoders: 2.11 fails on slices whose sizes follow from data."""
 COSINE = 0.99
 """Smallest mean centered cosine of a cheaper precision's features to float32's."""
 
@@ -53,7 +55,7 @@ def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
         half: compute in float16 once Gaussians have been merged into tokens.
 
     Raises:
-        InputError: onnx or onnxscript is missing.
+        InputError: onnx or onnxscript is missing, or torch is too old to export this network.
     """
     try:
         import onnx  # noqa: F401
@@ -70,21 +72,29 @@ def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
     voxel, corner, starts = (torch.from_numpy(value) for value in _settings(header).values())
     sizes = (*({0: clouds} for _ in FIELDS), {}, {}, {1: patches})
     with torch.no_grad(), _quiet():
-        program = torch.export.export(
-            RawEncoder(network, header.outputs).eval(),
-            (*example, voxel, corner, starts.repeat(1, 5)),
-            dynamic_shapes=sizes,
-        )
-        exported = torch.onnx.export(
-            program,
-            dynamo=True,
-            opset_version=OPSET,
-            custom_translation_table=TRANSLATIONS,
-            input_names=[*FIELDS, *SETTINGS],
-            output_names=[OUTPUT],
-            optimize=False,
-            verbose=False,
-        )
+        try:
+            program = torch.export.export(
+                RawEncoder(network, header.outputs).eval(),
+                (*example, voxel, corner, starts.repeat(1, 5)),
+                dynamic_shapes=sizes,
+            )
+            exported = torch.onnx.export(
+                program,
+                dynamo=True,
+                opset_version=OPSET,
+                custom_translation_table=TRANSLATIONS,
+                input_names=[*FIELDS, *SETTINGS],
+                output_names=[OUTPUT],
+                optimize=False,
+                verbose=False,
+            )
+        except Exception as error:  # the exporter raises its own classes, and whatever its passes stumble over
+            if torch.__version__ >= KNOWN_TORCH:
+                raise
+            raise InputError(
+                f"the exporter of torch {torch.__version__} cannot translate this encoder ({type(error).__name__}); "
+                f"export with torch {KNOWN_TORCH} or later, the file runs anywhere"
+            ) from error
     assert exported is not None
     return simplified(exported.model)
 
