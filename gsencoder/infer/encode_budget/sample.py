@@ -20,8 +20,7 @@ from gsencoder.types import GaussianFeatures, Gaussians
 
 PARTS = 2
 LEAST_ROWS, MOST_ROWS, SHARE = 256, 4096, 16
-"""A part holds one of so many Gaussians of the scene, within these bounds. Small parts lose more of what they see by a
-cut than chunks do, which is on the safe side; parts of 13,000 lost less, and promised what was not kept."""
+"""A part holds one of so many Gaussians of the scene, within these bounds. Larger parts did not predict better."""
 WARM_ROWS = 256
 BINS = 8
 """Distances that are told apart."""
