@@ -28,8 +28,8 @@ import numpy as np
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.budget.config import BudgetConfig, exact_config
-from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within, judge
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within
+from gsencoder.fusion.feature_error import field_error, judge
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher
 from gsencoder.fusion.teachers import Teacher

@@ -263,6 +263,9 @@ def _check_packable(path: Path, raw: RawSplat) -> None:
         warnings.warn(f"{path}: {clipped:,} values were clipped to the range of the format", SceneWarning, stacklevel=3)
 
 
+FINGERPRINT_DIGITS = 64
+
+
 def fingerprint(gaussians: Gaussians) -> str:
     """sha256 over names, shapes and bytes of all arrays: equal only for the same rows in the same order."""
     digest = hashlib.sha256()

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from gsencoder.core.files.model_files import find_file
-from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.runtime.device_names import Device, Precision
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.onnx.runtime import SUFFIX, OnnxEncoder
@@ -36,6 +36,9 @@ class Encoder(Protocol):
     @property
     def made_by(self) -> Mapping[str, Any]:
         """Settings and results of the training, as JSON values."""
+
+    def precisions(self, device: Device, /) -> tuple[Precision, ...]:
+        """The types that it computes in on a device, the most exact one first; others than that are cheaper."""
 
     def encode(
         self,

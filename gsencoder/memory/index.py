@@ -60,14 +60,22 @@ class IndexMemory:
     lowest: float
 
 
-def index_features(features: GaussianFeatures, config: IndexConfig = IndexConfig()) -> IndexMemory:
+class TooManyRowsError(InputError):
+    """A table would have more rows than it may."""
+
+
+def index_features(
+    features: GaussianFeatures, config: IndexConfig = IndexConfig(), *, most: int | None = None
+) -> IndexMemory:
     """Makes a table of rows that features share.
 
     Args:
         features: fused or encoded.
         config: how many rows.
+        most: a table of more rows is given up; None = one of more than two bytes can number.
 
     Raises:
+        TooManyRowsError: the table would have more rows than `most`.
         InputError: no features, or more rows than two bytes can number.
     """
     seen = np.flatnonzero(features.seen)
@@ -79,8 +87,8 @@ def index_features(features: GaussianFeatures, config: IndexConfig = IndexConfig
     norms = np.sqrt(np.einsum("nc,nc->n", centered, centered, dtype=np.float64))
     directed = np.flatnonzero(norms > MIN_RELATIVE_NORM * np.linalg.norm(features.mean.astype(np.float64)))
     # One row is for features without a direction, if there are any.
-    limit = (config.rows or MAX_ROWS) - (len(directed) < len(seen))
-    threshold, leaders = _leaders(centered[directed], config, limit)
+    limit = (config.rows or most or MAX_ROWS) - (len(directed) < len(seen))
+    threshold, leaders = _leaders(centered[directed], config, limit, search=most is None)
     table = np.concatenate([centered[directed[leaders]], np.zeros_like(centered[:1])])
     # Features without a direction have the last row, the mean of the space; it goes where there are none.
     number = np.full(len(seen), len(table) - 1, np.int32)
@@ -108,9 +116,9 @@ def index_features(features: GaussianFeatures, config: IndexConfig = IndexConfig
 
 
 def _leaders(
-    centered: Float32[np.ndarray, "n C"], config: IndexConfig, limit: int
+    centered: Float32[np.ndarray, "n C"], config: IndexConfig, limit: int, *, search: bool
 ) -> tuple[float, Int64[np.ndarray, " M"]]:
-    """The threshold of a cover, and its rows, at most so many.
+    """The threshold of a cover, and its rows, at most so many; with `search` an error says which threshold has them.
 
     Raises:
         InputError: more rows than the numbers of an index.
@@ -129,6 +137,8 @@ def _leaders(
             f"{threshold:.4f}; give more rows"
         )
     if len(made) > limit:
+        if not search:
+            raise TooManyRowsError(f"index: a table of threshold {threshold:g} has more than {limit:,} rows")
         fits = largest_threshold(lambda each: len(cover(each, limit)) <= limit)
         raise InputError(
             f"index: a table with a row within {threshold:g} of every feature has more than {limit:,} rows; give "

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from gsencoder.app.commands import COMMANDS
+from gsencoder.app.commands.encode import EncodeCommandConfig
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
@@ -17,6 +18,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.knobs import value_at
 from gsencoder.fusion.budget.config import exact_config
 from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.encode_budget.config import exact_encoding
 
 
 def composed(*words: str) -> FuseCommandConfig:
@@ -106,6 +109,8 @@ def test_presets_can_be_swept(tmp_path: Path) -> None:
 
 def test_errors_of_budgets_are_held_against_the_exact_preset() -> None:
     assert exact_config(FuseConfig()) == composed("preset=exact").fusion
+    encoded = compose("encode", EncodeCommandConfig, ["SPLAT", "preset=exact"])
+    assert exact_encoding(EncodeConfig()) == encoded.encode
 
 
 @pytest.mark.parametrize("preset", ["fast", "exact"])

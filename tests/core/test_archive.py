@@ -13,7 +13,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.archive import archive_bytes, open_archive, write_archive
 from gsencoder.core.files.checksums import BLOCK_BYTES
 from gsencoder.core.files.mapped_arrays import MappedArrays
 
@@ -246,3 +246,16 @@ def test_a_pointer_of_git_lfs_is_named_as_what_it_is(tmp_path: Path) -> None:
     (tmp_path / "x").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
     with pytest.raises(InputError, match="x: is a pointer of git-lfs and not the file itself"):
         taken(tmp_path / "x")
+
+
+def test_the_size_of_a_file_is_known_before_it_is_written(tmp_path: Path) -> None:
+    arrays = {
+        "a": np.ones((5, 3), np.float32),
+        "long": np.zeros(300_001, np.uint8),
+        "none": np.zeros((0, 4), np.float16),
+        "scalar": np.array(2.0),
+    }
+    header = {"name": "räum", "error": 0.25, "views": ["a", "b"]}
+    write_archive(tmp_path / "a", arrays, header)
+    entries = {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
+    assert archive_bytes(entries, header) == (tmp_path / "a").stat().st_size

@@ -11,8 +11,8 @@ from splats import one_gaussian
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.budget.config import BudgetConfig, check_budget, exact_config
-from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within, judge
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within
+from gsencoder.fusion.feature_error import field_error, judge
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.types import Cameras, FeatureMap, Scene, Views

@@ -10,6 +10,7 @@ from sklearn.cluster import KMeans
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.store import quantize as module
+from gsencoder.fusion.store.bit_allocation import BitAllocation
 from gsencoder.fusion.store.quantize import CompactFeatures, compact
 
 
@@ -144,7 +145,7 @@ def test_levels_are_as_good_as_another_programs(kinds: bool) -> None:
     if kinds:
         values = rng.normal(size=5)[rng.integers(0, 5, 4000)] + 0.02 * values
     for bits in (1, 2, 3, 4):
-        left, levels = module._BitAllocation(values[:, None], np.ones(4000), np.ones(4000))._fit(0, bits)
+        left, levels = BitAllocation(values[:, None], np.ones(4000), np.ones(4000))._fit(0, bits)
         assert len(levels) == 1 << bits
         theirs = KMeans(1 << bits, n_init=5, random_state=0).fit(values[:, None]).inertia_
         assert left <= 1.1 * theirs

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsencoder.app.commands.basis_figures import basis_figures, describe_basis
+from gsencoder.app.commands.encode_budget import check_promises, encode_in_budget
 from gsencoder.app.commands.scene_up import with_reported_up
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
@@ -24,6 +25,8 @@ from gsencoder.fusion.store.folder import FEATURES_FILE, file_of_teacher, save_f
 from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads, heads_beside
 from gsencoder.fusion.store.words import save_tables
 from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.encode_budget.config import EncodeBudget, check_encode_budget
+from gsencoder.infer.encode_budget.encode_within import BudgetEncoding
 from gsencoder.infer.load_encoder import Encoder, file_of_encoder, load_encoder
 from gsencoder.models.output_space import teacher_of_space
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
@@ -66,8 +69,10 @@ class EncodeCommandConfig(CommonConfig):
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     encode: EncodeConfig = field(default_factory=EncodeConfig)
+    budget: EncodeBudget = field(default_factory=EncodeBudget)
 
     def __post_init__(self) -> None:
+        check_encode_budget(self.budget, self.encode)
         if self.basis_views < 0:
             raise InputError(f"basis_views: expected 0 or more, got {self.basis_views}")
 
@@ -108,7 +113,7 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
                     scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
             scene = with_reported_up(scene, one, quiet=config.quiet)
             with about(scene.name):
-                spaces = _encode_into(folder, scene, encoder, config, made_with, one)
+                spaces, promises = _encode_into(folder, scene, encoder, config, made_with, one)
             if heads is not None:
                 others = [space for space in encoder.spaces.values() if space not in spaces]
                 copy_heads(heads, folder / HEADS_FILE, spaces, left_out=others)
@@ -117,6 +122,8 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
         for name, figures in one.results.get("teachers", {"": one.results}).items():
             of = f" for {name}" if name else ""
             screen.print(f"{out}: basis of the encoder{of}: {describe_basis(figures['basis'], where)}")
+        for line in promises:
+            screen.print(f"{out}: {line}")
 
     run_scenes(
         paths,
@@ -137,16 +144,22 @@ def _encode_into(
     config: EncodeCommandConfig,
     made_with: Mapping[str, str],
     summary: Summary,
-) -> list[FeatureSpace]:
+) -> tuple[list[FeatureSpace], list[str]]:
     """Encodes a scene and writes its features and words, and what they were made with; returns the spaces that were
-    written."""
+    written, and a line for each promise."""
     assert scene.gaussians is not None
     unit = unit_of(scene, encoder.voxel)
-    with summary.step("encode"):
-        by_teacher = encoder.encode_spaces(
-            scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
-        )
-    by_teacher = {name: by_teacher[name] for name in requested_teachers(encoder, config.spaces)}
+    teachers = requested_teachers(encoder, config.spaces)
+    made: BudgetEncoding | None = None
+    if config.budget.given:
+        made = encode_in_budget(scene, encoder, teachers, config, made_with, summary, metres_per_unit=unit)
+        by_teacher, encoding = made.features, made.setting.config
+    else:
+        with summary.step("encode"):
+            by_teacher = encoder.encode_spaces(
+                scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
+            )
+        by_teacher, encoding = {name: by_teacher[name] for name in teachers}, config.encode
     if config.basis_views and all(each.basis is None for each in by_teacher.values()):
         raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
     single = len(by_teacher) == 1
@@ -161,8 +174,12 @@ def _encode_into(
             "features": file,
         }
     with summary.step("write"):
-        save_features(folder, scene, by_teacher, {"encode": settings(config.encode), **made_with})
+        save_features(folder, scene, by_teacher, {"encode": settings(encoding), **made_with})
         save_tables(folder, {name: encoder.tables[name] for name in by_teacher if name in encoder.tables}, by_teacher)
+    lines = []
+    if made is not None:
+        files = [folder / str(each["features"]) for each in figures.values()]
+        lines = check_promises(made, scene, encoder, files, config, summary, metres_per_unit=unit)
     first = next(iter(by_teacher.values()))
     summary.results.update(
         gaussians=len(first),
@@ -172,7 +189,7 @@ def _encode_into(
         **made_with,
         **(next(iter(figures.values())) if single else {"teachers": figures}),
     )
-    return [features.space for features in by_teacher.values()]
+    return [features.space for features in by_teacher.values()], lines
 
 
 def requested_teachers(encoder: Encoder, names: tuple[str, ...]) -> list[str]:

@@ -1,14 +1,13 @@
 """The budgets of `fuse`: what was promised, and what became of it, for people and for the summary."""
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.progress import Progress
+from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
-from gsencoder.core.errors import SceneWarning
-from gsencoder.core.knobs import describe_values, shown_value
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.fusion.budget.config import BudgetConfig
 from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within, realised_error
@@ -47,25 +46,25 @@ def fuse_in_budget(
     )
     choice = made.choice
     summary.add_seconds({"choose": made.choosing, **made.fusion.seconds})
-    summary.results["budget"] = {
-        "chosen": dict(choice.knobs),
-        "of_views": len(scene.views) if scene.views is not None else 0,
-        "predicted": {name: value for name, value in _predicted(made).items() if value is not None},
-        "scatter": choice.scatter,
-        "rays_followed": choice.followed,
-        "rays_exact": choice.all_rays,
-        "notes": list(choice.notes),
-    }
-    screen = console(config.quiet)
-    screen.print(f"{scene.name}: budget: {describe_values(choice.knobs)}, of {len(made.scene.views or ())} views")
-    for note in choice.notes:
-        warnings.warn(note, SceneWarning, stacklevel=2)
+    report_choice(
+        summary,
+        scene.name,
+        choice.knobs,
+        predicted=_predicted(made),
+        notes=choice.notes,
+        quiet=config.quiet,
+        of=f", of {len(made.scene.views or ())} views",
+        of_views=len(scene.views) if scene.views is not None else 0,
+        scatter=choice.scatter,
+        rays_followed=choice.followed,
+        rays_exact=choice.all_rays,
+    )
     return made
 
 
 def _predicted(made: BudgetFusion) -> Mapping[str, float | None]:
     choice = made.choice
-    size = None if choice.bytes is None else choice.bytes / 1e6
+    size = None if choice.bytes is None else choice.bytes / MEGABYTE
     return {
         "error": choice.predicted.error,
         "error_deviation": choice.predicted.deviation,
@@ -86,20 +85,5 @@ def check_promises(made: BudgetFusion, file: Path, config: BudgetOptions, summar
     if budget.seconds is not None:
         realised["seconds"] = made.seconds
     if budget.megabytes is not None:
-        realised["megabytes"] = file.stat().st_size / 1e6
-    promised = {name: float(getattr(budget, name)) for name in budget.given}
-    summary.results["budget"].update(promised=promised, realised=realised)
-    lines = []
-    for name, promise in promised.items():
-        if name not in realised:
-            lines.append(f"budget.{name}: promised {shown_value(promise)}, not measured (budget.check=false)")
-            continue
-        lines.append(f"budget.{name}: promised {shown_value(promise)}, realised {realised[name]:.4g}")
-        if realised[name] > promise:
-            warnings.warn(
-                f"budget.{name}: promised {shown_value(promise)}, and it became {realised[name]:.4g}; the summary says "
-                "what was predicted",
-                SceneWarning,
-                stacklevel=2,
-            )
-    return lines
+        realised["megabytes"] = file.stat().st_size / MEGABYTE
+    return report_promises(summary, budget, realised)

@@ -1,32 +1,41 @@
 """`gsencoder pack FEATURES form=…`: a splat and its features as a small package, or in formats of other programs."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from shutil import copyfile
 
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
+from gsencoder.core.promises import MEGABYTE, check_governed
+from gsencoder.fusion.store.budget import PackBudget
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
 from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads
+from gsencoder.fusion.store.index_file import index_bytes
 from gsencoder.fusion.store.package import (
     PACKAGE_FILE,
     Form,
     save_arrays,
     save_index_package,
     save_package,
+    save_package_within,
     save_ply,
 )
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features
 from gsencoder.memory.index import IndexConfig, index_features
+from gsencoder.memory.index_budget import index_within
 from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene
 
 DEFAULT_ERROR = 0.01
+"""Budget of form=compact where none is given."""
 CODED = ("compact", "index")
 """Forms whose features are codes, which gsencoder alone reads; their words are float16."""
 
@@ -55,13 +64,8 @@ class PackConfig(CommonConfig):
             "a table; npz, safetensors = arrays; ply = a splat with the properties feature_0 …"
         },
     )
-    error: float = field(
-        default=DEFAULT_ERROR,
-        metadata={
-            "help": "largest mean loss of centered cosine, over Gaussians and over kinds of features, for form=compact"
-        },
-    )
     index: IndexConfig = field(default_factory=IndexConfig)
+    budget: PackBudget = field(default_factory=PackBudget)
     decoded: bool = field(
         default=False,
         metadata={
@@ -73,13 +77,15 @@ class PackConfig(CommonConfig):
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
-        if not 0 < self.error < 1:
-            raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
-        if self.error != DEFAULT_ERROR and self.form != "compact":
-            raise InputError(f"error: is the budget of form=compact, and form={self.form} has none; leave it out")
+        if self.budget.given and self.form not in CODED:
+            raise InputError(
+                f"{self.budget.names}: form={self.form} writes features as they are; take form=compact or index, or "
+                "leave the budget out"
+            )
         if self.index != IndexConfig() and self.form != "index":
             raise InputError(f"index: has the settings of form=index, and form={self.form} takes none; leave them out")
-        if self.decoded and self.form in ("compact", "index"):
+        check_governed(self.budget, self.index, IndexConfig(), ("threshold", "rows"), "index")
+        if self.decoded and self.form in CODED:
             raise InputError(f"decoded=true: form={self.form} holds codes; use form=npz, safetensors or ply")
 
 
@@ -128,19 +134,27 @@ def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFe
 
 
 def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
-    seen, dense = int(features.seen.sum()), 2 * features.space.channels
+    seen = int(features.seen.sum())
     summary.results.update(form=config.form, gaussians=len(features), seen=seen, space=features.space.describe())
+    if config.form == "compact":
+        return _write_compact(folder, scene, features, config, summary)
+    if config.form == "index":
+        return _write_index(folder, scene, features, config, summary)
     if config.form == "ply":
         save_ply(folder, scene, features, decoded=config.decoded)
-    elif config.form == "index":
-        return _write_index(folder, scene, features, config, summary)
-    elif config.form != "compact":
+    else:
         save_arrays(folder, scene, features, config.form, decoded=config.decoded)
-    if config.form != "compact":
-        return f"the splat, and features of {seen:,} of its {len(features):,} Gaussians as {config.form}"
-    made = save_package(folder, scene, features, error=config.error)
+    return f"the splat, and features of {seen:,} of its {len(features):,} Gaussians as {config.form}"
+
+
+def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
+    budget = config.budget
+    if budget.error is None and budget.megabytes is not None:
+        made = save_package_within(folder, scene, features, megabytes=budget.megabytes)
+    else:
+        made = save_package(folder, scene, features, error=budget.error or DEFAULT_ERROR)
     size = (folder / PACKAGE_FILE).stat().st_size
-    share = size / (dense * len(features))
+    share = size / (2 * features.space.channels * len(features))
     summary.results.update(
         bytes=size,
         row_bytes=made.row_bytes,
@@ -150,15 +164,20 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
         weight_error=(made.heaviest / made.lightest) ** (1 / 510) - 1,
         share_of_float16=share,
     )
+    _report(scene, {"rank": made.basis.rank, "row_bytes": made.row_bytes}, made.error, size, config, summary)
     return (
-        f"features of {seen:,} of {len(features):,} Gaussians in {size / 1e6:.3g} MB, {_ratio(share)} of float16 "
-        f"vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centered cosines lose "
-        f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
+        f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB, "
+        f"{_ratio(share)} of float16 vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centered "
+        f"cosines lose {made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
     )
 
 
 def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
-    made = index_features(features, config.index)
+    if config.budget.given:
+        made, error = index_within(features, config.budget, partial(index_bytes, scene, features))
+    else:
+        made = index_features(features, config.index)
+        error = made.error
     save_index_package(folder, scene, made.features, error=made.error)
     rows, size = len(made.features.features), (folder / PACKAGE_FILE).stat().st_size
     summary.results.update(
@@ -170,11 +189,27 @@ def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config:
         lowest=made.lowest,
         share_of_float16=size / (2 * features.space.channels * len(features)),
     )
+    _report(scene, {"rows": rows, "threshold": made.threshold}, error, size, config, summary)
     return (
-        f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / 1e6:.3g} MB: the number "
-        f"of one of {rows:,} rows in {'one byte' if rows < 256 else 'two bytes'}; centered cosines lose "
+        f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB: the "
+        f"number of one of {rows:,} rows in {'one byte' if rows < 256 else 'two bytes'}; centered cosines lose "
         f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
     )
+
+
+def _report(
+    scene: Scene, chosen: Mapping[str, int | float], error: float, size: int, config: PackConfig, summary: Summary
+) -> None:
+    """Says what a budget chose and what became of it: both are measured over all Gaussians, of the file as it is."""
+    budget, megabytes = config.budget, size / MEGABYTE
+    if not budget.given:
+        return
+    broken = budget.error is not None and budget.megabytes is not None and megabytes > budget.megabytes
+    notes = [budget.conflict("error", "megabytes", megabytes)] if broken else []
+    report_choice(summary, scene.name, chosen, predicted={}, notes=notes, quiet=config.quiet)
+    realised = {name: value for name, value in (("error", error), ("megabytes", megabytes)) if name in budget.given}
+    for line in report_promises(summary, budget, realised):
+        console(config.quiet).print(f"{scene.name}: {line}")
 
 
 def _ratio(share: float) -> str:

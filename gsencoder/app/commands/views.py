@@ -9,6 +9,7 @@ from gsencoder.app.commands.through_head import features_for_heads, heads_of_fol
 from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import write_archive
@@ -19,6 +20,7 @@ from gsencoder.fusion.heads.store import find_head
 from gsencoder.fusion.store.heads_file import check_heads_space
 from gsencoder.infer.localize.localization_json import box_to_json, words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features
+from gsencoder.infer.views.budget import ViewsBudget, check_views_budget, choose_views_within
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.pictures import describe_view, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
@@ -63,6 +65,7 @@ class ViewsCommandConfig(WordsOptions):
         default="stretch", metadata={"help": "how the preprocessing of the tower fits a picture to its input size"}
     )
     choose: ViewsConfig = field(default_factory=ViewsConfig)
+    budget: ViewsBudget = field(default_factory=ViewsBudget)
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
@@ -72,6 +75,7 @@ class ViewsCommandConfig(WordsOptions):
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
         if self.boxes < 1:
             raise InputError(f"boxes: expected 1 or more, got {self.boxes}")
+        check_views_budget(self.budget, self.choose)
         if len(self.grid) not in (0, 2):
             raise InputError(f"grid: expected rows and columns, such as [27,27], got {list(self.grid)}")
         if self.grid:
@@ -103,8 +107,22 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
             raise InputError(f"views: none of the words has a box in scene {scene.name}: {listing}")
         boxes = best_boxes(localization, config.boxes)
         summary.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
+    promises: list[str] = []
     with summary.step("choose"):
-        views = choose_views(scene, targets, config.choose)
+        if config.budget.given:
+            made = choose_views_within(scene, targets, config.choose, config.budget)
+            views = made.views
+            report_choice(
+                summary,
+                scene.name,
+                {"candidates": made.candidates},
+                predicted={"seconds": made.predicted},
+                notes=made.notes,
+                quiet=config.quiet,
+            )
+            promises = report_promises(summary, config.budget, {"seconds": made.seconds})
+        else:
+            views = choose_views(scene, targets, config.choose)
     out = config.out or Path("outputs") / scene.name / "views"
     rows = views_to_json(scene, views)
     summary.results.update(views=rows, judged=views.judged)
@@ -121,6 +139,8 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
         screen.print(f"{word}: {text}")
     for number, each in enumerate(views.chosen):
         screen.print(f"{number:2d}  {describe_view(each)}")
+    for line in promises:
+        screen.print(f"{out}: {line}")
     screen.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))
 
 

@@ -18,7 +18,14 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.checksums import block_checksums, bytes_of, damaged_blocks, file_digest
+from gsencoder.core.files.checksums import (
+    BLOCK_BYTES,
+    DIGITS,
+    block_checksums,
+    bytes_of,
+    damaged_blocks,
+    file_digest,
+)
 from gsencoder.core.files.model_files import check_fetched
 from gsencoder.core.files.safetensors_bytes import array_offsets, read_bytes
 
@@ -29,6 +36,8 @@ RESERVED_KEYS = ("version", "checksums", "digest")
 """Keys of the header that callers may not use: version, checksums of the blocks by array, and the digest of the rest.
 """
 LARGEST_NUMBER = 2.0**63
+LONGEST_NUMBER = -2.2250738585072014e-308
+"""JSON writes no number in more characters: it stands for numbers of a header that are not known yet."""
 DTYPES = {
     "F16": "float16",
     "F32": "float32",
@@ -43,6 +52,9 @@ DTYPES = {
 ORDER = ("I64", "F64", "F32", "I32", "F16", "U16", "I8", "U8")
 """The types in the order in which safetensors writes arrays: those first that are aligned to more bytes."""
 DAMAGED = "the file is damaged"
+
+Entries = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Type and shape of each array of a file."""
 
 
 def first_difference(saved: Mapping[str, Any], current: Mapping[str, Any], prefix: str = "") -> str:
@@ -253,10 +265,7 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     assert not set(RESERVED_KEYS) & set(header)
     assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that cannot be read back"
     checksums = {name: block_checksums(array) for name, array in pieces.items()}
-    # The digest is of what a reader will see: JSON turns tuples into lists and keys into text.
-    covered = json.loads(json.dumps({**header, "version": VERSION, "checksums": checksums}))
-    digest = file_digest(covered, {name: (array.dtype.name, array.shape) for name, array in pieces.items()})
-    _write_safetensors(path, pieces, {"gsencoder": json.dumps({**covered, "digest": digest})})
+    _write_safetensors(path, pieces, _metadata(_entries(pieces), checksums, header))
 
 
 def _write_safetensors(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
@@ -264,25 +273,53 @@ def _write_safetensors(path: Path, arrays: Mapping[str, np.ndarray], metadata: M
 
     The library's `save_file` writes a file of a random name first, which a kill leaves in the folder for good.
     """
+    entries = _entries(arrays)
+    with atomic_file(path) as stream:
+        stream.write(_table(entries, metadata))
+        for name in _file_order(entries):
+            stream.write(bytes_of(arrays[name]).data)
+
+
+def archive_bytes(entries: Entries, header: Mapping[str, Any]) -> int:
+    """The size of the file that `write_archive` would write.
+
+    Args:
+        entries: type and shape of each array.
+        header: as it would be written; numbers of other lengths change the size by as many bytes.
+    """
+    sizes = {name: math.prod(shape) * np.dtype(dtype).itemsize for name, (dtype, shape) in entries.items()}
+    checksums = {name: "0" * (DIGITS * -(-size // BLOCK_BYTES)) for name, size in sizes.items()}
+    return len(_table(entries, _metadata(entries, checksums, header))) + sum(sizes.values())
+
+
+def _entries(arrays: Mapping[str, np.ndarray]) -> Entries:
+    return {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
+
+
+def _file_order(entries: Entries) -> list[str]:
     letters = {name: letter for letter, name in DTYPES.items()}
-    order = sorted(arrays, key=lambda name: (ORDER.index(letters[arrays[name].dtype.name]), name))
+    return sorted(entries, key=lambda name: (ORDER.index(letters[entries[name][0]]), name))
+
+
+def _metadata(entries: Entries, checksums: Mapping[str, str], header: Mapping[str, Any]) -> dict[str, str]:
+    # The digest is of what a reader will see: JSON turns tuples into lists and keys into text.
+    covered = json.loads(json.dumps({**header, "version": VERSION, "checksums": checksums}))
+    return {"gsencoder": json.dumps({**covered, "digest": file_digest(covered, entries)})}
+
+
+def _table(entries: Entries, metadata: Mapping[str, str]) -> bytes:
+    """What stands before the arrays."""
+    letters = {name: letter for letter, name in DTYPES.items()}
     table: dict[str, Any] = {"__metadata__": dict(metadata)}
     end = 0
-    for name in order:
-        array = arrays[name]
-        table[name] = {
-            "dtype": letters[array.dtype.name],
-            "shape": list(array.shape),
-            "data_offsets": [end, end + array.nbytes],
-        }
-        end += array.nbytes
+    for name in _file_order(entries):
+        dtype, shape = entries[name]
+        begin, end = end, end + math.prod(shape) * np.dtype(dtype).itemsize
+        table[name] = {"dtype": letters[dtype], "shape": list(shape), "data_offsets": [begin, end]}
     text = json.dumps(table, separators=(",", ":"), ensure_ascii=False).encode("utf-8", "surrogatepass")
     # Arrays begin at a multiple of eight bytes.
     text += b" " * (-len(text) % 8)
-    with atomic_file(path) as stream:
-        stream.write(len(text).to_bytes(8, "little") + text)
-        for name in order:
-            stream.write(bytes_of(arrays[name]).data)
+    return len(text).to_bytes(8, "little") + text
 
 
 def _contiguous(array: np.ndarray) -> np.ndarray:

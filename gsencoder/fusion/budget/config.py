@@ -1,9 +1,9 @@
 """Promises about a fusion."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.knobs import value_at
+from gsencoder.core.promises import Budget, check_governed
 from gsencoder.fusion.fuse import FuseConfig
 
 GOVERNED = (
@@ -22,7 +22,7 @@ GOVERNED = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BudgetConfig:
+class BudgetConfig(Budget):
     """What a fusion may cost, or must reach. Where they conflict, the one that stands first here wins.
 
     A budget of error alone takes the cheapest setting that keeps it; budgets of seconds and megabytes without one take
@@ -48,19 +48,6 @@ class BudgetConfig:
     )
     seed: int = field(default=0, metadata={"help": "of the sample of Gaussians on which the setting is chosen"})
 
-    def __post_init__(self) -> None:
-        if self.error is not None and not 0 < self.error < 1:
-            raise InputError(f"error: expected a number between 0 and 1, got {self.error}")
-        for name in ("seconds", "megabytes"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise InputError(f"{name}: expected a number above 0, got {value}")
-
-    @property
-    def given(self) -> tuple[str, ...]:
-        """The budgets that are given, the one that wins first."""
-        return tuple(each.name for each in fields(self)[:3] if getattr(self, each.name) is not None)
-
 
 def check_budget(budget: BudgetConfig, config: FuseConfig, *, basis: bool = False) -> None:
     """Refuses what a budget cannot be combined with.
@@ -75,13 +62,8 @@ def check_budget(budget: BudgetConfig, config: FuseConfig, *, basis: bool = Fals
     """
     if not budget.given:
         return
-    names = " and ".join(f"budget.{name}" for name in budget.given)
-    default = FuseConfig()
-    for key in GOVERNED:
-        if (value := value_at(config, key)) != value_at(default, key):
-            raise InputError(
-                f"fusion.{key}={value}: is chosen by {names}; leave it (or the preset that sets it) out, or the budget"
-            )
+    names = budget.names
+    check_governed(budget, config, FuseConfig(), GOVERNED, "fusion")
     if config.lift != "blend":
         raise InputError(f"fusion.lift={config.lift}: {names} is for lift=blend alone; leave one of the two out")
     if "rendered" in config.visibility.against:

@@ -16,16 +16,14 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.budget.choose import Choice, choose
 from gsencoder.fusion.budget.config import BudgetConfig, check_budget, exact_config
 from gsencoder.fusion.checkpoint import open_checkpoint
-from gsencoder.fusion.feature_error import FieldError, field_error
+from gsencoder.fusion.feature_error import FieldError, judge
 from gsencoder.fusion.fuse import FuseConfig, Fusion, checked_scene, fuse
 from gsencoder.fusion.lift import FeatureSums, view_matrix
 from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import resolve
-from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Scene, Views
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
-JUDGED = 0.1
-"""Share of the seen Gaussians on which an error is measured."""
 REMEMBERED_BYTES = 1 << 28
 """Depth maps that the choice reads are remembered up to this size, for the fusion."""
 
@@ -145,15 +143,6 @@ def realised_error(
     now. All maps that were not made yet are made for it."""
     exact = fuse(made.scene, made.teacher, exact_config(config), device=device, track=track).features
     return judge(made.fusion.features, exact, seed=seed)
-
-
-def judge(features: GaussianFeatures, exact: GaussianFeatures, *, seed: int = 0) -> FieldError:
-    """The error on a tenth of the Gaussians that the exact features see; each counts the same."""
-    seen = np.flatnonzero(exact.seen)
-    count = min(max(round(JUDGED * len(seen)), 1), len(seen))
-    # Not the sequence of numbers that drew the sample of the choice.
-    rows = np.random.default_rng((seed, 1)).choice(seen, count, replace=False)
-    return field_error(features, exact, rows=np.sort(rows))
 
 
 class _Remembered(Sequence[Float32[np.ndarray, "_ _"]]):

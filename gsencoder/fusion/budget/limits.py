@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from gsencoder.core.knobs import shown_value
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.fusion.budget.config import BudgetConfig
 from gsencoder.fusion.budget.rank import RankErrors, file_bytes, rank_of_bytes
 from gsencoder.fusion.budget.settings import Setting, most_exact
@@ -49,10 +49,7 @@ def within_seconds(
     assert budget.seconds is not None
     if budget.error is not None:
         needed = pace.seconds(chosen)
-        note = (
-            f"budget.error={shown_value(budget.error)} takes about {needed:.3g} s, more than "
-            f"budget.seconds={shown_value(budget.seconds)}; budget.error comes first"
-        )
+        note = budget.conflict("error", "seconds", needed)
         return chosen, needed, (note,) if needed > budget.seconds else ()
     fitting = [each for each in settings if pace.seconds(each) <= PLANNED * budget.seconds]
     if fitting:
@@ -60,7 +57,7 @@ def within_seconds(
         return best, pace.seconds(best), ()
     fastest = min(settings, key=lambda each: (pace.seconds(each), each.error))
     needed = pace.seconds(fastest)
-    note = f"budget.seconds={shown_value(budget.seconds)}: the fastest setting takes about {needed:.3g} s; it is used"
+    note = f"{budget.shown('seconds')}: the fastest setting takes about {needed:.3g} s; it is used"
     return fastest, needed, (note,)
 
 
@@ -85,15 +82,15 @@ def within_megabytes(
     rows = math.ceil(min(share, 1.0) * sight.gaussians)
     rank = chosen.rank or (ranks.full if basis else channels)
     size = file_bytes(rows, rank, channels, basis=basis or chosen.rank > 0)
-    if size <= budget.megabytes * 1e6:
+    if size <= budget.megabytes * MEGABYTE:
         return chosen, size, ()
-    asked = f"budget.megabytes={shown_value(budget.megabytes)}"
     if budget.error is not None:
-        note = f"budget.error={shown_value(budget.error)} takes about {size / 1e6:.3g} MB, more than {asked}"
-        return chosen, size, (f"{note}; budget.error comes first",)
-    rank = min(rank_of_bytes(budget.megabytes * 1e6, rows, channels), ranks.full)
+        return chosen, size, (budget.conflict("error", "megabytes", size / MEGABYTE),)
+    rank = min(rank_of_bytes(budget.megabytes * MEGABYTE, rows, channels), ranks.full)
     size = file_bytes(rows, max(rank, 1), channels, basis=True)
-    note = f"{asked}: one coordinate of each Gaussian takes about {size / 1e6:.3g} MB; it is used"
+    note = (
+        f"{budget.shown('megabytes')}: one coordinate of each Gaussian takes about {size / MEGABYTE:.3g} MB; it is used"
+    )
     error = min(chosen.error + ranks.error_of(max(rank, 1)), 1.0)
     return replace(chosen, rank=max(rank, 1), error=error), size, () if rank else (note,)
 

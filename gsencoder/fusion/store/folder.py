@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive, open_archive, write_archive
+from gsencoder.core.files.archive import LONGEST_NUMBER, Archive, archive_bytes, open_archive, write_archive
 from gsencoder.core.row_numbers import rise_within
 from gsencoder.core.runtime.threads import parallel
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
-from gsencoder.data.splats import fingerprint
+from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint
 from gsencoder.fusion.store.memory_file import MEMORY_FILE, read_memory, write_memory
 from gsencoder.fusion.store.package import PACKAGE_FILE, load_package
-from gsencoder.types import GaussianFeatures, Gaussians, QueryMemory, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, QueryMemory, Scene
 
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 BLOCK = 16_384
@@ -144,6 +144,33 @@ def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any])
         "weights": features.weights[rows],
     }
     write_archive(path, arrays, header | dict(more))
+
+
+def features_bytes(
+    space: FeatureSpace, rows: int, rank: int, settings: Mapping[str, Any] = {}, *, basis: bool = True
+) -> int:
+    """The size of the file that `save_features` would write.
+
+    Args:
+        space: of the features.
+        rows: number of Gaussians that were seen.
+        rank: coordinates of each.
+        settings: as `save_features` takes them.
+        basis: whether the coordinates are in a basis.
+    """
+    arrays, header = space_parts(space, np.zeros(space.channels, np.float32), None)
+    entries: dict[str, tuple[str, tuple[int, ...]]] = {
+        "rows": ("int32", (rows,)),
+        "features": ("float16", (rows, rank)),
+        "channel_scale": ("float32", (rank,)),
+        "weights": ("float32", (rows,)),
+        **{name: (array.dtype.name, array.shape) for name, array in arrays.items()},
+    }
+    header |= {"settings": dict(settings), "fingerprint": "0" * FINGERPRINT_DIGITS}
+    if basis:
+        entries["components"] = ("float32", (rank, space.channels))
+        header["energy_kept"] = LONGEST_NUMBER
+    return archive_bytes(entries, header)
 
 
 def load_features(folder: str | Path) -> Scene:

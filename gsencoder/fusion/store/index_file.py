@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive, write_archive
+from gsencoder.core.files.archive import LONGEST_NUMBER, Archive, archive_bytes, write_archive
 from gsencoder.data.archive_records import read_space, scaled_halves, scene_parts, space_parts
+from gsencoder.data.splats import FINGERPRINT_DIGITS
 from gsencoder.types import GaussianFeatures, Scene
 
 INDEX_FORM = 2
@@ -43,6 +44,27 @@ def write_index(path: Path, scene: Scene, features: GaussianFeatures, *, fingerp
         "channel_scale": channel_scale,
     }
     write_archive(path, arrays, header | named | {"form": INDEX_FORM, "fingerprint": fingerprint, "error": error})
+
+
+def index_bytes(scene: Scene, features: GaussianFeatures, rows: int) -> int:
+    """The size of the file that `write_index` would write, with a table of so many rows.
+
+    Args:
+        scene: of the features.
+        features: without an index.
+        rows: of the table.
+    """
+    around, header = scene_parts(scene)
+    parts, named = space_parts(features.space, features.mean, features.basis)
+    columns = features.features.shape[1]
+    entries = {name: (array.dtype.name, array.shape) for name, array in {**around, **parts}.items()}
+    entries |= {
+        "index": ("uint8" if rows < 256 else "uint16", (len(features),)),
+        "table": ("float16", (rows, columns)),
+        "channel_scale": ("float32", (columns,)),
+    }
+    unknown = {"form": INDEX_FORM, "fingerprint": "0" * FINGERPRINT_DIGITS, "error": LONGEST_NUMBER}
+    return archive_bytes(entries, header | named | unknown)
 
 
 def read_index(file: Archive) -> GaussianFeatures:

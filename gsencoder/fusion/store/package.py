@@ -12,15 +12,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.archive import LONGEST_NUMBER, archive_bytes, open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.mapped_arrays import MappedArrays
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
-from gsencoder.data.splats import fingerprint, load_splat, save_splat
+from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint, load_splat, save_splat
 from gsencoder.fusion.store.index_file import INDEX_FORM, read_index, write_index
-from gsencoder.fusion.store.quantize import CompactFeatures, compact
+from gsencoder.fusion.store.quantize import CompactFeatures, compact, compact_within
 from gsencoder.types import GaussianFeatures, Scene
 
 Form = Literal["compact", "index", "npz", "safetensors", "ply"]
@@ -41,10 +43,42 @@ def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, erro
     Raises:
         InputError: no Gaussians, or a budget that cannot be met.
     """
-    made = compact(features, error=error)
+    return _save_compact(folder, scene, compact(features, error=error))
+
+
+def save_package_within(folder: Path, scene: Scene, features: GaussianFeatures, *, megabytes: float) -> CompactFeatures:
+    """Writes the most exact package whose file of features has at most so many megabytes, as `save_package` does.
+
+    Raises:
+        InputError: no Gaussians, or nothing is so small.
+    """
+    around, header = scene_parts(scene)
+    _, named = space_parts(features.space, features.mean, features.basis)
+    entries = {name: (array.dtype.name, array.shape) for name, array in around.items()}
+    # Numbers of the header that are not known yet are as long as JSON writes any.
+    header |= named | dict.fromkeys(("energy_kept", "lightest", "heaviest", "error", "lowest"), LONGEST_NUMBER)
+    header |= {"form": FORMAT, "fingerprint": "0" * FINGERPRINT_DIGITS, "total": len(features)}
+    seen, channels = int(features.seen.sum()), features.space.channels
+
+    def bytes_of(bits: Int64[np.ndarray, " R"]) -> int:
+        coded = {
+            "bits": ("uint8", (len(bits),)),
+            "levels": ("float32", (int((1 << bits).sum()),)),
+            "codes": ("uint8", (seen, -(-int(bits.sum()) // 8))),
+            "weight_codes": ("uint8", (seen,)),
+            "seen": ("uint8", (-(-len(features) // 8),)),
+            "mean": ("float32", (channels,)),
+            "components": ("float32", (len(bits), channels)),
+        }
+        return archive_bytes(entries | coded, header)
+
+    return _save_compact(folder, scene, compact_within(features, megabytes * MEGABYTE, bytes_of))
+
+
+def _save_compact(folder: Path, scene: Scene, made: CompactFeatures) -> CompactFeatures:
     written = _save_splat(folder, scene)
     arrays, header = scene_parts(scene)
-    parts, named = space_parts(features.space, features.mean, made.basis)
+    parts, named = space_parts(made.space, made.basis.mean, made.basis)
     seen = np.zeros(len(made), bool)
     seen[made.rows] = True
     coded = {

@@ -8,27 +8,32 @@ Kinds of features count alike, however many Gaussians they have: what is asked f
 and a mean over Gaussians is all ceiling.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
+from gsencoder.core.knobs import shown_value
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.core.row_numbers import rise_within
+from gsencoder.fusion.store.bit_allocation import MAX_BITS, BitAllocation, cosines_of, nearest_level
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
-MAX_BITS = 8
-"""Of a coordinate."""
 FIT_SAMPLE = 10_000
 """Gaussians that levels are fitted to."""
 SAME_KIND_COSINE = 0.9
 """Rows whose centered cosine is above are of one kind."""
 RETRIES = 3
 """Times that a sample is completed by rows that it missed."""
-ROUNDS = 10
-"""Of moving levels to the mean of what is nearest to them."""
-BINS = 1024
+STEP_BITS = 8
+"""Bits that are added at a time: a byte a row."""
+EXACT_ERROR = 1e-4
+"""Codes are not made more exact than this, however large they may be."""
 BLOCK = 16_384
 """Rows that are turned into bits, or back, at a time."""
 MIN_COSINE = 0.8
@@ -141,47 +146,93 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
     """
     if not 0 < error < 1:
         raise InputError(f"error: expected a budget between 0 and 1, got {error}")
+
+    def fewest(allocation: BitAllocation, encode: _Encode) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
+        while True:
+            allocation.add_bits(STEP_BITS)
+            if max(allocation.errors()) > error and allocation.can_grow:
+                continue
+            compacted, cosines = encode(allocation)
+            if compacted.error <= error:
+                return compacted, cosines
+            if not allocation.can_grow:
+                raise InputError(
+                    f"error={error}: {MAX_BITS} bits a coordinate reach {compacted.error:.2g}; give a larger budget, "
+                    "or another form"
+                )
+
+    return _completed(features, fewest)
+
+
+def compact_within(
+    features: GaussianFeatures, largest: float, bytes_of: Callable[[Int64[np.ndarray, " R"]], int]
+) -> CompactFeatures:
+    """The most exact codes of at most so many bytes; no more exact than `EXACT_ERROR`.
+
+    Args:
+        features: fused or encoded.
+        largest: number of bytes.
+        bytes_of: what a package takes, given the bits of each of its coordinates.
+
+    Raises:
+        InputError: nothing is so small; the message says what is. Nothing seen.
+    """
+
+    def most_exact(allocation: BitAllocation, encode: _Encode) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
+        while not allocation.bits.any() or (allocation.can_grow and max(allocation.errors()) > EXACT_ERROR):
+            more = allocation.copy()
+            more.add_bits(STEP_BITS)
+            if (size := bytes_of(more.bits[more.bits > 0])) > largest:
+                if not allocation.bits.any():
+                    raise InputError(
+                        f"budget.megabytes={shown_value(largest / MEGABYTE)}: the smallest package of these features "
+                        f"takes {math.ceil(size / 10) / 1e5:.6g}; give more, or another form"
+                    )
+                break
+            allocation = more
+        return encode(allocation)
+
+    return _completed(features, most_exact)
+
+
+_Encode = Callable[[BitAllocation], tuple[CompactFeatures, Float64[np.ndarray, " n"]]]
+"""All rows with an allocation of bits, and what it leaves of the cosine of each."""
+
+
+def _completed(
+    features: GaussianFeatures,
+    choose: Callable[[BitAllocation, _Encode], tuple[CompactFeatures, Float64[np.ndarray, " n"]]],
+) -> CompactFeatures:
+    """Features with the bits that are chosen on a sample, which is completed by kinds of rows that it missed."""
     rows = np.flatnonzero(features.seen)
     if not len(rows):
         raise InputError("compact: no Gaussian has features")
     sample = rows[even_indices(len(rows), FIT_SAMPLE)]
-    bound = min(MIN_COSINE, 1 - 10 * error)
     for _ in range(RETRIES):
-        compacted, cosines = _within(features, rows, sample, error)
-        missed = np.setdiff1d(rows[cosines < bound], sample)
+        allocation, rotated = _allocation(features, sample)
+        compacted, cosines = choose(allocation, partial(_encode, features, rows, rotated))
+        missed = np.setdiff1d(rows[cosines < min(MIN_COSINE, 1 - 10 * compacted.error)], sample)
         if not len(missed):
             break
         sample = np.union1d(sample, missed[even_indices(len(missed), FIT_SAMPLE // 4)])
     return compacted
 
 
-def _within(
-    features: GaussianFeatures, rows: Int64[np.ndarray, " n"], sample: Int64[np.ndarray, " k"], error: float
-) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
-    """The fewest bytes a row that a sample asks for, and what they leave of the cosine of each row."""
+def _allocation(
+    features: GaussianFeatures, sample: Int64[np.ndarray, " k"]
+) -> tuple[BitAllocation, Float64[np.ndarray, "R R"]]:
+    """No bits yet, and the axes in which coordinates have them."""
     centered = _centered(features, sample)
     norms = np.sqrt((centered * centered).sum(axis=1))
     centered, norms = centered[norms > 0], norms[norms > 0]
     if not len(norms):
         raise InputError("compact: all features are the space's mean, which no direction tells from one another")
-    rarity = _rarity(centered, norms)
+    rarity = rarity_of(centered, norms)
     # A cosine weighs an error by what it is an error of.
     row_weight = rarity / np.maximum(norms, 1e-6 * float(norms.max())) ** 2
     _, vectors = np.linalg.eigh((centered * row_weight[:, None]).T @ centered)
     rotated = vectors[:, ::-1]
-    allocation = _BitAllocation(centered @ rotated, row_weight, rarity)
-    while True:
-        allocation.add_bits(8)
-        if max(allocation.errors()) > error and allocation.can_grow:
-            continue
-        compacted, cosines = _encode(features, rows, rotated, allocation)
-        if compacted.error <= error:
-            return compacted, cosines
-        if not allocation.can_grow:
-            raise InputError(
-                f"error={error}: {MAX_BITS} bits a coordinate reach {compacted.error:.2g}; give a larger budget, or "
-                "another form"
-            )
+    return BitAllocation(centered @ rotated, row_weight, rarity), rotated
 
 
 def _centered(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray, "n R"]:
@@ -189,7 +240,7 @@ def _centered(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarra
     return values if features.basis is not None else values - features.mean
 
 
-def _rarity(centered: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+def rarity_of(centered: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """1 over the number of rows that point the same way, which adds up to one for each kind of feature."""
     units = (centered / norms[:, None]).astype(np.float32)
     counts_alike = [
@@ -198,88 +249,11 @@ def _rarity(centered: Float64[np.ndarray, "n R"], norms: Float64[np.ndarray, " n
     return 1 / np.maximum(np.concatenate(counts_alike), 1)
 
 
-class _BitAllocation:
-    """How many bits each coordinate has, and its levels, on a sample."""
-
-    def __init__(
-        self,
-        sample: Float64[np.ndarray, "n R"],
-        row_weight: Float64[np.ndarray, " n"],
-        rarity: Float64[np.ndarray, " n"],
-    ) -> None:
-        self._sample, self._heft, self._rarity = sample, row_weight, rarity
-        count = sample.shape[1]
-        self.bits = np.zeros(count, np.int64)
-        self.levels = [np.zeros(1)] * count
-        self._rounded = np.zeros_like(sample)
-        self._now = row_weight @ sample**2
-        self._next = [self._fit(number, 1) for number in range(count)]
-
-    @property
-    def energy_kept(self) -> float:
-        """Share of the energy that lies in coordinates with bits."""
-        energy = (self._sample**2).sum(axis=0)
-        return float(energy[self.bits > 0].sum() / max(float(energy.sum()), 1e-300))
-
-    @property
-    def can_grow(self) -> bool:
-        """Whether some coordinate may have more bits."""
-        return bool((self.bits < MAX_BITS).any())
-
-    def errors(self) -> tuple[float, float]:
-        """The mean of 1 − cosine over rows, and over kinds."""
-        each = 1 - _cosines(self._sample, self._rounded, (self._sample**2).sum(axis=1))
-        return float(each.mean()), float(self._rarity @ each / self._rarity.sum())
-
-    def add_bits(self, count: int) -> None:
-        """Gives some more bits, each where it lowers the error most."""
-        for _ in range(count):
-            gains = [
-                self._now[number] - self._next[number][0] if self.bits[number] < MAX_BITS else -1.0
-                for number in range(len(self.bits))
-            ]
-            best = int(np.argmax(gains))
-            if self.bits[best] == MAX_BITS:
-                break
-            self._now[best], self.levels[best] = self._next[best]
-            self.bits[best] += 1
-            self._rounded[:, best] = self.levels[best][_nearest(self.levels[best], self._sample[:, best])]
-            if self.bits[best] < MAX_BITS:
-                self._next[best] = self._fit(best, int(self.bits[best]) + 1)
-
-    def _fit(self, number: int, bits: int) -> tuple[float, Float64[np.ndarray, " L"]]:
-        """The weighted error that is left, and the levels: each the mean of what is nearest to it."""
-        values = self._sample[:, number]
-        best: tuple[float, np.ndarray] = (np.inf, np.zeros(1))
-        count = 1 << bits
-        # What levels end as depends on where they begin. Many that share a smooth density lie as dense as its cube root
-        # (Panter and Dite 1951); a few kinds of features are no density, and are found from an even spread.
-        mass, edges = np.histogram(values, BINS, weights=self._heft)
-        filled = np.concatenate(([0], np.cumsum(np.cbrt(mass))))
-        dense = np.interp((np.arange(count) + 0.5) / count * filled[-1], filled, edges)
-        spread = np.linspace(values.min(), values.max(), 2 * count + 1)[1::2]
-        for levels in (dense, spread):
-            for _ in range(ROUNDS):
-                near = _nearest(levels, values)
-                weight = np.bincount(near, self._heft, count)
-                total = np.bincount(near, self._heft * values, count)
-                levels = np.sort(np.where(weight > 0, total / np.where(weight > 0, weight, 1), levels))
-            left = float(self._heft @ (levels[_nearest(levels, values)] - values) ** 2)
-            if left < best[0]:
-                best = (left, levels)
-        return best
-
-
-def _nearest(levels: np.ndarray, values: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """Which of the ascending levels each value is nearest to."""
-    return np.searchsorted((levels[1:] + levels[:-1]) / 2, values)
-
-
 def _encode(
     features: GaussianFeatures,
     rows: Int64[np.ndarray, " n"],
     rotated: Float64[np.ndarray, "R R"],
-    allocation: _BitAllocation,
+    allocation: BitAllocation,
 ) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
     used = np.flatnonzero(allocation.bits)
     bits, levels = allocation.bits[used], [allocation.levels[number].astype(np.float32) for number in used]
@@ -290,12 +264,12 @@ def _encode(
         values = centered @ rotated[:, used]
         ones, rounded = [], np.empty_like(values)
         for number, (each, width) in enumerate(zip(levels, bits, strict=True)):
-            code = _nearest(each, values[:, number])
+            code = nearest_level(each, values[:, number])
             rounded[:, number] = each[code]
             ones.append(code[:, None] >> np.arange(width - 1, -1, -1) & 1)
         codes[start : start + BLOCK] = np.packbits(np.concatenate(ones, axis=1).astype(np.uint8), axis=1)
         squares = (centered**2).sum(axis=1)
-        cosines[start : start + BLOCK] = np.where(squares > 0, _cosines(values, rounded, squares), np.nan)
+        cosines[start : start + BLOCK] = np.where(squares > 0, cosines_of(values, rounded, squares), np.nan)
     axes = rotated[:, used].T
     basis = features.basis
     components = axes if basis is None else axes @ basis.components
@@ -322,11 +296,3 @@ def _encode(
         lowest=float(np.nanquantile(cosines, 0.001)),
     )
     return made, cosines
-
-
-def _cosines(
-    values: Float64[np.ndarray, "n R"], rounded: Float64[np.ndarray, "n R"], squares: Float64[np.ndarray, " n"]
-) -> Float64[np.ndarray, " n"]:
-    """Of rows and what they were rounded to; `squares` are the rows' own, with coordinates that were left out."""
-    norms = np.sqrt(squares) * np.sqrt((rounded**2).sum(axis=1))
-    return np.asarray((values * rounded).sum(axis=1) / np.where(norms > 0, norms, 1))

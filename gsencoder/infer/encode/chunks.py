@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device_names import Device, Precision
@@ -48,10 +48,24 @@ class Chunk:
     Attributes:
         core_rows: rows whose features come from this chunk.
         rows: what the network sees, `core_rows` first.
+        low, high: the box that it was cut to, world units; infinite where the scene was not cut.
+        halo: width of what the network sees around the box.
     """
 
     core_rows: Int64[np.ndarray, " n"]
     rows: Int64[np.ndarray, " m"]
+    low: Float[np.ndarray, "3"]
+    high: Float[np.ndarray, "3"]
+    halo: float
+
+    def seen_around(self, means: Float32[np.ndarray, "N 3"]) -> Float[np.ndarray, " n"]:
+        """How far the network sees around each row of the core before the scene is cut off; infinite where it is not.
+
+        Args:
+            means: of the scene.
+        """
+        points = means[self.core_rows]
+        return self.halo + np.minimum(points - self.low, self.high - points).min(axis=1)
 
 
 def encode_by_chunks(
@@ -117,7 +131,7 @@ def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chun
     """
     all_rows = np.arange(len(means))
     if chunk == 0 or len(means) <= chunk:
-        return [Chunk(core_rows=all_rows, rows=all_rows)]
+        return [Chunk(core_rows=all_rows, rows=all_rows, low=np.full(3, -np.inf), high=np.full(3, np.inf), halo=halo)]
     columns = np.ascontiguousarray(means.T)
     chunks: list[Chunk] = []
     pending = [(all_rows, all_rows, np.full(3, -np.inf), np.full(3, np.inf))]
@@ -126,12 +140,15 @@ def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chun
         # The surroundings of a box lie within those of the box that it was cut from.
         surroundings = _rows_near(columns, surroundings, low - halo, high + halo)
         if len(surroundings) <= chunk or len(core_rows) <= max(1, chunk // 4):
-            halo_rows = np.setdiff1d(surroundings, core_rows, assume_unique=True)
+            halo_rows, width = np.setdiff1d(surroundings, core_rows, assume_unique=True), halo
             if len(surroundings) > chunk:
                 inside = means[halo_rows].clip(low, high)
                 far = np.square(means[halo_rows] - inside).sum(axis=1)
-                halo_rows = halo_rows[np.sort(np.argsort(far, kind="stable")[: chunk - len(core_rows)])]
-            chunks.append(Chunk(core_rows=core_rows, rows=np.concatenate((core_rows, halo_rows))))
+                nearest = np.argsort(far, kind="stable")
+                width = math.sqrt(far[nearest[chunk - len(core_rows)]])
+                halo_rows = halo_rows[np.sort(nearest[: chunk - len(core_rows)])]
+            rows = np.concatenate((core_rows, halo_rows))
+            chunks.append(Chunk(core_rows=core_rows, rows=rows, low=low, high=high, halo=width))
             continue
         points = [column[core_rows] for column in columns]
         axis = int(np.argmax([values.max() - values.min() for values in points]))

@@ -8,6 +8,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device import autocast_dtype, choose_device
+from gsencoder.core.runtime.device_names import Device, Precision
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.store.words import load_tables
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
@@ -54,6 +55,11 @@ class TorchEncoder:
     def voxel(self) -> float:
         """Edge of the finest grid in metres."""
         return self.network.config.voxel
+
+    def precisions(self, device: Device) -> tuple[Precision, ...]:
+        """float32, and bfloat16 where it is cheaper: where `precision=auto` takes it."""
+        cheaper = autocast_dtype("auto", choose_device(device)) is torch.bfloat16
+        return ("float32", "bfloat16") if cheaper else ("float32",)
 
     def encode(
         self,

@@ -12,7 +12,7 @@ from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files.model_files import find_file
-from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.runtime.device_names import Device, Precision
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.infer.onnx.header import FIELDS, OUTPUT, SETTINGS, SUM, OnnxHeader, check_sum, from_metadata
@@ -97,6 +97,10 @@ class OnnxEncoder:
     def words(self) -> TextTable | None:
         """The first of the text tables; None where there is none."""
         return next(iter(self.tables.values()), None)
+
+    def precisions(self, _device: Device) -> tuple[Precision, ...]:
+        """That of the file, which it was exported in."""
+        return ("auto",)
 
     def encode(
         self,

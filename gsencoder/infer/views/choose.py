@@ -44,22 +44,54 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
     Raises:
         InputError: no Gaussians; no targets; frames are asked for where there are none; no camera finds room.
     """
-    gaussians = scene.gaussians
-    if gaussians is None:
+    gaussians = checked_gaussians(scene, targets, config)
+    free = FreeSpace(gaussians)
+    return chosen_views(scene, targets, judge_candidates(scene, gaussians, targets, free, config), free, config)
+
+
+def checked_gaussians(scene: Scene, targets: Sequence[Target], config: ViewsConfig) -> Gaussians:
+    """The Gaussians of a scene in which views can be chosen.
+
+    Raises:
+        InputError: there are none, or no targets.
+    """
+    if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
     if targets or config.method == "greedy":
-        check_targets(targets, gaussians)
-    free = FreeSpace(gaussians)
+        check_targets(targets, scene.gaussians)
+    return scene.gaussians
+
+
+class Judged(NamedTuple):
+    """Candidates, and what they show of each target."""
+
+    candidates: "_Candidates"
+    scores: tuple[ViewScores, ...]
+    blend: BlendConfig
+
+
+def judge_candidates(
+    scene: Scene, gaussians: Gaussians, targets: Sequence[Target], free: FreeSpace, config: ViewsConfig
+) -> Judged:
+    """Places candidates and judges them by small renders; arguments and errors are those of `choose_views`."""
     judged = replace(CONSTANTS.score_blend, near=min(CONSTANTS.score_blend.near, free.cell / 2))
     if config.method == "uniform":
         candidates = _uniform(scene, gaussians, config)
     else:
         candidates = _candidates(scene, gaussians, targets, free, config, judged)
-    cameras = candidates.cameras
-    scores = score_views(gaussians, cameras, targets, side=config.judged_side, config=judged)
+    scores = score_views(gaussians, candidates.cameras, targets, side=config.judged_side, config=judged)
     if scene.views is not None and scene.views.images is not None:
         is_photograph = np.array([frame is not None for frame in candidates.frames])
         scores = tuple(replace_with_photographs(each, is_photograph) for each in scores)
+    return Judged(candidates, scores, judged)
+
+
+def chosen_views(
+    scene: Scene, targets: Sequence[Target], made: Judged, free: FreeSpace, config: ViewsConfig
+) -> ViewSet:
+    """The candidates that show targets best together; see `choose_views`."""
+    candidates, scores, judged = made
+    cameras = candidates.cameras
     values = CoverageObjective(cameras, targets, scores, config)
     if config.method == "uniform":
         order, gains = np.arange(len(cameras)), None

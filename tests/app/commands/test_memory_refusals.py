@@ -93,7 +93,5 @@ def test_settings_that_a_form_or_a_memory_does_not_take_are_refused(
     assert "splats are compared with encoders alone" in refusal(capsys, "export", "/nowhere", *export[1:])
     assert "space: names a teacher of memory=" in refusal(capsys, "export", "space=foo", out)
     packed = ["pack", folder, f"out={tmp_path / 'p'}"]
-    assert "is the budget of form=compact, and form=index has none" in refusal(
-        capsys, *packed, "form=index", "error=0.5"
-    )
+    assert "budget.error: form=npz writes features as they are" in refusal(capsys, *packed, "form=npz", "error=0.5")
     assert "form=compact takes none" in refusal(capsys, *packed, "index.threshold=0.4")

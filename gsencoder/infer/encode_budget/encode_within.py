@@ -1,0 +1,282 @@
+"""Encoding within a budget: the choice of a setting, the encoding, and the check of what was promised."""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.knobs import shown_value
+from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.fusion.feature_error import FieldError, judge
+from gsencoder.fusion.store.folder import features_bytes
+from gsencoder.infer.encode.chunks import EncodeConfig, cut
+from gsencoder.infer.encode_budget.config import EncodeBudget, exact_encoding
+from gsencoder.infer.encode_budget.principal_axes import PrincipalAxes, principal_axes
+from gsencoder.infer.encode_budget.sample import Measured, measure_parts, seen_around
+from gsencoder.infer.load_encoder import Encoder
+from gsencoder.types import GaussianFeatures, Gaussians
+
+HALOS = (0.0, 0.16, 0.32, 0.64, 1.28)
+"""Halos that are chosen among, metres; the last is that of preset=exact."""
+EXPONENT = 0.8
+"""Seconds of a chunk grow with its Gaussians to this power: measured from 7,000 to 216,000 on one thread."""
+COSTS = {"auto": 1.0, "float32": 1.0, "bfloat16": 0.55}
+"""Of precisions. Stated and not measured, so that one scene makes one choice, on a busy machine too."""
+SMALL_SCENE = 20_000
+"""Scenes of fewer Gaussians that are not cut are encoded exactly: choosing would cost more than it saves."""
+SAFETY, DEVIATIONS = 5.0, 2.0
+"""A predicted error counts so many times, and with so many of its standard errors: parts said a third to five times of
+what cuts of whole scenes did."""
+PLANNED = 0.85
+"""Share of the seconds that is planned with."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """A halo and a precision, with what is predicted of them.
+
+    Attributes:
+        config: of the encoding.
+        knobs: values that differ between settings, by name.
+        error: predicted.
+        bound: what the error stays below in all likelihood.
+        cost: of all chunks; 1 = a Gaussian by itself in float32.
+        seconds: of all chunks.
+    """
+
+    config: EncodeConfig
+    knobs: Mapping[str, float | str]
+    error: float
+    bound: float
+    cost: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BudgetEncoding:
+    """An encoding within a budget.
+
+    Attributes:
+        features: by teacher, with as few coordinates as a budget of megabytes asks for.
+        encoded: the same before any were left out.
+        setting: that was chosen.
+        exact: the setting that errors are measured against.
+        ranks: coordinates, by teacher; empty without a budget of megabytes.
+        sampled: Gaussians of the parts that the choice encoded.
+        choosing: seconds of the choice.
+        seconds: from its beginning to the features.
+        predicted: error of the setting and of leaving out coordinates.
+        notes: what budgets in conflict do not keep.
+    """
+
+    features: dict[str, GaussianFeatures]
+    encoded: dict[str, GaussianFeatures]
+    setting: Setting
+    exact: EncodeConfig
+    ranks: dict[str, int]
+    sampled: int
+    choosing: float
+    seconds: float
+    predicted: float
+    notes: tuple[str, ...]
+
+
+def encode_within(
+    gaussians: Gaussians,
+    encoder: Encoder,
+    teachers: Sequence[str],
+    config: EncodeConfig,
+    budget: EncodeBudget,
+    *,
+    metres_per_unit: float = 1.0,
+    header: Mapping[str, Any] = {},
+    track: Track = untracked,
+    clock: Callable[[], float] = time.perf_counter,
+) -> BudgetEncoding:
+    """Encodes a splat by the setting that keeps a budget.
+
+    Args:
+        gaussians: the splat.
+        encoder: from `load_encoder`.
+        teachers: whose features are wanted.
+        config: options that the budget does not choose.
+        budget: at least one promise.
+        metres_per_unit: see `Encoder.encode`.
+        header: what the files of features say of their making, which takes bytes.
+        track: wraps the loop over chunks to show progress.
+        clock: seconds.
+
+    Raises:
+        InputError: no budget, megabytes into which not even one coordinate fits, or what encoding refuses.
+    """
+    if not budget.given:
+        raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
+    start = clock()
+    exact = replace(exact_encoding(config), precision=encoder.precisions(config.device)[0])
+    if budget.megabytes is not None and budget.error is None:
+        _check_size(encoder, teachers, len(gaussians), header, budget.megabytes)
+    settings, sampled = all_settings(gaussians, encoder, exact, budget, metres_per_unit=metres_per_unit, clock=clock)
+    setting, notes = _chosen(settings, budget, clock() - start)
+    chosen = clock()
+    made = encoder.encode_spaces(gaussians, setting.config, metres_per_unit=metres_per_unit, track=track)
+    encoded = {name: made[name] for name in teachers}
+    features, ranks, left_out = encoded, dict[str, int](), 0.0
+    if budget.megabytes is not None:
+        features, ranks, left_out, said = _within_megabytes(encoded, header, setting, budget)
+        notes += said
+    return BudgetEncoding(
+        features=features,
+        encoded=encoded,
+        setting=setting,
+        exact=exact,
+        ranks=ranks,
+        sampled=sampled,
+        choosing=chosen - start,
+        seconds=clock() - start,
+        predicted=min(setting.error + left_out, 1.0),
+        notes=notes,
+    )
+
+
+def all_settings(
+    gaussians: Gaussians,
+    encoder: Encoder,
+    exact: EncodeConfig,
+    budget: EncodeBudget,
+    *,
+    metres_per_unit: float,
+    clock: Callable[[], float] = time.perf_counter,
+) -> tuple[list[Setting], int]:
+    """All settings, the exact one first, and the number of Gaussians that were encoded to predict them."""
+    is_cut = bool(exact.chunk) and len(gaussians) > exact.chunk
+    precisions, timed = encoder.precisions(exact.device), budget.seconds is not None
+    if len(gaussians) < SMALL_SCENE and not is_cut and not timed:
+        precisions = precisions[:1]
+    parts: list[Measured] = []
+    if is_cut or len(precisions) > 1 or timed:
+        parts = measure_parts(
+            gaussians,
+            encoder,
+            exact,
+            precisions,
+            is_cut=is_cut,
+            metres_per_unit=metres_per_unit,
+            seed=budget.seed,
+            timed=timed,
+            clock=clock,
+        )
+    settings = []
+    for halo in reversed(HALOS) if is_cut else (exact.halo,):
+        chunks = cut(gaussians.means, exact.chunk, halo / metres_per_unit)
+        seen = seen_around(gaussians, chunks) * metres_per_unit
+        # Where the exact setting cuts the scene is right by definition.
+        seen = np.full_like(seen, np.inf) if halo == exact.halo else seen
+        sizes = np.array([len(chunk.rows) for chunk in chunks], np.float64)
+        for precision in precisions:
+            errors = np.array([part.error(precision, seen) for part in parts] or [0.0])
+            if halo == exact.halo and precision == precisions[0]:
+                errors = np.zeros(1)
+            error, deviation = float(errors.mean()), float(errors.std() / max(len(errors) - 1, 1) ** 0.5)
+            paces = [part.seconds[precision] * ((sizes / part.rows) ** EXPONENT).sum() for part in parts]
+            config = replace(exact, halo=halo, precision=precision)
+            settings.append(
+                Setting(
+                    config=config,
+                    knobs={"precision": precision, **({"halo": halo} if is_cut else {})},
+                    error=error,
+                    bound=min(SAFETY * error + DEVIATIONS * deviation, 1.0),
+                    cost=float((sizes**EXPONENT).sum()) * COSTS[precision],
+                    seconds=float(min(paces, default=0.0)),
+                )
+            )
+    return settings, sum(part.rows for part in parts)
+
+
+def _chosen(settings: Sequence[Setting], budget: EncodeBudget, spent: float) -> tuple[Setting, tuple[str, ...]]:
+    """The setting, and what is to be said."""
+
+    def exactness(each: Setting) -> tuple[float, float]:
+        return each.error, each.cost
+
+    if budget.error is not None:
+        limit = budget.error
+        chosen = min((each for each in settings if each.bound <= limit), key=lambda each: (each.cost, each.error))
+        needed = spent + chosen.seconds
+        conflict = budget.seconds is not None and needed > budget.seconds
+        return chosen, (budget.conflict("error", "seconds", needed),) if conflict else ()
+    if budget.seconds is None:
+        return min(settings, key=exactness), ()
+    fitting = [each for each in settings if spent + each.seconds <= PLANNED * budget.seconds]
+    if fitting:
+        return min(fitting, key=exactness), ()
+    fastest = min(settings, key=lambda each: (each.seconds, each.error))
+    needed = spent + fastest.seconds
+    return fastest, (f"{budget.shown('seconds')}: the fastest setting takes about {needed:.3g} s; it is used",)
+
+
+def _check_size(encoder: Encoder, teachers: Sequence[str], count: int, header: Mapping[str, Any], size: float) -> None:
+    """Refuses a size into which not even one coordinate of each teacher fits."""
+    least = sum(features_bytes(encoder.spaces[name], count, 1, header) for name in teachers)
+    if least > size * MEGABYTE:
+        raise InputError(
+            f"budget.megabytes={shown_value(size)}: one coordinate of each Gaussian takes "
+            f"{math.ceil(least / 10) / 1e5:.6g}; give more"
+        )
+
+
+def _within_megabytes(
+    encoded: Mapping[str, GaussianFeatures], header: Mapping[str, Any], setting: Setting, budget: EncodeBudget
+) -> tuple[dict[str, GaussianFeatures], dict[str, int], float, tuple[str, ...]]:
+    """Features with as many coordinates as fit, or as a promised error needs; their numbers, the error that this adds,
+    and what is to be said."""
+    assert budget.megabytes is not None
+    limit = budget.megabytes * MEGABYTE
+
+    def bytes_of(name: str, rank: int) -> int:
+        features = encoded[name]
+        # All channels have no basis, which takes bytes of its own.
+        whole = features.basis is None and rank == features.features.shape[1]
+        return features_bytes(features.space, len(features), rank, header, basis=not whole)
+
+    full = {name: features.features.shape[1] for name, features in encoded.items()}
+    sizes = {name: bytes_of(name, rank) for name, rank in full.items()}
+    ranks, axes = dict(full), dict[str, PrincipalAxes]()
+    if sum(sizes.values()) > limit:
+        for name, features in encoded.items():
+            share, axes[name] = limit * sizes[name] / sum(sizes.values()), principal_axes(features)
+            fitting = [rank for rank in range(1, full[name] + 1) if bytes_of(name, rank) <= share]
+            needed = 1
+            if budget.error is not None:
+                needed = axes[name].rank_within(budget.error - setting.bound)
+            ranks[name] = max([needed, *fitting])
+    reduced = {
+        name: each if ranks[name] == full[name] else axes[name].reduced(each, ranks[name])
+        for name, each in encoded.items()
+    }
+    left_out = max((axes[name].left_out(ranks[name]) for name in axes), default=0.0)
+    size = sum(bytes_of(name, rank) for name, rank in ranks.items())
+    broken = size > limit and budget.error is not None
+    notes = (budget.conflict("error", "megabytes", size / MEGABYTE),) if broken else ()
+    return reduced, ranks, left_out, notes
+
+
+def realised_error(
+    made: BudgetEncoding,
+    gaussians: Gaussians,
+    encoder: Encoder,
+    *,
+    metres_per_unit: float = 1.0,
+    seed: int = 0,
+    track: Track = untracked,
+) -> dict[str, FieldError]:
+    """The error of each teacher's features against those of the exact setting, on a tenth of the Gaussians, drawn now.
+    Where the exact setting was chosen, nothing is encoded again."""
+    exact: Mapping[str, GaussianFeatures] = made.encoded
+    if made.setting.config != made.exact:
+        exact = encoder.encode_spaces(gaussians, made.exact, metres_per_unit=metres_per_unit, track=track)
+    return {name: judge(features, exact[name], seed=seed) for name, features in made.features.items()}
