@@ -22,11 +22,12 @@ from gsencoder.models.weights import save_weights
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians
 
+# One level: the spaces are columns of what follows, and a graph of two takes twice as long to make.
 SHAPE = TransformerConfig(
-    encoder_depths=(1, 1),
-    encoder_channels=(16, 32),
-    decoder_depths=(1,),
-    decoder_channels=(16,),
+    encoder_depths=(1,),
+    encoder_channels=(16,),
+    decoder_depths=(),
+    decoder_channels=(),
     head_channels=8,
     patch=24,
 )
