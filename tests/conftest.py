@@ -5,7 +5,7 @@ import os
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Before torch counts the cores: small arrays are slower on two threads, and another process has the other core.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    # Where gsply runs a kernel of numba in parallel, OpenMP, and torch with it, has as many threads as numba ever after.
+    # Once gsply has run a parallel kernel of numba, OpenMP, and torch with it, has as many threads as numba.
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 # Vectors of phrases are not cached in the user's folder.
