@@ -5,12 +5,15 @@ import os
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Before torch counts the cores: small arrays are slower on two threads, and another process has the other core.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # Once gsply has run a parallel kernel of numba, OpenMP, and torch with it, has as many threads as numba.
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 # Vectors of phrases are not cached in the user's folder.
 os.environ["GSENCODER_CACHE"] = "off"
 # A test that needs a model names its folder: with a developer's own models in reach, it could pass for them alone.
 os.environ.pop("GSENCODER_MODELS", None)
 
+import gc
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +28,17 @@ from jaxtyping import config as jaxtyping_config
 # How long an example takes says something about the machine, and the first one imports half the package.
 settings.register_profile("no_deadline", deadline=None)
 settings.load_profile("no_deadline")
+
+
+# What a test sees of a sync are its errors, which tests raise in its stead; the waiting is the disk's.
+os.fsync = os.fstat  # type: ignore[assignment]
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Modules and collected tests live to the end, so that the collector need not look at them again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 10, 10)
 
 
 @pytest.fixture(scope="session")

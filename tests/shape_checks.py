@@ -3,8 +3,8 @@
 jaxtyping's import hook decorates each function, those inside functions anew at every call of the outer one, with its
 `jaxtyped`. That compiles two functions for each, which takes a millisecond, and checks the arguments twice. Here the
 checks of a function are compiled at its first call and once for all closures of one `def`, and arguments are checked
-once. What is checked is the same: the arguments before the call, what it returns after it, with one meaning of the
-names of axes for both.
+once; the names of axes are looked after only where a function has some. What is checked is the same: the arguments
+before the call, what it returns after it, with one meaning of the names of axes for both.
 """
 
 import inspect
@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import is_dataclass
 from functools import wraps
 from types import FunctionType
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, ForwardRef, Literal, TypeVar, get_args, get_origin
 
 import jaxtyping
 from beartype import beartype
@@ -20,6 +20,8 @@ from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import config
 
 _jaxtyped = jaxtyping.jaxtyped
+_axes_of_one_call = _jaxtyped("context")
+"""Names of axes have new meanings within; it holds nothing, so that one serves all calls."""
 
 
 class Checks:
@@ -29,6 +31,7 @@ class Checks:
         self._resolved = {name: _resolved(each, function) for name, each in function.__annotations__.items()}
         self._result = self._resolved.pop("return", Any)
         self._function = function
+        self._names_axes = any(map(_names_axes, (*self._resolved.values(), self._result)))
         self._compiled = False
 
     def compile(self) -> None:
@@ -47,16 +50,21 @@ class Checks:
     def call(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         if not self._compiled:
             self.compile()
-        with _jaxtyped("context"):
-            try:
-                self.arguments(*args, **kwargs)
-            except BeartypeCallHintViolation as error:
-                raise jaxtyping.TypeCheckError(str(error)) from error
-            value = function(*args, **kwargs)
-            try:
-                return self.result(value)
-            except BeartypeCallHintViolation as error:
-                raise jaxtyping.TypeCheckError(str(error)) from error
+        if not self._names_axes:
+            return self._checked(function, args, kwargs)
+        with _axes_of_one_call:
+            return self._checked(function, args, kwargs)
+
+    def _checked(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        try:
+            self.arguments(*args, **kwargs)
+        except BeartypeCallHintViolation as error:
+            raise jaxtyping.TypeCheckError(str(error)) from error
+        value = function(*args, **kwargs)
+        try:
+            return self.result(value)
+        except BeartypeCallHintViolation as error:
+            raise jaxtyping.TypeCheckError(str(error)) from error
 
 
 _checks: dict[Hashable, Checks] = {}
@@ -74,7 +82,7 @@ def checked(target: Any = None, *, typechecker: Any) -> Any:
         if is_dataclass(target) and not hasattr(target.__init__, "has_checks"):
             target.__init__ = checked(target.__init__, typechecker=typechecker)
         return target
-    if not isinstance(target, FunctionType) or inspect.isgeneratorfunction(target) or _names_arguments(target):
+    if not isinstance(target, FunctionType) or _names_arguments(target):
         return _jaxtyped(target, typechecker=typechecker)
     key = (target.__code__, tuple((name, _meaning(each)) for name, each in target.__annotations__.items()))
     checks = _checks.get(key)
@@ -100,6 +108,19 @@ def _meaning(annotation: Any) -> Hashable:
     if get_args(annotation) and get_origin(annotation) is not Literal:
         return get_origin(annotation), tuple(map(_meaning, get_args(annotation)))
     return annotation if isinstance(annotation, Hashable) else id(annotation)
+
+
+def _names_axes(annotation: Any) -> bool:
+    """Whether an annotation has an array or a tree in it, or may have: a name in quotes is looked up later."""
+    if isinstance(annotation, (list, tuple)):
+        return any(map(_names_axes, annotation))
+    if get_origin(annotation) is not Literal and get_args(annotation):
+        return any(map(_names_axes, get_args(annotation)))
+    if isinstance(annotation, TypeVar):
+        return _names_axes((annotation.__bound__, *annotation.__constraints__))
+    if inspect.isclass(annotation):
+        return issubclass(annotation, jaxtyping.AbstractArray) or annotation.__module__.startswith("jaxtyping")
+    return isinstance(annotation, (str, ForwardRef))
 
 
 def _names_arguments(function: FunctionType) -> bool:

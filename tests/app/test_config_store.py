@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -20,6 +21,13 @@ MISSING = object()
 
 def config_of(command: str) -> type[CommonConfig]:
     return COMMANDS[command].load()[0]
+
+
+@cache
+def composed_with(command: str, word: str) -> CommonConfig:
+    """The settings with one word, which several tests look at: composing takes a tenth of a second."""
+    cls = config_of(command)
+    return compose(command, cls, [word], choices=choices_of(cls))
 
 
 def value_at(data: Any, key: str) -> Any:
@@ -49,11 +57,9 @@ def test_composed_defaults_are_those_of_the_dataclass(command: str) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.slow
 def test_a_member_of_a_choice_has_the_defaults_of_its_dataclass(command: str) -> None:
-    cls = config_of(command)
-    choices = choices_of(cls)
-    for key, member in union_members(cls):
+    for key, member in union_members(config_of(command)):
         word = f"{key.replace('.', '/')}={member_name(member)}"
-        assert value_at(compose(command, cls, [word], choices=choices), key) == member()
+        assert value_at(composed_with(command, word), key) == member()
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -63,7 +69,7 @@ def test_every_member_of_every_choice_composes_and_the_default_one_changes_nothi
     choices = choices_of(cls)
     for group, members in choices.groups.items():
         for member in members:
-            config = compose(command, cls, [f"{group}={member}"], choices=choices)
+            config = composed_with(command, f"{group}={member}")
             assert (config == cls()) == (member == choices.chosen[group])
 
 
@@ -137,7 +143,7 @@ def test_a_yaml_file_is_a_member_of_a_choice_and_sets_only_what_differs(path: Pa
         word for word in base if word[: len(group)] != group
     }
     before = settings(compose(commands[0], cls, base))
-    after = settings(compose(commands[0], cls, [f"{group}={path.stem}"]))
+    after = settings(composed_with(commands[0], f"{group}={path.stem}"))
     keys = list(leaves(data, "" if group == EXPERIMENT else group.replace("/", ".") + "."))
     assert keys
     # Several experiments can be composed, so one may also set back what another of them changes.

@@ -1,5 +1,6 @@
 """Work in pieces: in order, and within work in pieces."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -93,3 +94,18 @@ def test_without_torch_there_are_as_many_threads_as_the_environment_says(stated:
         f"sys.exit('torch' in sys.modules or thread_count() != {expected if expected != 'cores' else 'cores'})"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.slow
+def test_a_parallel_loop_of_gsply_leaves_torch_the_threads_of_the_environment() -> None:
+    code = (
+        "import sys, torch\n"
+        "from splat_samples import make_raw\n"
+        "from gsencoder.data.splat_formats.compressed_ply import packed_bytes\n"
+        "assert torch.get_num_threads() == 1\n"
+        "packed_bytes(make_raw())\n"
+        "sys.exit(torch.get_num_threads() != 1)"
+    )
+    path = os.pathsep.join(each for each in sys.path if each)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "2", "PYTHONPATH": path}
+    assert subprocess.run([sys.executable, "-c", code], check=False, env=environment).returncode == 0

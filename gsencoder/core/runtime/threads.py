@@ -69,6 +69,19 @@ def threads_of_torch(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@contextlib.contextmanager
+def threads_unchanged() -> Iterator[None]:
+    """Gives torch the threads again that it had before the block. Where a library runs a parallel loop of numba, OpenMP
+    has as many threads as numba ever after, and torch with it."""
+    torch = sys.modules.get("torch")
+    before = torch.get_num_threads() if torch is not None else 0
+    try:
+        yield
+    finally:
+        if torch is not None:
+            torch.set_num_threads(before)
+
+
 def parallel(work: Callable[[int], Any], pieces: Iterable[int]) -> list[Any]:
     """Runs `work` for each piece in `thread_count` threads, and returns the results in order. A nested call runs its
     pieces one after the other, since all threads are busy."""

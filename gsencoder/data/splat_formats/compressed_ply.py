@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.threads import threads_unchanged
 from gsencoder.data.splat_formats.ply import PlyHeader, element_start
 from gsencoder.data.splat_formats.raw import RawSplat, logits_from_opacities, quats_from_smallest_three
 from gsencoder.types import sh_from_colors
@@ -109,9 +110,10 @@ def packed_bytes(raw: RawSplat) -> bytes:
     from gsply import compress_to_bytes
 
     rest = raw.sh[:, 1:] if raw.sh.shape[1] > 1 else None
-    data = compress_to_bytes(
-        raw.means.astype(np.float32), raw.log_scales, raw.quats, raw.logit_opacities, raw.sh[:, 0], rest
-    )
+    with threads_unchanged():
+        data = compress_to_bytes(
+            raw.means.astype(np.float32), raw.log_scales, raw.quats, raw.logit_opacities, raw.sh[:, 0], rest
+        )
     return bytes(data)
 
 
