@@ -31,6 +31,9 @@ class Stub:
         self.spaces = {name: FeatureSpace(name=name, channels=2, text_encoder=f"{name}-words") for name in WORDS}
         self.words = next(iter(tables.values()), None)
 
+    def precisions(self, device: str) -> tuple[str, ...]:
+        return ("float32",)
+
     def encode_spaces(self, gaussians: Gaussians, *_: object, **__: object) -> dict[str, GaussianFeatures]:
         rows = np.ones((len(gaussians), 2), np.float32)
         return {
