@@ -79,7 +79,7 @@ def test_fusion_is_measured_against_the_exact_features_and_the_budget_advises(
 
 def test_words_packages_and_views_have_scores_of_their_own(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    sweep = ["sweep.knobs=relative,form,candidates", "sweep.values=relative:0.9,form:index/npz,candidates:4"]
+    sweep = ["sweep.knobs=relative,form,candidates", "sweep.values=[relative:0.9,form:index/npz,candidates:4]"]
     sweep += ["choose.candidates=8", "choose.count=2", "choose.width=64", "choose.height=48", "quiet=true"]
     stages = "stages=[localization,packages,views]"
     assert cli.main(words_of(scene, stages, "preset=exact", *sweep, f"out={out}")) == 0
