@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from gsencoder.evaluate.tradeoff.sweep import StageResult
 
 TEMPLATE = Path(__file__).with_name("plot.html")
 DATA = "/*DATA*/"
+OFFSETS = (((6, 4), "left"), ((6, -11), "left"), ((-6, 4), "right"), ((-6, -11), "right"))
+"""Where labels stand relative to their points, and the side at which they begin."""
+Label = tuple[str, tuple[float, float]]
 COST_NAMES = {
     "cpu_seconds": "CPU seconds a scene",
     "seconds": "seconds a scene",
@@ -67,6 +71,10 @@ def picture(stages: Sequence[StageResult]) -> bytes:
         _panel(axes, stage)
     for axes in panels[len(stages) :]:
         axes.set_visible(False)
+    # Where points and legends are is known once they are drawn.
+    canvas.draw()
+    for axes, stage in zip(panels, stages, strict=False):
+        label_points(axes, _labels(stage))
     stream = io.BytesIO()
     canvas.print_png(stream)
     return stream.getvalue()
@@ -74,7 +82,7 @@ def picture(stages: Sequence[StageResult]) -> bytes:
 
 def _panel(axes: Any, stage: StageResult) -> None:
     accuracy = stage.stage.accuracy
-    shown = [each for each in stage.results if each.score(accuracy) == each.score(accuracy)]
+    shown = _measured(stage)
     colors = {name: f"C{number}" for number, name in enumerate(dict.fromkeys(map(_group, shown)))}
     labeled: set[str] = set()
     for each in shown:
@@ -91,9 +99,6 @@ def _panel(axes: Any, stage: StageResult) -> None:
         labeled.add(group)
         if each.on_front:
             axes.scatter(*point, s=180, facecolors="none", edgecolors="black", linewidths=1.1, zorder=4)
-        if each.phase != "joint":
-            text = ", ".join(str(value) for value in each.knobs.values())
-            axes.annotate(text, point, xytext=(6, 4), textcoords="offset points", fontsize=7)
     axes.set_xlabel(COST_NAMES[stage.cost])
     axes.set_ylabel(accuracy + (" (more is better)" if HIGHER_IS_BETTER[accuracy] else " (less is better)"))
     axes.set_title(f"{stage.stage.name} (ringed: on the Pareto front)")
@@ -102,6 +107,49 @@ def _panel(axes: Any, stage: StageResult) -> None:
     axes.set_axisbelow(True)
     if shown:
         axes.legend(fontsize=7)
+
+
+def _measured(stage: StageResult) -> list[SettingResult]:
+    """The settings whose accuracy is a number."""
+    return [each for each in stage.results if not math.isnan(each.score(stage.stage.accuracy))]
+
+
+def _labels(stage: StageResult) -> list[Label]:
+    """The values of settings, and the points that they belong to."""
+    return [
+        (
+            ", ".join(str(value) for value in each.knobs.values()),
+            (each.cost(stage.cost), each.score(stage.stage.accuracy)),
+        )
+        for each in _measured(stage)
+        if each.knobs and each.phase != "joint"
+    ]
+
+
+def label_points(axes: Any, labels: Sequence[Label]) -> list[Any]:
+    """Writes labels beside points, each at the first of `OFFSETS` where it covers no other label.
+
+    Args:
+        axes: a panel that was drawn.
+        labels: texts, and their points in the panel's units.
+
+    Returns:
+        Their annotations; a label for which there is no room is left out.
+    """
+    renderer = axes.figure.canvas.get_renderer()
+    legend = axes.get_legend()
+    taken = [] if legend is None else [legend.get_window_extent(renderer)]
+    notes = []
+    for text, point in labels:
+        for offset, side in OFFSETS:
+            note = axes.annotate(text, point, xytext=offset, textcoords="offset points", fontsize=7, ha=side)
+            box = note.get_window_extent(renderer)
+            if box.count_overlaps(taken) == 0:
+                taken.append(box)
+                notes.append(note)
+                break
+            note.remove()
+    return notes
 
 
 def _group(result: SettingResult) -> str:

@@ -46,7 +46,10 @@ class SweepConfig:
     knobs: tuple[str, ...] = field(default=(), metadata={"names": True, "help": "knobs that are tried; empty = all"})
     values: tuple[str, ...] = field(
         default=(),
-        metadata={"names": True, "help": "values in place of the usual ones, KNOB:VALUE/VALUE, such as views:4/8,rays_per_patch:1"},
+        metadata={
+            "names": True,
+            "help": "values in place of the usual ones, KNOB:VALUE/VALUE, such as views:4/8,rays_per_patch:1",
+        },
     )
     grid: bool = field(default=False, metadata={"help": "try all combinations instead of changing one knob at a time"})
     rounds: int = field(default=3, metadata={"help": "timed runs of each setting, of which the median is reported"})
