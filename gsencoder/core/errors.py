@@ -7,6 +7,7 @@ and exits with code 2; any other exception is a bug and is shown with its traceb
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 
 class InputError(ValueError):
@@ -64,3 +65,16 @@ def renamed_options(section: str, typed: str, options: Iterable[str]) -> Iterato
         key = rf"(?<![\w./\\-]){re.escape(section)}\.(?=(?:{'|'.join(map(re.escape, options))})\b)"
         message = re.sub(key, lambda _: f"{typed}.", str(error))
         raise error if message == str(error) else type(error)(message) from error
+
+
+@contextmanager
+def readable(path: str | Path) -> Iterator[None]:
+    """Turns an error of the system in the block into one that names the file: an error of reading does not.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error

@@ -14,6 +14,8 @@ from gsencoder.core.knobs import shown_value, value_at
 PROMISES = {"error": "", "seconds": " s", "megabytes": " MB"}
 """What can be promised, with its unit. Where promises conflict, the one that stands first wins."""
 MEGABYTE = 1_000_000
+PLANNED = 0.85
+"""Share of promised seconds that is planned with, since times vary."""
 
 
 class Budget:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float16, UInt8
 from PIL import Image
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.core.files.sealed_rows import sealed, unsealed
@@ -62,11 +62,9 @@ class PromptStore:
         path = folder / PROMPTS_FILE
         if not path.is_file():
             return
-        try:
+        with readable(path):
             # What follows the last line break was cut off.
             lines = path.read_bytes().split(b"\n")[:-1]
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
         for number, line in enumerate(lines, start=1):
             try:
                 self._take(unsealed(json.loads(line)))

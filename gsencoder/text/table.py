@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, about, readable
 from gsencoder.core.files.archive import open_archive, warn_without_checksums, write_archive
-from gsencoder.core.files.model_files import readable
 from gsencoder.core.files.npz import read_npz
 from gsencoder.text.towers import TowerRecord
 from gsencoder.types import FeatureSpace

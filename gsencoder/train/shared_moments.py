@@ -86,11 +86,11 @@ def sampled_moments(
         files = [folder / f"{len(every) + number:05d}.safetensors" if folder else None for number in range(len(blocks))]
         with fail_together():
             share = range(process.rank, len(blocks), process.world_size)
-            own = {
+            computed = {
                 number: _block(blocks[number], open_scene, space, files[number], optional=optional)
                 for number in track(share, "fitting the basis")
             }
-        made = {number: block for of_process in values_of_all(own) for number, block in of_process.items()}
+        made = {number: block for of_process in values_of_all(computed) for number, block in of_process.items()}
         in_order = [made[number] for number in range(len(blocks))]
         every += zip(files, blocks, in_order, strict=True)
         for block in in_order:
@@ -99,8 +99,8 @@ def sampled_moments(
     total = Moments(space.channels)
     with fail_together():
         if process.is_first:
-            for file, asked, block in every:
-                total.merge(_moments(block, asked, open_scene, space, file, optional=optional))
+            for file, requests, block in every:
+                total.merge(_moments(block, requests, open_scene, space, file, optional=optional))
     return value_of_first(total), tuple(kinds)
 
 

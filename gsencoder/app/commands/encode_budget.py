@@ -11,7 +11,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import settings
 from gsencoder.core.promises import MEGABYTE
 from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode_budget.config import EncodeBudget
+from gsencoder.infer.encode_budget.config import EncodeBudget, exact_encoding
 from gsencoder.infer.encode_budget.encode_within import BudgetEncoding, encode_within, realised_error
 from gsencoder.infer.load_encoder import Encoder
 from gsencoder.types import Scene
@@ -42,7 +42,7 @@ def encode_in_budget(
     """Chooses a setting and encodes; says which setting that is, and what is predicted of it."""
     assert scene.gaussians is not None
     # Of the settings, those that take the most bytes in the files.
-    longest = replace(config.encode, precision="bfloat16", halo=1.28)
+    longest = replace(exact_encoding(config.encode), precision="bfloat16")
     made = encode_within(
         scene.gaussians,
         encoder,

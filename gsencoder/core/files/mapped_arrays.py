@@ -1,6 +1,5 @@
 """Memory-mapped arrays of an archive: only the blocks that are used are read, and processes share them."""
 
-import json
 import mmap
 import os
 from collections.abc import Mapping
@@ -9,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int, Int64, UInt8
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.archive import DAMAGED, open_archive
 from gsencoder.core.files.checksums import BLOCK_BYTES, damaged_blocks
+from gsencoder.core.files.safetensors_bytes import array_offsets
 
 
 class MappedArrays:
@@ -38,19 +38,17 @@ class MappedArrays:
         with open_archive(path) as file:
             shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in types.items()}
             self._checksums = file.checksums
-        with path.open("rb") as stream:
-            state = os.fstat(stream.fileno())
+        with about(path), path.open("rb") as stream:
+            state, offsets = os.fstat(stream.fileno()), array_offsets(stream)
             self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self._stamp = (state.st_ino, state.st_size, state.st_mtime_ns)
         self._check_size()
         raw = np.frombuffer(self._map, np.uint8)
-        begin = 8 + int.from_bytes(raw[:8].tobytes(), "little")
-        entries = json.loads(raw[8:begin].tobytes())
         self._bytes: dict[str, UInt8[np.ndarray, " bytes"]] = {}
         self._arrays: dict[str, np.ndarray] = {}
         for name, (dtype, _) in types.items():
-            first, last = entries[name]["data_offsets"]
-            self._bytes[name] = raw[begin + first : begin + last]
+            first, last = offsets[name]
+            self._bytes[name] = raw[first:last]
             self._arrays[name] = self._bytes[name].view(dtype).reshape(shapes[name])
         self._unchecked: dict[str, np.ndarray] = {}
         if self._checksums is not None:

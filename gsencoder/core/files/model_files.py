@@ -2,29 +2,14 @@
 
 import hashlib
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, readable
 
 MODELS_VARIABLE = "GSENCODER_MODELS"
 BLOCK_BYTES = 1 << 24
 POINTER = b"version https://git-lfs"
 """What files begin with that stand for large ones in a repository."""
-
-
-@contextmanager
-def readable(path: Path) -> Iterator[None]:
-    """Turns an error of the system in the block into one that names the file: an error of reading does not.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def check_fetched(path: Path) -> None:

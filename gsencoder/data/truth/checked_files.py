@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files.written_files import check_written
 
 SCENE_BYTES = 256 << 20
@@ -51,10 +51,8 @@ def read_checked(path: Path, *, max_bytes: int = SCENE_BYTES) -> bytes:
         InputError: as `check_file`, or the file cannot be read.
     """
     check_file(path, max_bytes=max_bytes)
-    try:
+    with readable(path):
         return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def read_checked_text(path: Path, *, max_bytes: int = SCENE_BYTES) -> str:

@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, readable
 from gsencoder.data.splat_formats.ply import PlyElement, PlyHeader, read_header, read_property
 
 MAX_VERTICES = 100_000_000
@@ -62,10 +62,8 @@ def read_vertex_labels(path: Path) -> Int32[np.ndarray, " V"]:
 
 
 def _opened(path: Path) -> BinaryIO:
-    try:
+    with readable(path):
         return path.open("rb")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _header(path: Path, stream: BinaryIO) -> tuple[PlyHeader, int]:

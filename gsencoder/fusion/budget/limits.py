@@ -4,14 +4,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.promises import MEGABYTE, PLANNED
 from gsencoder.fusion.budget.config import BudgetConfig
 from gsencoder.fusion.budget.rank import RankErrors, file_bytes, rank_of_bytes
 from gsencoder.fusion.budget.settings import Setting, most_exact
 from gsencoder.fusion.coverage.sight import Sight
-
-PLANNED = 0.85
-"""Share of the seconds that is planned with: times vary, and what comes before and after the views takes some, too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

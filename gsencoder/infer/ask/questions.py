@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, about, readable
 from gsencoder.core.files.written_files import check_written
 from gsencoder.data.truth.checked_files import read_checked_text
 from gsencoder.infer.ask.ask import Question
@@ -112,10 +112,8 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
     if not path.exists():
         return {}
     check_written(path)
-    try:
+    with readable(path):
         lines = path.read_bytes().split(b"\n")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     questions = {}
     for number, line in enumerate(lines[:-1], start=1):
         try:

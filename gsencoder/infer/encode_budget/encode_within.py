@@ -10,7 +10,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.knobs import shown_value
-from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.promises import MEGABYTE, PLANNED
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.fusion.feature_error import FieldError, judge
 from gsencoder.fusion.store.folder import features_bytes
@@ -32,8 +32,6 @@ SMALL_SCENE = 20_000
 SAFETY, DEVIATIONS = 5.0, 2.0
 """A predicted error counts so many times, and with so many of its standard errors: parts said a third to five times of
 what cuts of whole scenes did."""
-PLANNED = 0.85
-"""Share of the seconds that is planned with."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

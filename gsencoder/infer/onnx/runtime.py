@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.errors import InputError, SceneWarning, about, readable
 from gsencoder.core.files.model_files import find_file
 from gsencoder.core.runtime.device_names import Device, Precision
 from gsencoder.core.runtime.tracking import Track, untracked
@@ -46,10 +46,8 @@ class OnnxEncoder:
                 device.
         """
         self.name = "the model" if isinstance(file, bytes) else str(find_file(str(file), "weights"))
-        try:
+        with readable(self.name):
             model = file if isinstance(file, bytes) else Path(self.name).read_bytes()
-        except OSError as error:
-            raise InputError(f"{self.name}: cannot be read: {error.strerror or error}") from error
         with about(self.name):
             summed = check_sum(model)
         self._session = open_session(model, self.name, device, threads)
@@ -236,7 +234,8 @@ def open_session(model: bytes, name: str, device: Device, threads: int = 0) -> A
     if threads:
         options.intra_op_num_threads = threads
     providers: list[Any] = [CPU]
-    if device != "cpu" and CUDA in available:
+    on_gpu = device != "cpu" and CUDA in available
+    if on_gpu:
         # TensorFloat-32, onnxruntime's default, moves features by 2 % of the largest.
         providers.insert(0, (CUDA, {"use_tf32": "0"}))
         _load_cuda()
@@ -244,7 +243,7 @@ def open_session(model: bytes, name: str, device: Device, threads: int = 0) -> A
         session = onnxruntime.InferenceSession(model, options, providers=providers)
     except Exception as error:  # as above
         raise InputError(f"{name}: is no model that onnxruntime reads, or damaged: {_first_line(error)}") from error
-    if len(providers) > len(session.get_providers()):
+    if on_gpu and CUDA not in session.get_providers():
         # onnxruntime falls back to the CPU by itself.
         problem = "onnxruntime has a GPU provider, and could not load CUDA or cuDNN for it"
         if device == "cuda":

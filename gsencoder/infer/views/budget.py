@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import Budget, check_governed
+from gsencoder.core.promises import PLANNED, Budget, check_governed
 from gsencoder.infer.views.choose import Judged, checked_gaussians, chosen_views, judge_candidates
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
@@ -16,8 +16,6 @@ GOVERNED = ("candidates",)
 """The options of the choice that a budget sets."""
 CANDIDATES = (8, 12, 16, 24, 32, 48, 64)
 """Numbers that are chosen among; the last is that of preset=exact. The first is judged in any case, and timed."""
-PLANNED = 0.85
-"""Share of the seconds that is planned with: times vary."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
