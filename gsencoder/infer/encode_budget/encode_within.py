@@ -17,7 +17,7 @@ from gsencoder.fusion.store.folder import features_bytes
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
 from gsencoder.infer.encode_budget.config import EncodeBudget, exact_encoding
 from gsencoder.infer.encode_budget.principal_axes import PrincipalAxes, principal_axes
-from gsencoder.infer.encode_budget.sample import Measured, measure_parts, seen_around
+from gsencoder.infer.encode_budget.sample import ROUNDING_ROWS, measure_parts, measure_rounding, seen_around
 from gsencoder.infer.load_encoder import Encoder
 from gsencoder.types import GaussianFeatures, Gaussians
 
@@ -155,32 +155,31 @@ def all_settings(
     precisions, timed = encoder.precisions(exact.device), budget.seconds is not None
     if len(gaussians) < SMALL_SCENE and not is_cut and not timed:
         precisions = precisions[:1]
-    parts: list[Measured] = []
-    if is_cut or len(precisions) > 1 or timed:
-        parts = measure_parts(
-            gaussians,
-            encoder,
-            exact,
-            precisions,
-            is_cut=is_cut,
-            metres_per_unit=metres_per_unit,
-            seed=budget.seed,
-            timed=timed,
-            clock=clock,
-        )
+    unit, seed = metres_per_unit, budget.seed
+    rounding = measure_rounding(gaussians, encoder, exact, precisions, metres_per_unit=unit, seed=seed)
+    parts = measure_parts(
+        gaussians,
+        encoder,
+        exact,
+        precisions,
+        is_cut=is_cut,
+        metres_per_unit=unit,
+        seed=seed,
+        clock=clock if timed else None,
+    )
     settings = []
     for halo in reversed(HALOS) if is_cut else (exact.halo,):
         chunks = cut(gaussians.means, exact.chunk, halo / metres_per_unit)
-        seen = seen_around(gaussians, chunks) * metres_per_unit
-        # Where the exact setting cuts the scene is right by definition.
-        seen = np.full_like(seen, np.inf) if halo == exact.halo else seen
         sizes = np.array([len(chunk.rows) for chunk in chunks], np.float64)
+        cutting = np.zeros(1)
+        # Where the exact setting cuts the scene is right by definition.
+        if halo != exact.halo:
+            seen = seen_around(gaussians, chunks) * metres_per_unit
+            cutting = np.array([part.cutting_error(seen) for part in parts])
         for precision in precisions:
-            errors = np.array([part.error(precision, seen) for part in parts] or [0.0])
-            if halo == exact.halo and precision == precisions[0]:
-                errors = np.zeros(1)
-            error, deviation = float(errors.mean()), float(errors.std() / max(len(errors) - 1, 1) ** 0.5)
-            paces = [part.seconds[precision] * ((sizes / part.rows) ** EXPONENT).sum() for part in parts]
+            error = min(rounding[precision] + float(cutting.mean()), 1.0)
+            deviation = float(cutting.std() / max(len(cutting) - 1, 1) ** 0.5)
+            paces = [part.seconds[precision] * ((sizes / part.rows) ** EXPONENT).sum() for part in parts if timed]
             config = replace(exact, halo=halo, precision=precision)
             settings.append(
                 Setting(
@@ -189,10 +188,12 @@ def all_settings(
                     error=error,
                     bound=min(SAFETY * error + DEVIATIONS * deviation, 1.0),
                     cost=float((sizes**EXPONENT).sum()) * COSTS[precision],
+                    # The first pass of a process loads kernels, which no later one pays for.
                     seconds=float(min(paces, default=0.0)),
                 )
             )
-    return settings, sum(part.rows for part in parts)
+    sampled = sum(part.rows for part in parts) + (ROUNDING_ROWS if len(precisions) > 1 else 0)
+    return settings, min(sampled, len(gaussians))
 
 
 def _chosen(settings: Sequence[Setting], budget: EncodeBudget, spent: float) -> tuple[Setting, tuple[str, ...]]:
