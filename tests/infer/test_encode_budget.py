@@ -147,7 +147,7 @@ def test_the_same_seed_makes_the_same_choice_and_the_same_features(gaussians: Ga
 def test_nothing_that_a_chunk_does_not_see_is_nearer_than_it_says(halo: float) -> None:
     scene = random_gaussians(2000)
     chunks = cut(scene.means, 500, halo)
-    seen = seen_around(scene, chunks)
+    seen = seen_around(scene.means, chunks)
     assert np.isfinite(seen).all()
     for chunk in chunks:
         unseen = np.setdiff1d(np.arange(len(scene)), chunk.rows)

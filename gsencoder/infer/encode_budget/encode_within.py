@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.knobs import shown_value
 from gsencoder.core.promises import MEGABYTE, PLANNED
 from gsencoder.core.runtime.tracking import Track, untracked
@@ -29,6 +30,8 @@ COSTS = {"auto": 1.0, "float32": 1.0, "bfloat16": 0.55}
 """Of precisions. Stated and not measured, so that one scene makes one choice, on a busy machine too."""
 SMALL_SCENE = 20_000
 """Scenes of fewer Gaussians that are not cut are encoded exactly: choosing would cost more than it saves."""
+CUT_ROWS = 100_000
+"""Chunks of larger scenes are counted on so many of their Gaussians, in chunks that are as much smaller."""
 SAFETY, DEVIATIONS = 5.0, 2.0
 """A predicted error counts so many times, and with so many of its standard errors: parts said a third to five times of
 what cuts of whole scenes did."""
@@ -167,14 +170,15 @@ def all_settings(
         seed=seed,
         clock=clock if timed else None,
     )
-    settings = []
+    means, settings = gaussians.means[even_indices(len(gaussians), CUT_ROWS)], []
+    scale = len(gaussians) / len(means)
     for halo in reversed(HALOS) if is_cut else (exact.halo,):
-        chunks = cut(gaussians.means, exact.chunk, halo / metres_per_unit)
-        sizes = np.array([len(chunk.rows) for chunk in chunks], np.float64)
+        chunks = cut(means, math.ceil(exact.chunk / scale), halo / metres_per_unit)
+        sizes = scale * np.array([len(chunk.rows) for chunk in chunks], np.float64)
         cutting = np.zeros(1)
         # Where the exact setting cuts the scene is right by definition.
         if halo != exact.halo:
-            seen = seen_around(gaussians, chunks) * metres_per_unit
+            seen = seen_around(means, chunks) * metres_per_unit
             cutting = np.array([part.cutting_error(seen) for part in parts])
         for precision in precisions:
             error = min(rounding[precision] + float(cutting.mean()), 1.0)

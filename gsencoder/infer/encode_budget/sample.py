@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int64
 
 from gsencoder.core.runtime.device_names import Precision
 from gsencoder.fusion.feature_error import row_cosines
@@ -18,7 +18,7 @@ from gsencoder.infer.load_encoder import Encoder
 from gsencoder.types import GaussianFeatures, Gaussians
 
 PARTS = 2
-LEAST_ROWS, MOST_ROWS, SHARE = 256, 4096, 16
+LEAST_ROWS, MOST_ROWS, SHARE = 256, 4096, 64
 """A part holds one of so many Gaussians of the scene, within these bounds. Larger parts did not predict better."""
 ROUNDING_ROWS = 512
 """Gaussians on which precisions are compared: parts of a scene differ in it by less than a tenth."""
@@ -121,7 +121,7 @@ def measure_parts(
             exact = encoder.encode_spaces(part, whole, metres_per_unit=metres_per_unit)
             halves = replace(whole, chunk=max(len(part) * 2 // 3, 1), halo=0.0)
             halved = encoder.encode_spaces(part, halves, metres_per_unit=metres_per_unit)
-            seen = seen_around(part, cut(part.means, halves.chunk, 0.0)) * metres_per_unit
+            seen = seen_around(part.means, cut(part.means, halves.chunk, 0.0)) * metres_per_unit
             distances, cutting = _never_rising(seen, _errors(halved, exact))
         parts.append(Part(rows=len(part), seconds=seconds, distances=distances, cutting=cutting))
     return parts
@@ -133,11 +133,12 @@ def _centers(gaussians: Gaussians, seed: int) -> list[int]:
     return [int(center) for center in chosen]
 
 
-def seen_around(gaussians: Gaussians, chunks: Sequence[Chunk]) -> Float64[np.ndarray, " N"]:
-    """How far the network sees around each Gaussian, world units; infinite where nothing is cut."""
-    seen = np.empty(len(gaussians))
+def seen_around(means: Float32[np.ndarray, "N 3"], chunks: Sequence[Chunk]) -> Float64[np.ndarray, " N"]:
+    """How far the network sees around each Gaussian of a scene in chunks, world units; infinite where nothing is
+    cut."""
+    seen = np.empty(len(means))
     for chunk in chunks:
-        seen[chunk.core_rows] = chunk.seen_around(gaussians.means)
+        seen[chunk.core_rows] = chunk.seen_around(means)
     return seen
 
 
