@@ -89,7 +89,7 @@ def test_megabytes_that_nothing_fits_into_are_refused_with_those_that_something_
 ) -> None:
     with pytest.raises(InputError, match="^budget.megabytes=0.005: one coordinate of each Gaussian takes ") as refused:
         within(gaussians, encoder, megabytes=0.005)
-    smallest = float(str(refused.value).split("takes ")[1].split(";")[0])
+    smallest = float(str(refused.value).split("takes ")[1].split(" MB;")[0])
     assert within(gaussians, encoder, megabytes=smallest).ranks == {"labels": 1}
 
 

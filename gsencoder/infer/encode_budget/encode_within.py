@@ -228,7 +228,7 @@ def _check_size(encoder: Encoder, teachers: Sequence[str], count: int, header: M
     if least > size * MEGABYTE:
         raise InputError(
             f"budget.megabytes={shown_value(size)}: one coordinate of each Gaussian takes "
-            f"{math.ceil(least / 10) / 1e5:.6g}; give more"
+            f"{math.ceil(least / 10) / 1e5:.6g} MB; give more"
         )
 
 

@@ -87,10 +87,18 @@ def test_a_line_that_a_kill_cut_off_is_measured_again_and_a_damaged_one_refused(
 
 
 def test_measurements_of_another_sweep_are_not_mixed_in(tmp_path: Path) -> None:
-    Records(tmp_path, {"scenes": 1})
-    Records(tmp_path, {"scenes": 1})
+    timing = Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0)
+    Records(tmp_path, {"scenes": 1}).add_timing("fusion", "a", {}, timing)
+    assert len(Records(tmp_path, {"scenes": 1})) == 1
     with pytest.raises(InputError, match="holds measurements of a sweep with other settings; give resume=false"):
         Records(tmp_path, {"scenes": 2})
+
+
+def test_a_sweep_that_measured_nothing_leaves_nothing_and_does_not_stand_in_the_way_of_another(tmp_path: Path) -> None:
+    Records(tmp_path, {"scenes": 1})
+    assert list(tmp_path.iterdir()) == []
+    Records(tmp_path, {"scenes": 2}).add_timing("fusion", "a", {}, Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0))
+    assert len(Records(tmp_path, {"scenes": 2})) == 1
 
 
 def test_numbers_that_are_not_finite_survive_the_file(tmp_path: Path) -> None:
@@ -121,10 +129,12 @@ def test_one_knob_is_changed_at_a_time_and_the_base_comes_first() -> None:
 @pytest.mark.parametrize(
     ("sweep", "message"),
     [
-        (SweepConfig(knobs=("rays",)), "^knobs: 'rays' is no knob of fusion; expected some of effort, color"),
-        (SweepConfig(values=("rays:1",)), "^values: 'rays' is no knob"),
-        (SweepConfig(values=("effort:1", "effort:2")), "^values: effort is given twice"),
-        (SweepConfig(values=("effort",)), "^values: expected KNOB:VALUE/VALUE, got 'effort'"),
+        (SweepConfig(knobs=("rays",)), "^sweep.knobs: 'rays' is no knob of fusion; expected some of effort, color"),
+        (SweepConfig(values=("rays:1",)), "^sweep.values: 'rays' is no knob"),
+        (SweepConfig(values=("effort:1", "effort:2")), "^sweep.values: effort is given twice"),
+        (SweepConfig(values=("effort",)), "^sweep.values: expected KNOB:VALUE/VALUE, got 'effort'"),
+        (SweepConfig(values=("effort:",)), "^sweep.values: expected KNOB:VALUE/VALUE, got 'effort:'"),
+        (SweepConfig(knobs=("color",), values=("effort:1",)), "^sweep.values: effort is not among sweep.knobs=color;"),
         (SweepConfig(values=("effort:much",)), "^effort: expected a whole number, got 'much'"),
         (SweepConfig(values=("effort:0",)), "^effort=0: effort: expected 1 or more"),
     ],
