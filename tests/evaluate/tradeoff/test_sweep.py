@@ -14,7 +14,7 @@ from gsencoder.core.runtime.peak_memory import Growth
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig
 from gsencoder.evaluate.tradeoff.measure import interleaved, measure
 from gsencoder.evaluate.tradeoff.records import RECORDS_FILE, Record, Records, Timing
-from gsencoder.evaluate.tradeoff.results import estimate, mark_front, pick_within, summarize
+from gsencoder.evaluate.tradeoff.results import estimate, estimate_difference, mark_front, pick_within, summarize
 from gsencoder.evaluate.tradeoff.stage import Judged, Score
 from gsencoder.evaluate.tradeoff.sweep import SweepConfig, check_sweep, settings_of, sweep_stage
 
@@ -209,6 +209,25 @@ def test_standard_errors_hold_the_truth_as_often_as_they_say() -> None:
         value, error, _ = estimate([Score(float(h), float(n)) for h, n in zip(hits, things, strict=True)])
         inside += abs(value - 0.8) <= 1.96 * error
     assert 0.92 < inside / 1000 < 0.98
+
+
+def test_a_difference_of_scores_has_the_error_of_differences_of_scenes() -> None:
+    base = [Score(3, 4), Score(1, 4), Score(2, 4)]
+    # Every scene gains one thing, so that nothing about the gain is uncertain, whatever the scenes' scores are.
+    assert estimate_difference([Score(4, 4), Score(2, 4), Score(3, 4)], base) == pytest.approx((0.25, 0.0, 12))
+    value, error, _ = estimate_difference([Score(4, 4), Score(0, 4), Score(3, 4)], base)
+    assert value == pytest.approx(1 / 12)
+    assert error == pytest.approx(np.std([0.25, -0.25, 0.25], ddof=1) / np.sqrt(3))
+    assert np.isnan(estimate_difference([Score(3, 4)], [Score(1, 4)]).error)
+    assert np.isnan(estimate_difference([], []).value)
+
+
+def test_differences_are_of_the_scenes_that_both_have_scores_of() -> None:
+    base = [record("a", [1.0], {"acc_25": Score(1, 2)}), record("b", [1.0])]
+    other = [record("b", [1.0], {"acc_25": Score(2, 2)}, views=1), record("a", [1.0], {"acc_25": Score(2, 2)}, views=1)]
+    row = summarize(other, base, "grid").row()
+    assert (row["acc_25_difference"], row["acc_25_things"]) == (0.5, 4)
+    assert "acc_25_difference" not in summarize(base, base, "base").row()
 
 
 def test_the_front_is_drawn_among_settings_of_as_many_scenes() -> None:
