@@ -1,8 +1,8 @@
 """Scripts as the processes of one training, forked from a server that has imported torch and what they import.
 
 Processes that a launcher starts import torch once each, and the launcher itself does, which takes longer than what most
-tests do in them. Those of `started` have the environment that torchrun gives; that torchrun gives it, tests of trainings
-and of commands hold.
+tests do in them. Those of `started` have the environment that torchrun gives; that torchrun gives it is tested where
+one training runs in two processes of it.
 """
 
 import ast
