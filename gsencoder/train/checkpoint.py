@@ -14,7 +14,8 @@ import torch
 
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import Archive, first_difference, open_archive, write_archive
+from gsencoder.core.files.archive import Archive, open_archive, write_archive
+from gsencoder.core.first_difference import first_difference
 
 TRAINING_CHECKPOINT_FILE = "checkpoint.safetensors"
 

@@ -18,8 +18,9 @@ from jaxtyping import Float32
 
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.json_values import plain, write_json
+from gsencoder.core.first_difference import first_difference
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.archive_records import bank_parts, read_bank
 from gsencoder.data.splats import fingerprint

@@ -15,8 +15,9 @@ from jaxtyping import Float32
 
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised, listed
-from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file, locked
+from gsencoder.core.first_difference import first_difference
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.fusion.teacher_maps import CachedTeacher
