@@ -9,7 +9,8 @@ from pathlib import Path
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.data.scenes import SceneConfig, find_scenes, is_scene, listed_paths, load_scene
+from gsencoder.data.scene_paths import find_scenes, is_scene, listed_paths
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.video.decode import is_video
 from gsencoder.data.video.frames import VideoConfig, take_frames
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE

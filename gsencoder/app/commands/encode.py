@@ -17,7 +17,8 @@ from gsencoder.app.settings.config import CommonConfig, settings, typed
 from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files.model_files import digest_files
 from gsencoder.core.runtime.heap import retain_freed_memory
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE

@@ -12,7 +12,8 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.runtime.device_names import Stored
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE

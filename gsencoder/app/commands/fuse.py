@@ -20,7 +20,8 @@ from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
-from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.budget.config import BudgetConfig, check_budget

@@ -20,7 +20,7 @@ from gsencoder.core.files.picture_file import write_picture
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
-from gsencoder.data.scenes import find_scenes
+from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
 from gsencoder.fusion.store.folder import file_of_teacher, save_memories

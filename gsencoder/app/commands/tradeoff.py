@@ -15,7 +15,8 @@ from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import json_bytes, write_bytes
-from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig

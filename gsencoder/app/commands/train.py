@@ -22,7 +22,7 @@ from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.core.runtime.threads import threads_of_torch
-from gsencoder.data.scenes import find_scenes
+from gsencoder.data.scene_paths import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit
 from gsencoder.fusion.heads.measure import HeadSet
