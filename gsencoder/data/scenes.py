@@ -10,8 +10,8 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.posed_views import make_views
+from gsencoder.data.readers.depth_images import DepthMeasure
 from gsencoder.data.readers.frames import pinhole_of
-from gsencoder.data.readers.images import DepthMeasure
 from gsencoder.data.readers.layouts import ReadOptions, layout_of, read_transforms_file
 from gsencoder.data.readers.objects_json import read_objects
 from gsencoder.data.readers.posed import PosedImage, PosedImages, rigid_pose

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.written_files import sha256_of
-from gsencoder.data.readers.images import check_picture
+from gsencoder.data.readers.image_file import check_picture
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.video.decode import SUFFIXES as VIDEO_SUFFIXES
 

@@ -19,7 +19,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.mapped_arrays import MappedArrays
 from gsencoder.core.files.model_files import check_fetched, digest_files
-from gsencoder.data.readers.images import load_npy
+from gsencoder.data.readers.image_file import load_npy
 from gsencoder.text.table import load_text_table
 from gsencoder.train.data_workers import lost_workers
 

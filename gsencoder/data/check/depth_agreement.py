@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from gsencoder.data.readers.images import ray_lengths
+from gsencoder.data.readers.depth_images import ray_lengths
 from gsencoder.types import Views
 from gsencoder.types.cameras import pixel_centers, project_points
 from gsencoder.types.poses import invert_rigid, transform

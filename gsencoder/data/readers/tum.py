@@ -17,7 +17,7 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.frames import SkippedFrames
-from gsencoder.data.readers.images import picture_size
+from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, warn_left_out
 from gsencoder.data.readers.tables import read_numbers, table_lines
 from gsencoder.data.readers.undistort import CameraModel
