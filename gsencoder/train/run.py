@@ -34,7 +34,8 @@ from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
 from gsencoder.train.source import SourceConfig
-from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, TrainerConfig, ValidationResult
+from gsencoder.train.trainer import ValidationResult
+from gsencoder.train.trainer_config import CHANGEABLE_ON_RESUME, TrainerConfig
 from gsencoder.train.training_scene import TrainingScene
 
 SceneValidator = Callable[

@@ -40,7 +40,7 @@ from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import MemoryScene, open_memory_scene, open_raw_sample, prepare_memory
 from gsencoder.train.render_rows import sample_rows
 from gsencoder.train.source import SourceConfig
-from gsencoder.train.trainer import TrainerConfig
+from gsencoder.train.trainer_config import TrainerConfig
 from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 
 DRAWN_FEATURES = 20_000
