@@ -27,7 +27,8 @@ from gsencoder.reconstruct.budget import BudgetConfig, plan_steps, wanted_steps
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.expected_time import expected_seconds
 from gsencoder.reconstruct.exposure_prediction import predict_exposures
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.report import Comparison, LogRow, compare, describe, describe_exposure, describe_plan
@@ -259,7 +260,7 @@ def optimize(
         scores = {
             name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None
         }
-        row: LogRow = {"seconds": time.monotonic() - start, "gaussians": len(optimizer.raw["means"]), **scores}
+        row: LogRow = {"seconds": time.monotonic() - start, "gaussians": len(optimizer.parameters["means"]), **scores}
         log.add(optimizer.step, row)
         rows.append({"step": optimizer.step, **row})
         report(

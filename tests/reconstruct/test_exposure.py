@@ -13,7 +13,8 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
 from gsencoder.reconstruct.exposure import IDENTITY, ROUNDS, SAME, Exposures, apply_colors, fitted_colors, known_pixels
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.report import describe_exposure
