@@ -45,6 +45,8 @@ RESERVED_KEYS = ("version", "checksums", "digest")
 LARGEST_NUMBER = 2.0**63
 LONGEST_NUMBER = -2.2250738585072014e-308
 """JSON writes no number in more characters: it stands for numbers of a header that are not known yet."""
+LONGEST_SHARE = abs(LONGEST_NUMBER)
+"""The same for numbers that cannot be negative."""
 DAMAGED = "the file is damaged"
 
 
@@ -248,16 +250,22 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     write_safetensors(path, pieces, _metadata(entries_of(pieces), checksums, header))
 
 
-def archive_bytes(entries: Entries, header: Mapping[str, Any]) -> int:
+def archive_bytes(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> int:
     """The size of the file that `write_archive` would write.
 
     Args:
-        entries: type and shape of each array.
+        arrays: by name; values do not matter, so that arrays of `shape_only` will do.
         header: as it would be written; numbers of other lengths change the size by as many bytes.
     """
+    entries = entries_of(arrays)
     sizes = {name: math.prod(shape) * np.dtype(dtype).itemsize for name, (dtype, shape) in entries.items()}
     checksums = {name: "0" * (DIGITS * -(-size // BLOCK_BYTES)) for name, size in sizes.items()}
     return len(safetensors_header(entries, _metadata(entries, checksums, header))) + sum(sizes.values())
+
+
+def shape_only(dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    """An array of zeros that takes no memory: it stands for one of its type and shape in `archive_bytes`."""
+    return np.broadcast_to(np.zeros((), dtype), shape)
 
 
 def _metadata(entries: Entries, checksums: Mapping[str, str], header: Mapping[str, Any]) -> dict[str, str]:
