@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from shutil import copyfile
 
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
@@ -12,6 +11,7 @@ from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.copied_file import copy_checked
 from gsencoder.core.promises import MEGABYTE, check_governed
 from gsencoder.fusion.store.budget import PackBudget
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
@@ -122,12 +122,7 @@ def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFe
     if words is not None and form in CODED:
         save_text_table(folder / WORDS_FILE, load_text_table(words), dtype="float16")
     elif words is not None:
-        copyfile(words, folder / WORDS_FILE)
-        try:
-            # What was copied is looked at: the file may have been cut off meanwhile.
-            load_text_table(folder / WORDS_FILE)
-        except InputError as error:
-            raise InputError(str(error).replace(str(folder / WORDS_FILE), str(words))) from error
+        copy_checked(words, folder / WORDS_FILE, load_text_table)
     if (source / HEADS_FILE).is_file():
         others = [each.space for each in scene.features.values() if each is not features]
         copy_heads(source / HEADS_FILE, folder / HEADS_FILE, [features.space], left_out=others)

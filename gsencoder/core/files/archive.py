@@ -303,3 +303,13 @@ def open_archive(path: Path) -> Iterator[Archive]:
         check_fetched(path)
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged or no safetensors file: {message}") from error
+
+
+def verify_archive(path: Path) -> None:
+    """Reads an archive and verifies its checksums.
+
+    Raises:
+        InputError: missing, damaged, of another version, or without checksums.
+    """
+    with open_archive(path) as file:
+        file.verify()

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gsencoder.core.setting_choice import best_setting, within_seconds
 from gsencoder.fusion.basis import Moments
 from gsencoder.fusion.budget.config import BudgetConfig, exact_config
-from gsencoder.fusion.budget.limits import Measure, Pace, within_megabytes, within_seconds
+from gsencoder.fusion.budget.limits import Measure, Pace, within_megabytes
 from gsencoder.fusion.budget.model import (
     UNKNOWN_SCATTER,
     Predicted,
@@ -18,7 +19,7 @@ from gsencoder.fusion.budget.model import (
     setting_weights,
 )
 from gsencoder.fusion.budget.rank import RankErrors, rank_errors, with_rank
-from gsencoder.fusion.budget.settings import Setting, all_settings, cheapest, most_exact
+from gsencoder.fusion.budget.settings import Setting, all_settings
 from gsencoder.fusion.coverage.order import view_order
 from gsencoder.fusion.coverage.sight import LatticeOf, Sight, look
 from gsencoder.fusion.fuse import FuseConfig
@@ -134,7 +135,7 @@ def choose(
             coded=teacher.table is not None,
             least=max(len(first), 1) if budget.seconds is None else 1,
         )
-        chosen = most_exact(settings) if budget.error is None else cheapest(settings, budget.error)
+        chosen = best_setting(settings, budget.error)
         # More maps are made until they are half of what is needed, and never one that is not.
         if teacher.cheap or budget.error is None or chosen.views <= 2 * wanted or wanted == len(views):
             break
@@ -144,13 +145,14 @@ def choose(
     if budget.seconds is not None:
         of_map, lift = measure(int(order[0]))
         passes = 2 if teacher.cheap and known.ranks.fitted else 1
-        pace = Pace(map=of_map, lift=lift, passes=passes, made=len(known.maps), spent=elapsed())
-        chosen, seconds, said = within_seconds(chosen, settings, budget, pace)
-        notes += said
+        pace = Pace(map=of_map, lift=lift, passes=passes, cached=len(known.maps), spent=elapsed())
+        chosen, broken = within_seconds(settings, chosen, budget, pace.seconds)
+        seconds = pace.seconds(chosen)
+        notes += broken
     if budget.megabytes is not None:
         weights = setting_weights(sight, chosen.stop, exact.blend.stop_transmittance)
         basis = base.basis and teacher.space.channels > base.narrow
-        chosen, size, said = within_megabytes(
+        chosen, size, broken = within_megabytes(
             chosen,
             _seen_share(weights[order[: chosen.views]]),
             sight,
@@ -159,7 +161,7 @@ def choose(
             budget,
             basis=basis,
         )
-        notes += said
+        notes += broken
     return _choice(chosen, base, teacher, known, sight, order, seconds, size, notes)
 
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.knobs import shown_value
-from gsencoder.core.promises import MEGABYTE, PLANNED
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.setting_choice import best_setting, within_seconds
 from gsencoder.fusion.feature_error import FieldError, judge
 from gsencoder.fusion.store.folder import features_bytes
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
@@ -119,14 +120,16 @@ def encode_within(
     if budget.megabytes is not None and budget.error is None:
         _check_size(encoder, teachers, len(gaussians), header, budget.megabytes)
     settings, sampled = all_settings(gaussians, encoder, exact, budget, metres_per_unit=metres_per_unit, clock=clock)
-    setting, notes = _chosen(settings, budget, clock() - start)
-    chosen = clock()
-    made = encoder.encode_spaces(gaussians, setting.config, metres_per_unit=metres_per_unit, track=track)
-    encoded = {name: made[name] for name in teachers}
+    setting, notes, spent = best_setting(settings, budget.error), tuple[str, ...](), clock() - start
+    if budget.seconds is not None:
+        setting, notes = within_seconds(settings, setting, budget, lambda each: spent + each.seconds)
+    encoding_start = clock()
+    by_teacher = encoder.encode_spaces(gaussians, setting.config, metres_per_unit=metres_per_unit, track=track)
+    encoded = {name: by_teacher[name] for name in teachers}
     features, ranks, left_out = encoded, dict[str, int](), 0.0
     if budget.megabytes is not None:
-        features, ranks, left_out, said = _within_megabytes(encoded, header, setting, budget)
-        notes += said
+        features, ranks, left_out, broken = _within_megabytes(encoded, header, setting, budget)
+        notes += broken
     return BudgetEncoding(
         features=features,
         encoded=encoded,
@@ -134,7 +137,7 @@ def encode_within(
         exact=exact,
         ranks=ranks,
         sampled=sampled,
-        choosing=chosen - start,
+        choosing=encoding_start - start,
         seconds=clock() - start,
         predicted=min(setting.error + left_out, 1.0),
         notes=notes,
@@ -195,28 +198,6 @@ def all_settings(
     return settings, sum(part.rows for part in parts)
 
 
-def _chosen(settings: Sequence[Setting], budget: EncodeBudget, spent: float) -> tuple[Setting, tuple[str, ...]]:
-    """The setting, and what is to be said."""
-
-    def exactness(each: Setting) -> tuple[float, float]:
-        return each.error, each.cost
-
-    if budget.error is not None:
-        limit = budget.error
-        chosen = min((each for each in settings if each.bound <= limit), key=lambda each: (each.cost, each.error))
-        needed = spent + chosen.seconds
-        conflict = budget.seconds is not None and needed > budget.seconds
-        return chosen, (budget.conflict("error", "seconds", needed),) if conflict else ()
-    if budget.seconds is None:
-        return min(settings, key=exactness), ()
-    fitting = [each for each in settings if spent + each.seconds <= PLANNED * budget.seconds]
-    if fitting:
-        return min(fitting, key=exactness), ()
-    fastest = min(settings, key=lambda each: (each.seconds, each.error))
-    needed = spent + fastest.seconds
-    return fastest, (f"{budget.shown('seconds')}: the fastest setting takes about {needed:.3g} s; it is used",)
-
-
 def _check_size(encoder: Encoder, teachers: Sequence[str], count: int, header: Mapping[str, Any], size: float) -> None:
     """Refuses a size into which not even one coordinate of each teacher fits."""
     least = sum(features_bytes(encoder.spaces[name], count, 1, header) for name in teachers)
@@ -231,7 +212,7 @@ def _within_megabytes(
     encoded: Mapping[str, GaussianFeatures], header: Mapping[str, Any], setting: Setting, budget: EncodeBudget
 ) -> tuple[dict[str, GaussianFeatures], dict[str, int], float, tuple[str, ...]]:
     """Features with as many coordinates as fit, or as a promised error needs; their numbers, the error that this adds,
-    and what is to be said."""
+    and notes about a promise that is not kept."""
     assert budget.megabytes is not None
     limit = budget.megabytes * MEGABYTE
 
@@ -258,8 +239,8 @@ def _within_megabytes(
     }
     left_out = max((axes[name].left_out(ranks[name]) for name in axes), default=0.0)
     size = sum(bytes_of(name, rank) for name, rank in ranks.items())
-    broken = size > limit and budget.error is not None
-    notes = (budget.conflict("error", "megabytes", size / MEGABYTE),) if broken else ()
+    is_broken = size > limit and budget.error is not None
+    notes = (budget.conflict("error", "megabytes", size / MEGABYTE),) if is_broken else ()
     return reduced, ranks, left_out, notes
 
 
