@@ -1,11 +1,12 @@
 """The choice of a setting by the promises of a budget, among settings whose errors and costs are predicted."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from gsencoder.core.promises import PLANNED, Budget
 
 
+@runtime_checkable
 class PredictedSetting(Protocol):
     """A setting with what is predicted of it.
 

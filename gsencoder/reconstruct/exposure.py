@@ -48,8 +48,8 @@ class Exposures:
 
     def relative(self, view: int, moved: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
         """What is applied to a render of a photograph whose map is `moved`."""
-        own = self.maps[self._rows[view]]
-        return moved - (self.maps.sum(0) + moved - own) / len(self.maps) + IDENTITY
+        current = self.maps[self._rows[view]]
+        return moved - (self.maps.sum(0) + moved - current) / len(self.maps) + IDENTITY
 
     def set(self, view: int, moved: Float[Tensor, "3 4"]) -> None:
         """Replaces the map of a photograph."""
@@ -69,23 +69,23 @@ class Exposures:
 
 
 def fitted_colors(
-    render: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], known: Bool[Tensor, "H W"]
+    render: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W"]
 ) -> Float[Tensor, "3 4"]:
     """The affine map A·c + b of the render's colors that is nearest to the photograph's, by ridge regression.
 
     Args:
         render: in [0, 1].
         image: the photograph.
-        known: pixels to compare; without any the map is the identity.
+        mask: pixels to compare; without any the map is the identity.
 
     Returns:
         A in the first three columns and b in the last, on the CPU.
     """
-    weights = known.unsqueeze(-1).to(render.dtype)
+    weights = mask.unsqueeze(-1).to(render.dtype)
     inputs = torch.cat((render, torch.ones_like(render[..., :1])), dim=-1) * weights
-    rows, wanted = inputs.flatten(0, 1), ((image - render) * weights).flatten(0, 1)
-    count = float(known.sum().clamp(min=1))
-    gram, moments = ((rows.T @ other).double().cpu() / count for other in (rows, wanted))
+    rows, residuals = inputs.flatten(0, 1), ((image - render) * weights).flatten(0, 1)
+    count = float(mask.sum().clamp(min=1))
+    gram, moments = ((rows.T @ other).double().cpu() / count for other in (rows, residuals))
     change = torch.linalg.solve(gram + RIDGE * torch.eye(4, dtype=torch.float64), moments)
     return IDENTITY + change.T.float()
 
@@ -96,7 +96,7 @@ def apply_colors(colors: Float[Tensor, "H W 3"], affine: Float[Tensor, "3 4"]) -
     return colors @ affine[:, :3].T + affine[:, 3]
 
 
-def known_pixels(alpha: Float[Tensor, "H W"], mask: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"]:
+def compared_pixels(alpha: Float[Tensor, "H W"], mask: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"]:
     """Pixels whose colors are compared: what the splat covers and the mask leaves."""
     covered = alpha > OPAQUE
     return covered if mask is None else covered & mask.to(covered.device)

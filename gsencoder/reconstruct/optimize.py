@@ -14,7 +14,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.signals import defer_signals
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.anchor import Anchor
-from gsencoder.reconstruct.exposure import ROUNDS, Exposures, apply_colors, fitted_colors, known_pixels
+from gsencoder.reconstruct.exposure import ROUNDS, Exposures, apply_colors, compared_pixels, fitted_colors
 from gsencoder.reconstruct.losses import losses_of
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import (
@@ -265,7 +265,7 @@ class Optimizer:
     def _fitted_colors(
         rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], photo: ScaledPhotograph
     ) -> Float[Tensor, "3 4"]:
-        return fitted_colors(rgb, photo.image.to(rgb.device), known_pixels(alpha, photo.mask))
+        return fitted_colors(rgb, photo.image.to(rgb.device), compared_pixels(alpha, photo.mask))
 
     def gaussians(self) -> Gaussians:
         """The current splat."""

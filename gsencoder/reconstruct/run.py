@@ -23,7 +23,7 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.anchor import anchor_at
-from gsencoder.reconstruct.budget import BudgetConfig, plan_steps, wanted_steps
+from gsencoder.reconstruct.budget import BudgetConfig, plan_steps, steps_for_minutes
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.expected_time import expected_seconds
 from gsencoder.reconstruct.exposure_prediction import predict_exposures
@@ -150,7 +150,7 @@ def reconstruct(
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
         chosen_device, checkpoint = choose_device(device), folder / CHECKPOINT_FILE
         if continued := os.path.lexists(checkpoint):
-            most = max(config.optimize.steps, wanted_steps(config.budget.minutes, config.optimize))
+            most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize))
             shape = {"steps": most, "sh_degree": config.optimize.sh_degree}
             state = load_state(checkpoint, identity, **shape, device=chosen_device)
         else:

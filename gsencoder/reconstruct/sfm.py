@@ -83,7 +83,7 @@ def _names_with(folder: Path, suffixes: tuple[str, ...]) -> list[str]:
     return sorted(entry.name for entry in entries if entry.suffix.lower() in suffixes)
 
 
-def place_photographs(
+def register_photographs(
     folder: Path, work: Path, config: SfmConfig = SfmConfig(), *, single_camera: bool = False
 ) -> Placed:
     """Finds poses and intrinsics. Every photograph is decoded before. Few photographs that do not fit together are
@@ -110,9 +110,9 @@ def place_photographs(
     inputs = _inputs(folder, names, config)
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
-    known = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
-    if config.camera not in known:
-        raise InputError(f"sfm.camera: expected one of {', '.join(known)}, got {config.camera!r}")
+    camera_models = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
+    if config.camera not in camera_models:
+        raise InputError(f"sfm.camera: expected one of {', '.join(camera_models)}, got {config.camera!r}")
     attempts, model = work / "attempts", work / "sparse" / "0"
     for stale in (work / PLACED_FILE, work / "database.db", attempts, model.parent):
         shutil.rmtree(stale, ignore_errors=True)
@@ -125,8 +125,8 @@ def place_photographs(
         try:
             models += _map(pycolmap, attempt, folder, names, config, single_camera, thorough)
         except (RuntimeError, ValueError) as error:
-            said = " ".join(str(error).split())[:160]
-            raise InputError(f"{folder}: pycolmap cannot place these photographs: {said}") from error
+            message = " ".join(str(error).split())[:160]
+            raise InputError(f"{folder}: pycolmap cannot place these photographs: {message}") from error
         most = max((each.num_reg_images() for each in models), default=0)
         if len(names) > MAX_THOROUGH or most >= ENOUGH_PLACED * len(names):
             break

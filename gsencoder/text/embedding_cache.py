@@ -85,10 +85,10 @@ def _read(path: Path) -> dict[str, Float32[np.ndarray, " D"]]:
     return dict(zip(phrases, vectors, strict=True))
 
 
-def _write(path: Path, known: dict[str, Float32[np.ndarray, " D"]]) -> None:
+def _write(path: Path, cached: dict[str, Float32[np.ndarray, " D"]]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_archive(path, {"vectors": np.stack(list(known.values()))}, {"phrases": list(known)})
+        write_archive(path, {"vectors": np.stack(list(cached.values()))}, {"phrases": list(cached)})
     except (OSError, InputError) as error:
         warnings.warn(
             f"text vectors are not cached: {error} ({CACHE_VARIABLE}={OFF} turns the cache off)",

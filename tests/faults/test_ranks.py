@@ -49,10 +49,10 @@ for how in sys.argv[2:]:
     said = "ended"
     try:
         if how == "settings":
-            with distributed.join_processes("cpu", asked={"steps": rank, "quiet": bool(rank)}):
+            with distributed.join_processes("cpu", settings={"steps": rank, "quiet": bool(rank)}):
                 pass
         elif not torch.distributed.is_initialized():
-            with distributed.join_processes("cpu", asked={"steps": 3, "quiet": bool(rank)}) as (process, device):
+            with distributed.join_processes("cpu", settings={"steps": 3, "quiet": bool(rank)}) as (process, device):
                 train(how, process, device)
         else:
             with distributed.lost_processes(process := distributed.rank_from_environment(os.environ)[0]):

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from gsencoder.app.commands.query_words import asked_scene, load_words
+from gsencoder.app.commands.query_words import load_words, queried_scene
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.store.words import table_path
@@ -54,8 +54,8 @@ def asker_of(settings: AskerSettings, scene: Scene, folder: Path) -> Asker:
     """The asker of a scene that was loaded from a folder of features. A box can be asked about without words."""
     words: Words | None
     if settings.head:
-        scene, words = asked_scene(
-            scene, folder, head=settings.head, space=settings.space, given=settings.words, text=settings.text
+        scene, words = queried_scene(
+            scene, folder, head=settings.head, space=settings.space, words_file=settings.words, text=settings.text
         )
     else:
         space = select_features(scene, settings.space or None)[1].space

@@ -71,7 +71,7 @@ def encode_in_budget(
 
 
 def check_promises(
-    made: BudgetEncoding,
+    encoding: BudgetEncoding,
     scene: Scene,
     encoder: Encoder,
     files: Sequence[Path],
@@ -86,7 +86,7 @@ def check_promises(
     if budget.error is not None and budget.check:
         with summary.step("check"):
             errors = realised_error(
-                made,
+                encoding,
                 scene.gaussians,
                 encoder,
                 metres_per_unit=metres_per_unit,
@@ -95,7 +95,7 @@ def check_promises(
             )
         realised["error"] = max(error.total for error in errors.values())
     if budget.seconds is not None:
-        realised["seconds"] = made.seconds
+        realised["seconds"] = encoding.seconds
     if budget.megabytes is not None:
         realised["megabytes"] = sum(file.stat().st_size for file in files) / MEGABYTE
     return report_promises(summary, budget, realised)

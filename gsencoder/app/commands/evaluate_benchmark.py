@@ -48,7 +48,7 @@ def run_benchmark(
     summary: Summary,
 ) -> None:
     """Predicts the scenes of this process, and in the first process scores those of all and prints the scores."""
-    with join_processes("cpu", asked=settings(config)) as (process, _), ExitStack() as results:
+    with join_processes("cpu", settings=settings(config)) as (process, _), ExitStack() as results:
         folder = None
         with fail_together():
             if process.is_first:

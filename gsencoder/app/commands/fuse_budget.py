@@ -62,8 +62,8 @@ def fuse_in_budget(
     return made
 
 
-def _predicted(made: BudgetFusion) -> Mapping[str, float | None]:
-    choice = made.choice
+def _predicted(fused: BudgetFusion) -> Mapping[str, float | None]:
+    choice = fused.choice
     size = None if choice.bytes is None else choice.bytes / MEGABYTE
     return {
         "error": choice.predicted.error,
@@ -73,17 +73,17 @@ def _predicted(made: BudgetFusion) -> Mapping[str, float | None]:
     }
 
 
-def check_promises(made: BudgetFusion, file: Path, config: BudgetOptions, summary: Summary) -> list[str]:
+def check_promises(fused: BudgetFusion, file: Path, config: BudgetOptions, summary: Summary) -> list[str]:
     """Measures what was promised; returns a line for each promise, and warns of those that are broken."""
     budget, realised = config.budget, dict[str, float]()
     if budget.error is not None and budget.check:
         with summary.step("check"):
             track = Progress(quiet=config.quiet)
-            error = realised_error(made, config.fusion, seed=budget.seed, device=config.device, track=track)
+            error = realised_error(fused, config.fusion, seed=budget.seed, device=config.device, track=track)
         realised["error"] = error.total
         summary.results["budget"]["covered"] = error.covered
     if budget.seconds is not None:
-        realised["seconds"] = made.seconds
+        realised["seconds"] = fused.seconds
     if budget.megabytes is not None:
         realised["megabytes"] = file.stat().st_size / MEGABYTE
     return report_promises(summary, budget, realised)

@@ -108,7 +108,7 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
     with (
         WorkFolder(out.with_name(f"{out.name}.training")) as state,
-        join_processes(config.device, asked=settings(config)) as (process, device),
+        join_processes(config.device, settings=settings(config)) as (process, device),
         ExitStack() as results,
     ):
         track = Progress(quiet=config.quiet or not process.is_first)

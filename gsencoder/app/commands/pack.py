@@ -145,50 +145,52 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
 def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
     budget = config.budget
     if budget.error is None and budget.megabytes is not None:
-        made = save_package_within(folder, scene, features, megabytes=budget.megabytes)
+        compacted = save_package_within(folder, scene, features, megabytes=budget.megabytes)
     else:
-        made = save_package(folder, scene, features, error=budget.error or DEFAULT_ERROR)
+        compacted = save_package(folder, scene, features, error=budget.error or DEFAULT_ERROR)
     size = (folder / PACKAGE_FILE).stat().st_size
     share = size / (2 * features.space.channels * len(features))
     summary.results.update(
         bytes=size,
-        row_bytes=made.row_bytes,
-        rank=made.basis.rank,
-        error=made.error,
-        lowest=made.lowest,
-        weight_error=(made.heaviest / made.lightest) ** (1 / 510) - 1,
+        row_bytes=compacted.row_bytes,
+        rank=compacted.basis.rank,
+        error=compacted.error,
+        lowest=compacted.lowest,
+        weight_error=(compacted.heaviest / compacted.lightest) ** (1 / 510) - 1,
         share_of_float16=share,
     )
-    _report(scene, {"rank": made.basis.rank, "row_bytes": made.row_bytes}, made.error, size, config, summary)
+    _report(
+        scene, {"rank": compacted.basis.rank, "row_bytes": compacted.row_bytes}, compacted.error, size, config, summary
+    )
     return (
         f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB, "
-        f"{_ratio(share)} of float16 vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centered "
-        f"cosines lose {made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
+        f"{_ratio(share)} of float16 vectors: {compacted.basis.rank} coordinates in {compacted.row_bytes} bytes a row; "
+        f"centered cosines lose {compacted.error:.4f}, one in a thousand is below {compacted.lowest:.3f}"
     )
 
 
 def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
     if config.budget.given:
-        made, error = index_within(features, config.budget, partial(index_bytes, scene, features))
+        indexed, error = index_within(features, config.budget, partial(index_bytes, scene, features))
     else:
-        made = index_features(features, config.index)
-        error = made.error
-    save_index_package(folder, scene, made.features, error=made.error)
-    rows, size = len(made.features.features), (folder / PACKAGE_FILE).stat().st_size
+        indexed = index_features(features, config.index)
+        error = indexed.error
+    save_index_package(folder, scene, indexed.features, error=indexed.error)
+    rows, size = len(indexed.features.features), (folder / PACKAGE_FILE).stat().st_size
     summary.results.update(
         bytes=size,
         rows=rows,
         row_bytes=1 if rows < 256 else 2,
-        threshold=made.threshold,
-        error=made.error,
-        lowest=made.lowest,
+        threshold=indexed.threshold,
+        error=indexed.error,
+        lowest=indexed.lowest,
         share_of_float16=size / (2 * features.space.channels * len(features)),
     )
-    _report(scene, {"rows": rows, "threshold": made.threshold}, error, size, config, summary)
+    _report(scene, {"rows": rows, "threshold": indexed.threshold}, error, size, config, summary)
     return (
         f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB: the "
         f"number of one of {rows:,} rows in {'one byte' if rows < 256 else 'two bytes'}; centered cosines lose "
-        f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
+        f"{indexed.error:.4f}, one in a thousand is below {indexed.lowest:.3f}"
     )
 
 

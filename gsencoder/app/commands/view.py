@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import asked_scene
+from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_file import refuse_existing, sole_writer
 from gsencoder.app.runs.progress import console
@@ -135,7 +135,7 @@ def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple
         if not features.space.text_encoder:
             # Features such as DINOv2's can be looked at.
             return replace(scene, features={features.space.name: features}), None
-    return asked_scene(scene, folder, head=config.head, space=config.space, given=config.words, text=config.text)
+    return queried_scene(scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text)
 
 
 def _titles(folders: Sequence[Path]) -> list[str]:

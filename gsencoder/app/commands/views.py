@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.commands.query_words import queried_scene, query_words
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.commands.through_head import features_for_heads, heads_of_folder
 from gsencoder.app.commands.words_options import WordsOptions
@@ -95,10 +95,10 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     if config.query or config.queries or config.choose.method == "greedy":
         with summary.step("localize"):
             words = query_words(config.query, config.queries)
-            asked, table = asked_scene(
-                scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
+            queried, table = queried_scene(
+                scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
             )
-            localization = localize(asked, words, table, config.localize)
+            localization = localize(queried, words, table, config.localize)
             assert scene.gaussians is not None
             targets = targets_of(scene.gaussians, localization, config.boxes)
         absent = {word: describe_absent(value) for word, value in localization.absent.items()}

@@ -164,13 +164,13 @@ def _details(views: Views, row: int, width: int, height: int) -> Float64[np.ndar
     return np.asarray(gaussian_filter(values, FINE) - gaussian_filter(values, COARSE))
 
 
-def _correlation(places: list[_Places], pairs: int, factor: float, shift: Float64[np.ndarray, "2"]) -> float:
+def _correlation(positions: list[_Places], pairs: int, factor: float, shift: Float64[np.ndarray, "2"]) -> float:
     """Mean correlation of the details of pairs of views with a color camera."""
     from scipy.ndimage import map_coordinates
 
-    total = sum(len(each.points) for each in places)
+    total = sum(len(each.points) for each in positions)
     values, numbers = np.full(total, np.nan), np.zeros(total, np.int64)
-    for details, K, points, entries, pair in places:
+    for details, K, points, entries, pair in positions:
         focal = K.copy()
         focal[0, 0] *= factor
         focal[1, 1] *= factor

@@ -245,7 +245,7 @@ def _within_megabytes(
 
 
 def realised_error(
-    made: BudgetEncoding,
+    encoding: BudgetEncoding,
     gaussians: Gaussians,
     encoder: Encoder,
     *,
@@ -255,7 +255,7 @@ def realised_error(
 ) -> dict[str, FieldError]:
     """The error of each teacher's features against those of the exact setting, on a tenth of the Gaussians, drawn now.
     Where the exact setting was chosen, nothing is encoded again."""
-    exact: Mapping[str, GaussianFeatures] = made.encoded
-    if made.setting.config != made.exact:
-        exact = encoder.encode_spaces(gaussians, made.exact, metres_per_unit=metres_per_unit, track=track)
-    return {name: judge(features, exact[name], seed=seed) for name, features in made.features.items()}
+    exact: Mapping[str, GaussianFeatures] = encoding.encoded
+    if encoding.setting.config != encoding.exact:
+        exact = encoder.encode_spaces(gaussians, encoding.exact, metres_per_unit=metres_per_unit, track=track)
+    return {name: judge(features, exact[name], seed=seed) for name, features in encoding.features.items()}

@@ -67,8 +67,8 @@ def labels_by_features(
             better = shares > best[candidates]
             chosen = candidates[better]
             best[chosen], possible[chosen] = shares[better], number + 1
-    taken = best > config.share
-    labels[taken] = possible[taken]
+    above_share = best > config.share
+    labels[above_share] = possible[above_share]
     return Candidates(labels=labels, possible=possible, shares=best)
 
 
@@ -86,19 +86,19 @@ def labels_by_pixels(
     """
     labels, possible = candidates.labels, candidates.possible
     rows = np.flatnonzero(possible > 0)
-    own, total = _own(votes.present, rows, possible)
-    left, total_left = _own(votes.removed, rows, possible)
+    on_label, total = _weight_on_label(votes.present, rows, possible)
+    on_label_removed, total_removed = _weight_on_label(votes.removed, rows, possible)
     usual = _usual_weights(votes.present, labels)[possible[rows]]
-    is_in, known = labels[rows] == possible[rows], seen[rows]
-    partly = known & (candidates.shares[rows] > PARTLY * config.share)
-    ghost = (left > 0.5) & (left * total_left >= GHOST_WEIGHT * usual) & (total_left > 0)
-    shown = (total > 0) & (own >= config.only)
+    is_in, has_feature = labels[rows] == possible[rows], seen[rows]
+    partly = has_feature & (candidates.shares[rows] > PARTLY * config.share)
+    ghost = (on_label_removed > 0.5) & (on_label_removed * total_removed >= GHOST_WEIGHT * usual) & (total_removed > 0)
+    confirmed = (total > 0) & (on_label >= config.only)
     # What is hidden now is judged by the views in which it would appear.
-    featureless = ~known & (np.where(total > 0, own, left) > 0.5)
-    lost = is_in & (total > 0) & np.where(known, own < 1 - config.only, own <= 0.5)
+    featureless = ~has_feature & (np.where(total > 0, on_label, on_label_removed) > 0.5)
+    lost = is_in & (total > 0) & np.where(has_feature, on_label < 1 - config.only, on_label <= 0.5)
     corrected = labels.copy()
-    taken = rows[(partly & (shown | ghost)) | featureless]
-    corrected[taken] = possible[taken]
+    added = rows[(partly & (confirmed | ghost)) | featureless]
+    corrected[added] = possible[added]
     corrected[rows[lost]] = 0
     return corrected
 
@@ -112,11 +112,13 @@ def _usual_weights(present: Float32[np.ndarray, "N labels"], labels: Labels) -> 
     return usual
 
 
-def _own(weights: Float32[np.ndarray, "N labels"], rows: np.ndarray, possible: Labels) -> tuple[np.ndarray, np.ndarray]:
+def _weight_on_label(
+    weights: Float32[np.ndarray, "N labels"], rows: np.ndarray, possible: Labels
+) -> tuple[np.ndarray, np.ndarray]:
     """The share of the weight that is on the pixels of the label that is possible, 0 without weight; and the weight."""
     total = weights[rows].sum(axis=1)
-    own = weights[rows, possible[rows]]
-    return np.divide(own, total, out=np.zeros_like(own), where=total > 0), total
+    on_label = weights[rows, possible[rows]]
+    return np.divide(on_label, total, out=np.zeros_like(on_label), where=total > 0), total
 
 
 def labels_of_hidden(
@@ -130,16 +132,16 @@ def labels_of_hidden(
     from scipy.spatial import cKDTree
 
     rows = np.flatnonzero(unknown & (possible > 0))
-    known = np.flatnonzero(~unknown)
-    if not len(rows) or not len(known):
+    labeled = np.flatnonzero(~unknown)
+    if not len(rows) or not len(labeled):
         return labels
     points = gaussians.means.astype(np.float64)
-    distances, nearest = cKDTree(points[known]).query(points[rows], k=min(NEIGHBORS, len(known)))
+    distances, nearest = cKDTree(points[labeled]).query(points[rows], k=min(NEIGHBORS, len(labeled)))
     distances, nearest = distances.reshape(len(rows), -1), nearest.reshape(len(rows), -1)
-    agreeing = (labels[known[nearest]] == possible[rows][:, None]).mean(axis=1)
+    agreeing = (labels[labeled[nearest]] == possible[rows][:, None]).mean(axis=1)
     corrected = labels.copy()
-    taken = (agreeing > 0.5) & (distances[:, 0] <= 2 * spacing)
-    corrected[rows] = np.where(taken, possible[rows], 0)
+    agrees = (agreeing > 0.5) & (distances[:, 0] <= 2 * spacing)
+    corrected[rows] = np.where(agrees, possible[rows], 0)
     return corrected
 
 
@@ -169,7 +171,7 @@ def grow(
     candidates = labels_by_features(gaussians, features, parts, relevancy, config, spacing)
     labels = candidates.labels
     unknown = ~features.seen
-    looked = 0
+    view_count = 0
     if cameras is not None and config.views and len(cameras):
         # The matrix of a view needs torch, which all else does without.
         from gsencoder.infer.select.votes import sampling, votes
@@ -178,5 +180,5 @@ def grow(
         by_pixels = votes(gaussians, cameras, labels, len(parts), chosen, spacing=spacing, track=track)
         labels = labels_by_pixels(candidates, features.seen, by_pixels, config)
         unknown = unknown & (by_pixels.present.sum(axis=1) + by_pixels.removed.sum(axis=1) == 0)
-        looked = len(chosen.views)
-    return labels_of_hidden(gaussians, labels, candidates.possible, unknown, spacing), looked
+        view_count = len(chosen.views)
+    return labels_of_hidden(gaussians, labels, candidates.possible, unknown, spacing), view_count

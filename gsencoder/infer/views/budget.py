@@ -93,16 +93,16 @@ def choose_views_within(
         return judge_candidates(scene, gaussians, targets, free, replace(config, candidates=number))
 
     begun = clock()
-    made, number = judged(numbers[0]), numbers[0]
-    each = (clock() - begun) / number
+    judgment, number = judged(numbers[0]), numbers[0]
+    seconds_each = (clock() - begun) / number
     spent = predicted = clock() - start
     notes: tuple[str, ...] = ()
     # Placing candidates takes some of that time whatever their number, so that this is on the safe side.
-    fitting = [more for more in numbers[1:] if spent + more * each <= PLANNED * budget.seconds]
+    fitting = [more for more in numbers[1:] if spent + more * seconds_each <= PLANNED * budget.seconds]
     if fitting:
         number = fitting[-1]
-        predicted, made = spent + number * each, judged(number)
+        predicted, judgment = spent + number * seconds_each, judged(number)
     elif spent > budget.seconds:
         notes = (f"{budget.shown('seconds')}: judging {number} candidates took {spent:.3g} s; they are used",)
-    views = chosen_views(scene, targets, made, free, config)
+    views = chosen_views(scene, targets, judgment, free, config)
     return BudgetViews(views=views, candidates=number, predicted=predicted, seconds=clock() - start, notes=notes)

@@ -87,10 +87,10 @@ def judge_candidates(
 
 
 def chosen_views(
-    scene: Scene, targets: Sequence[Target], made: Judged, free: FreeSpace, config: ViewsConfig
+    scene: Scene, targets: Sequence[Target], judgment: Judged, free: FreeSpace, config: ViewsConfig
 ) -> ViewSet:
     """The candidates that show targets best together; see `choose_views`."""
-    candidates, scores, judged = made
+    candidates, scores, judged = judgment
     cameras = candidates.cameras
     values = CoverageObjective(cameras, targets, scores, config)
     if config.method == "uniform":
