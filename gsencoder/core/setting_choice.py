@@ -54,7 +54,7 @@ def within_seconds(
         The setting, and notes about a promise that is not kept.
     """
     limit = budget.promise("seconds")
-    if "error" in budget.given:
+    if "error" in budget.promised:
         needed = seconds(best)
         return best, (budget.conflict("error", "seconds", needed),) if needed > limit else ()
     fast_enough = [setting for setting in settings if seconds(setting) <= PLANNED * limit]

@@ -106,20 +106,20 @@ def write_predictions(
     names: list[RankedNames] = []
     sentences: list[Expression] = []
     boxes: list[PredictedBoxes] = []
-    given: tuple[Expression, ...] = ()
+    all_expressions: tuple[Expression, ...] = ()
     if isinstance(protocol, ReferringProtocol) and protocol.expressions:
-        given = read_expressions(Path(protocol.expressions))
+        all_expressions = read_expressions(Path(protocol.expressions))
     for loaded, load_seconds in scenes:
         scene, features, seconds = with_features(loaded, source, seeds)
         start = time.perf_counter()
         mesh = None if scene.folder is None else find_labels(scene.folder, names=labeled)
         if isinstance(protocol, ReferringProtocol):
-            asked = _expressions(scene, mesh, given, raw_ids)
+            expressions = _expressions(scene, mesh, all_expressions, raw_ids)
             # Boxes of a file are in the aligned frame of its scans, those of a scene's objects in its world.
-            aligned = mesh.aligned_from_world if mesh is not None and given else None
-            sentences += asked
+            aligned = mesh.aligned_from_world if mesh is not None and all_expressions else None
+            sentences += expressions
             boxes += predict_referring(
-                scene, features, asked, words, protocol, localization, aligned_from_world=aligned
+                scene, features, expressions, words, protocol, localization, aligned_from_world=aligned
             )
         else:
             points = labeled_points(scene, mesh)

@@ -10,7 +10,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.entries import box_corners
 from gsencoder.infer.ask.ask import Question
-from gsencoder.infer.ask.predictions import predictions, said, short_answer, target_corners
+from gsencoder.infer.ask.predictions import answer_text, predictions, short_answer, target_corners
 from gsencoder.infer.ask.question_sets import QuestionSet, caption_question, is_question_set, read_question_set
 
 
@@ -140,7 +140,7 @@ def test_a_set_is_one_value_that_is_no_question(tmp_path: Path, text: str, one: 
 
 
 def test_what_was_said_is_on_one_line_and_loses_thoughts_and_the_last_stops() -> None:
-    assert said("<think>no</think>  A\n b. ") == "A b."
+    assert answer_text("<think>no</think>  A\n b. ") == "A b."
     assert short_answer("It is 3.5. ..") == "it is 3.5."
     assert short_answer("...") == ""
     assert wrapped_caption("it is. it is.") == "sos it is . it is . eos"

@@ -43,7 +43,7 @@ def encode_in_budget(
     assert scene.gaussians is not None
     # Of the settings, those that take the most bytes in the files.
     longest = replace(exact_encoding(config.encode), precision="bfloat16")
-    made = encode_within(
+    encoding = encode_within(
         scene.gaussians,
         encoder,
         teachers,
@@ -53,21 +53,21 @@ def encode_in_budget(
         header={"encode": settings(longest), **made_with},
         track=Progress(quiet=config.quiet),
     )
-    summary.add_seconds({"choose": made.choosing, "encode": made.seconds - made.choosing})
-    ranks = {"rank" if len(made.ranks) == 1 else f"rank of {name}": rank for name, rank in made.ranks.items()}
+    summary.add_seconds({"choose": encoding.choosing, "encode": encoding.seconds - encoding.choosing})
+    ranks = {"rank" if len(encoding.ranks) == 1 else f"rank of {name}": rank for name, rank in encoding.ranks.items()}
     report_choice(
         summary,
         scene.name,
-        {**made.setting.knobs, **ranks},
+        {**encoding.setting.knobs, **ranks},
         predicted={
-            "error": made.predicted,
-            "seconds": made.choosing + made.setting.seconds if config.budget.seconds is not None else None,
+            "error": encoding.predicted,
+            "seconds": encoding.choosing + encoding.setting.seconds if config.budget.seconds is not None else None,
         },
-        notes=made.notes,
+        notes=encoding.notes,
         quiet=config.quiet,
-        gaussians_sampled=made.sampled,
+        gaussians_sampled=encoding.sampled,
     )
-    return made
+    return encoding
 
 
 def check_promises(

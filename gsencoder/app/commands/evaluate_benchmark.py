@@ -116,17 +116,17 @@ def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str], *, wa
     """
     if not isinstance(protocol, ReferringProtocol) or not protocol.expressions:
         return 0
-    asked = read_expressions(Path(protocol.expressions))
-    others = [each.scene for each in asked if each.scene not in scenes]
-    if len(others) == len(asked):
+    sentences = read_expressions(Path(protocol.expressions))
+    others = [each.scene for each in sentences if each.scene not in scenes]
+    if len(others) == len(sentences):
         raise InputError(
-            f"protocol.expressions: none of the {len(asked)} sentences of {protocol.expressions} is about a scene that "
-            f"is evaluated ({listed(sorted(scenes), 3)}); first {listed(others, 1)}"
+            f"protocol.expressions: none of the {len(sentences)} sentences of {protocol.expressions} is about a scene "
+            f"that is evaluated ({listed(sorted(scenes), 3)}); first {listed(others, 1)}"
         )
     if others and warn:
         warnings.warn(
-            f"{len(others)} of {len(asked)} sentences do not count: they are about {len(set(others))} scenes that are "
-            f"not evaluated (first: {others[0]})",
+            f"{len(others)} of {len(sentences)} sentences do not count: they are about {len(set(others))} scenes that "
+            f"are not evaluated (first: {others[0]})",
             SceneWarning,
             stacklevel=2,
         )

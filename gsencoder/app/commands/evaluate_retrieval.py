@@ -37,18 +37,18 @@ def run_retrieval(
     """Compares the views of all scenes with all texts, and scores what it wrote."""
     if not protocol.captions:
         raise InputError("protocol.captions= is missing: a JSON list of {scene_id, view, caption}")
-    given = read_view_captions(Path(protocol.captions))
+    provided = read_view_captions(Path(protocol.captions))
     names = [scene_name(path) for path in find_scenes(config.paths)]
-    captions = [each for name in names for each in given if each.scene == name]
+    captions = [each for name in names for each in provided if each.scene == name]
     if not captions:
         raise InputError(
             f"protocol.captions: none of the captions in {protocol.captions} is about a scene "
-            f"that is evaluated ({listed(names, 3)}); first {given[0].scene}"
+            f"that is evaluated ({listed(names, 3)}); first {provided[0].scene}"
         )
-    if len(captions) < len(given):
+    if len(captions) < len(provided):
         warnings.warn(
-            f"{len(given) - len(captions)} of {counted(len(given), 'caption')} do not count: they are about scenes "
-            "that are not evaluated",
+            f"{len(provided) - len(captions)} of {counted(len(provided), 'caption')} do not count: they are about "
+            "scenes that are not evaluated",
             SceneWarning,
             stacklevel=2,
         )

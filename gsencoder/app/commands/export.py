@@ -215,8 +215,8 @@ def _memory_of(memories: Mapping[str | None, QueryMemory], space: str) -> QueryM
         by_name.setdefault(memory.space.name, memory)
     if space not in by_name:
         names = ", ".join(name or memory.space.name for name, memory in memories.items())
-        wanted = f"expected one of them, got {space!r}" if space else "name one of them"
-        raise InputError(f"space: the folder has memories of {names}; {wanted}")
+        hint = f"expected one of them, got {space!r}" if space else "name one of them"
+        raise InputError(f"space: the folder has memories of {names}; {hint}")
     return by_name[space]
 
 

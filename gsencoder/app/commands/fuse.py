@@ -117,7 +117,7 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
                 teacher = build_teacher(config.teacher, scene, words)
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             in_budget: BudgetFusion | None = None
-            if config.budget.given:
+            if config.budget.promised:
                 in_budget = fuse_in_budget(scene, teacher, config, one, work_folder(out), sample_cells=bool(heads))
                 fusion = in_budget.fusion
             else:

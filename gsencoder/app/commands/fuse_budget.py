@@ -34,7 +34,7 @@ def fuse_in_budget(
     scene: Scene, teacher: Teacher, config: BudgetOptions, summary: Summary, work: Path, *, sample_cells: bool
 ) -> BudgetFusion:
     """Chooses a setting and fuses; says which setting that is, and what is predicted of it."""
-    made = fuse_within(
+    fused = fuse_within(
         scene,
         teacher,
         config.fusion,
@@ -44,22 +44,22 @@ def fuse_in_budget(
         device=config.device,
         track=Progress(quiet=config.quiet),
     )
-    choice = made.choice
-    summary.add_seconds({"choose": made.choosing, **made.fusion.seconds})
+    choice = fused.choice
+    summary.add_seconds({"choose": fused.choosing, **fused.fusion.seconds})
     report_choice(
         summary,
         scene.name,
         choice.knobs,
-        predicted=_predicted(made),
+        predicted=_predicted(fused),
         notes=choice.notes,
         quiet=config.quiet,
-        of=f", of {len(made.scene.views or ())} views",
+        of=f", of {len(fused.scene.views or ())} views",
         of_views=len(scene.views) if scene.views is not None else 0,
         scatter=choice.scatter,
         rays_followed=choice.followed,
         rays_exact=choice.all_rays,
     )
-    return made
+    return fused
 
 
 def _predicted(fused: BudgetFusion) -> Mapping[str, float | None]:

@@ -77,7 +77,7 @@ class PackConfig(CommonConfig):
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
-        if self.budget.given and self.form not in CODED:
+        if self.budget.promised and self.form not in CODED:
             raise InputError(
                 f"{self.budget.names}: form={self.form} writes features as they are; take form=compact or index, or "
                 "leave the budget out"
@@ -170,7 +170,7 @@ def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, confi
 
 
 def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
-    if config.budget.given:
+    if config.budget.promised:
         indexed, error = index_within(features, config.budget, partial(index_bytes, scene, features))
     else:
         indexed = index_features(features, config.index)
@@ -199,12 +199,12 @@ def _report(
 ) -> None:
     """Says what a budget chose and what became of it: both are measured over all Gaussians, of the file as it is."""
     budget, megabytes = config.budget, size / MEGABYTE
-    if not budget.given:
+    if not budget.promised:
         return
     broken = budget.error is not None and budget.megabytes is not None and megabytes > budget.megabytes
     notes = [budget.conflict("error", "megabytes", megabytes)] if broken else []
     report_choice(summary, scene.name, chosen, predicted={}, notes=notes, quiet=config.quiet)
-    realised = {name: value for name, value in (("error", error), ("megabytes", megabytes)) if name in budget.given}
+    realised = {name: value for name, value in (("error", error), ("megabytes", megabytes)) if name in budget.promised}
     for line in report_promises(summary, budget, realised):
         console(config.quiet).print(f"{scene.name}: {line}")
 

@@ -138,7 +138,7 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
         screen.print(_table(each))
         screen.print(f"knobs that matter: {', '.join(each.matter) or 'none'}")
         for rung in each.rungs:
-            more = "" if rung is each.rungs[-1] else f"; the best {len(rung.kept)} went on"
+            more = "" if rung is each.rungs[-1] else f"; the best {len(rung.survivors)} went on"
             screen.print(f"{counted(len(rung.settings), 'setting')} on {counted(rung.scenes, 'scene')}{more}")
     for scaled in exponents:
         value, low, high, *_ = scaled.exponent

@@ -109,18 +109,18 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
         summary.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
     promises: list[str] = []
     with summary.step("choose"):
-        if config.budget.given:
-            made = choose_views_within(scene, targets, config.choose, config.budget)
-            views = made.views
+        if config.budget.promised:
+            result = choose_views_within(scene, targets, config.choose, config.budget)
+            views = result.views
             report_choice(
                 summary,
                 scene.name,
-                {"candidates": made.candidates},
-                predicted={"seconds": made.predicted},
-                notes=made.notes,
+                {"candidates": result.candidates},
+                predicted={"seconds": result.predicted},
+                notes=result.notes,
                 quiet=config.quiet,
             )
-            promises = report_promises(summary, config.budget, {"seconds": made.seconds})
+            promises = report_promises(summary, config.budget, {"seconds": result.seconds})
         else:
             views = choose_views(scene, targets, config.choose)
     out = config.out or Path("outputs") / scene.name / "views"

@@ -203,8 +203,8 @@ def sweep_neighbors(
 
 def _pixel_size(cameras: Cameras, depths: Mapping[int, Float[Tensor, "h w"]]) -> float:
     """What a pixel of a typical photograph covers of the known surfaces, in world units."""
-    known = [(view, depth[depth > 0]) for view, depth in depths.items()]
-    return float(np.median([float(z.median() / cameras.Ks[view, 0, 0]) for view, z in known if len(z)] or [1.0]))
+    measured = [(view, depth[depth > 0]) for view, depth in depths.items()]
+    return float(np.median([float(z.median() / cameras.Ks[view, 0, 0]) for view, z in measured if len(z)] or [1.0]))
 
 
 def carve(

@@ -102,9 +102,9 @@ def take_frames(
             stacklevel=2,
         )
     names: list[str] = []
-    wanted = set(chosen.tolist())
+    selected = set(chosen.tolist())
     for index, frame in track(enumerate(video.frames()), f"taking {len(chosen)} frames"):
-        if index in wanted:
+        if index in selected:
             names.append(f"frame_{index:06d}.jpg")
             _write(folder / names[-1], color_picture(frame, config.pixels, video.pixel_aspect))
         if index == chosen[-1]:

@@ -88,14 +88,14 @@ class Records:
         self._path = None if folder is None else folder / RECORDS_FILE
         if folder is None:
             return
-        wanted = json.dumps(plain(dict(identity)), sort_keys=True)
+        expected = json.dumps(plain(dict(identity)), sort_keys=True)
         written = folder / IDENTITY_FILE
-        if written.is_file() and written.read_text(encoding="utf-8") != wanted:
+        if written.is_file() and written.read_text(encoding="utf-8") != expected:
             raise InputError(
                 f"{folder}: holds measurements of a sweep with other settings; give resume=false to begin anew, or "
                 "another out="
             )
-        write_bytes(written, wanted.encode())
+        write_bytes(written, expected.encode())
         self._read()
 
     def _read(self) -> None:

@@ -21,7 +21,7 @@ from gsencoder.fusion.budget.model import (
 from gsencoder.fusion.budget.rank import RankErrors, rank_errors, with_rank
 from gsencoder.fusion.budget.settings import Setting, all_settings
 from gsencoder.fusion.coverage.order import view_order
-from gsencoder.fusion.coverage.sight import LatticeOf, Sight, look
+from gsencoder.fusion.coverage.sight import LatticeOf, Sight, trace_sight
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import capped, distinct_rows
 from gsencoder.fusion.teachers import Teacher
@@ -121,7 +121,7 @@ def choose(
     probed = _ProbedTeacher(maps={probe: map_of(probe)})
     lattice_of = _lattices(views, probed.maps[probe], exact)
     visibility = resolve(base.visibility, views, base.lift)
-    sight = look(gaussians, views, lattice_of, visibility, exact.blend, seed=budget.seed)
+    sight = trace_sight(gaussians, views, lattice_of, visibility, exact.blend, seed=budget.seed)
     choosing, judging = sight.halves()
     map_count = min(max(FIRST_MAPS, math.ceil(len(views) / MAPS_SHARE)), len(views))
     while True:

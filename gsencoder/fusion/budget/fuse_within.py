@@ -77,7 +77,7 @@ def fuse_within(
     Raises:
         InputError: no budget, one that cannot be combined with the options, or what `fuse` refuses.
     """
-    if not budget.given:
+    if not budget.promised:
         raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
     check_budget(budget, config)
     start = clock()

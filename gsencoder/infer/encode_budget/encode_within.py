@@ -113,7 +113,7 @@ def encode_within(
     Raises:
         InputError: no budget, megabytes into which not even one coordinate fits, or what encoding refuses.
     """
-    if not budget.given:
+    if not budget.promised:
         raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
     start = clock()
     exact = replace(exact_encoding(config), precision=encoder.precisions(config.device)[0])

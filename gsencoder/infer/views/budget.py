@@ -54,7 +54,7 @@ def check_views_budget(budget: ViewsBudget, config: ViewsConfig) -> None:
         InputError: `GOVERNED` options are set, or views are not chosen from candidates.
     """
     check_governed(budget, config, ViewsConfig(), GOVERNED, "choose")
-    if budget.given and config.method != "greedy":
+    if budget.promised and config.method != "greedy":
         raise InputError(
             f"choose.method={config.method}: {budget.names} is for method=greedy, which judges candidates; leave one "
             "of the two out"

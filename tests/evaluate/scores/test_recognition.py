@@ -41,7 +41,7 @@ def test_scores_are_those_worked_out_by_hand() -> None:
     assert scores.mean == pytest.approx({1: (1 / 3 + 1) / 2, 2: (2 / 3 + 1) / 2})
     assert scores.overall == pytest.approx({1: 2 / 4, 2: 3 / 4})
     assert scores.counts == {"bed": 3, "chair": 1, "sofa": 0}
-    assert [item.place for item in found] == [1, 2, 0, 1]
+    assert [item.rank for item in found] == [1, 2, 0, 1]
 
 
 def test_the_mean_of_the_papers_row_is_the_mean_of_its_classes() -> None:
