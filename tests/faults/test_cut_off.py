@@ -90,7 +90,7 @@ def test_words_that_are_cut_off_while_they_are_copied_are_named(
         cut(target)
 
     save_room(tmp_path / "features")
-    monkeypatch.setattr("gsencoder.app.commands.pack.copyfile", cut_off)
+    monkeypatch.setattr("gsencoder.core.files.copied_file.copyfile", cut_off)
     assert cli.main(["pack", str(tmp_path / "features"), "form=npz", f"out={tmp_path / 'out'}", "quiet=true"]) == 2
     assert capsys.readouterr().err.startswith(f"error: {tmp_path / 'features' / 'words.safetensors'}: ")
     assert not (tmp_path / "out").exists()
