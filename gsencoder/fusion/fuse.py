@@ -124,7 +124,7 @@ def fuse(
     Args:
         scene: with Gaussians and views.
         teacher: whose maps are lifted.
-        config: see there.
+        config: settings.
         basis: fuse in the coordinates of this basis, which scenes that are trained on together share; None = one of the
             scene's own, where `config` asks for one.
         rows: numbers of the views that are lifted, in this order; None = those that `config` chooses.
@@ -286,7 +286,7 @@ def find_subspace(
         teacher: whose table, if it has one, makes a pass over the maps unnecessary.
         maps: the map of a view.
         rows: of the views.
-        config: see there.
+        config: settings.
         track: progress.
         one_pass: whether the mean may be left to the pass that lifts, where nothing else is missing.
     """

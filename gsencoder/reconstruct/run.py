@@ -121,7 +121,7 @@ def reconstruct(
 
     Args:
         scene: with photographs and poses; depth and masks are used where it has them.
-        config: see there.
+        config: settings.
         device: where to compute; on CUDA gsplat renders.
         work: an existing folder for the checkpoint and the log. A run that was interrupted is continued from the
             checkpoint in it, with the same result; None = a temporary folder.

@@ -92,7 +92,7 @@ def register_photographs(
     Args:
         folder: of the photographs.
         work: an existing folder for COLMAP's database; the model is written to `sparse/0` in it.
-        config: see there.
+        config: settings.
         single_camera: whether one camera took them all with one focal length, as the frames of a video.
 
     Raises:

@@ -43,7 +43,7 @@ def load_asker(settings: AskerSettings, folder: Path, photos: str) -> Asker:
     """The scene of a folder of features, and what is asked about it is looked up with.
 
     Args:
-        settings: see there.
+        settings: settings.
         folder: of the features.
         photos: the scene that was fused, whose photographs are shown; empty = renders are.
     """

@@ -129,7 +129,7 @@ def densify(
         training: the views that may be looked at.
         points: from structure from motion.
         colors: beside them.
-        config: see there.
+        config: settings.
         guide: points that tell which views to compare and at which depths, and are no seeds; None = `points`.
         track: progress.
     """

@@ -60,7 +60,7 @@ def take_frames(
         path: of the video.
         folder: is replaced; it receives `frame_000000.jpg` and so on, the number being that of the frame in the video,
             and a record of what they were made from.
-        config: see there.
+        config: settings.
         track: progress of decoding.
 
     Returns:

@@ -84,7 +84,7 @@ def successive_halving(
         settings: to begin with.
         scenes: how many there are.
         evaluate: see there.
-        config: see there.
+        config: settings.
     """
     rungs: list[Rung] = []
     current, used = list(settings), min(config.first, scenes)

@@ -128,7 +128,7 @@ class Asker:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
         words: what leads into the features; None where nothing does.
         space: which features are asked.
-        config: see there.
+        config: settings.
         localization: how words become boxes.
         views: how views are chosen.
         vlm: how requests are made; pictures are made smaller than its `image_side`.

@@ -121,7 +121,7 @@ def localize(
         scene: Gaussians with features.
         queries: words that `text` knows.
         text: turns words into the features' space.
-        config: see there.
+        config: settings.
         space: name of the feature set; None where the scene has only one.
         rivals: words that may fit the Gaussians better than those asked; None = the names that
             `text` knows, if it knows any.

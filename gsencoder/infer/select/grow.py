@@ -164,7 +164,7 @@ def grow(
         cameras: that look at it; None = features and places alone decide.
         parts: what each word's selection starts with.
         relevancy: of each word.
-        config: see there.
+        config: settings.
         spacing: of the scene, world units.
         track: progress over the views.
     """

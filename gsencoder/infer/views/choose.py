@@ -36,7 +36,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
         scene: Gaussians, and cameras where it has any. Frames of a scene with photographs are judged as these, and
             close-ups cut from them are candidates too.
         targets: what is looked at; all count alike. Evenly spread frames need none.
-        config: see there.
+        config: settings.
 
     Warns:
         SceneWarning: fewer views than were asked for, a target that no view shows, no room around one.

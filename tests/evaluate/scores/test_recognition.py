@@ -48,7 +48,7 @@ def test_the_mean_of_the_papers_row_is_the_mean_of_its_classes() -> None:
     # Table 1, PointCLIP: 0 but for table 0.7, bookshelf 91.8 and curtain 15.0, of 17 classes; the paper prints 6.3.
     shares = {"table": 7, "bookshelf": 918, "curtain": 150} | {f"class {number}": 0 for number in range(14)}
     found = [
-        RecognizedInstance(scene=name, object=str(number), name=name, place=int(number < right), first=name)
+        RecognizedInstance(scene=name, object=str(number), name=name, rank=int(number < right), first=name)
         for name, right in shares.items()
         for number in range(1000)
     ]
