@@ -118,7 +118,7 @@ class CachedTeacher(WrappedTeacher):
     ) -> None:
         """Args:
         teacher: whose maps.
-        folder: of one scene's maps of this teacher and no other; whoever gives it sees to that.
+        folder: must hold the maps of one scene by this teacher alone, which is not checked.
         before_write: called before a file is written.
         advice: what to do about a damaged file, for the error.
         """

@@ -10,13 +10,13 @@ from torch import Tensor
 RIDGE = 1e-3
 """Pull toward the identity, as a variance of colors in [0, 1]: what a picture does not vary in is not fitted."""
 STEP = 0.5
-"""How far a map moves toward the one that fits best, each time its photograph is looked at."""
+"""Share of the way to the best fit that a map moves at each step of its photograph."""
 OPAQUE = 0.5
 """Pixels of a render below this alpha show the background, and tell nothing."""
 SAME = 0.03
 """Photographs of which no color channel differs by more from the mean do not count as differing in exposure."""
 ROUNDS = 3
-"""After so many looks at every photograph its map has gone seven eighths of its way, and is judged."""
+"""Number of steps of each photograph after which the maps, now seven eighths of the way to the fits, are judged."""
 
 IDENTITY = torch.eye(3, 4)
 
@@ -24,9 +24,9 @@ IDENTITY = torch.eye(3, 4)
 class Exposures:
     """An affine map of colors for each fitted photograph, relative to the mean of all.
 
-    The maps are not optimized by gradients: photographs are looked at too seldom for that. Each time a render of one is
-    at hand, its map moves halfway to the least-squares fit. What all maps have in common, such as the loss of contrast
-    where the splat is still blurred, is left to the splat: only the difference from their mean is applied.
+    The maps are not optimized by gradients, since each photograph is rendered too rarely for that: at each of its steps
+    its map moves halfway to the least-squares fit. What all maps have in common, such as the loss of contrast while the
+    splat is still blurred, is left to the splat: only the difference of a map from the mean of all is applied.
 
     Attributes:
         training: row numbers of the fitted photographs.
@@ -36,7 +36,7 @@ class Exposures:
     def __init__(self, training: Sequence[int], maps: Float[Tensor, "V 3 4"] | None = None) -> None:
         """Args:
         training: row numbers of the fitted photographs.
-        maps: of a run that is continued; None = nothing is known yet.
+        maps: of a run that is continued; None = identities.
         """
         self.training = tuple(training)
         self._rows = {view: row for row, view in enumerate(training)}

@@ -32,9 +32,9 @@ from gsencoder.types import FeatureMap, Gaussians, Views
 FIRST_MAPS, MAPS_SHARE = 4, 8
 """The scatter of the teacher's vectors is first measured on so many views, or on one of so many if that is more."""
 SAFETY = 1.5
-"""ρ counts so many times, since views are not independent of each other."""
+"""Factor by which ρ is multiplied, since views are not independent of each other."""
 MINIMAL_SCATTER = 1e-4
-"""ρ is not taken for less: what a few views show alike, others may not."""
+"""Lower bound of ρ: vectors that agree in a few views may differ in others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -31,8 +31,8 @@ COSTS = {"auto": 1.0, "float32": 1.0, "bfloat16": 0.55}
 SMALL_SCENE = 20_000
 """Scenes of fewer Gaussians that are not cut are encoded exactly: choosing would cost more than it saves."""
 SAFETY, DEVIATIONS = 5.0, 2.0
-"""A predicted error counts so many times, and with so many of its standard errors: parts said a third to five times of
-what cuts of whole scenes did."""
+"""The bound of an error is `SAFETY` times the predicted one plus `DEVIATIONS` of its standard errors: the error that
+parts of a scene predict was a third to five times that of the whole scene."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

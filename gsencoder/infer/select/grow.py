@@ -21,12 +21,13 @@ surroundings goes with it."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Candidates:
-    """What features and places say of each Gaussian.
+    """The label of each Gaussian by its feature, and the label that it could have by its position.
 
     Attributes:
-        labels: by the features.
-        possible: the label that it could have by its place; 0 = out of reach of every word.
-        shares: of the object of that label in its feature; −∞ where no label is possible, `NO_SHARE` without a feature.
+        labels: by the features, 0 = none.
+        possible: by the position; 0 = out of reach of every word.
+        shares: share of the object of the possible label in the feature; −∞ where no label is possible, `NO_SHARE`
+            without a feature.
     """
 
     labels: Labels
@@ -42,11 +43,11 @@ def labels_by_features(
     config: SelectConfig,
     spacing: float,
 ) -> Candidates:
-    """The label of each Gaussian by its feature, and the label that it could have by its place.
+    """The label of each Gaussian by its feature, and the label that it could have by its position.
 
-    A Gaussian has the word of whose objects its feature has the largest share, if that is above `config.share`. By its
-    place it could be of a word of which a part is within reach; of several, that whose share is the largest, or the
-    first where it has no feature.
+    By its position a Gaussian could have a word of which a part is within reach; of several words the one with the
+    largest share in its feature, or the first where it has no feature. It has that word if the share is above
+    `config.share`.
     """
     count = len(gaussians)
     labels, possible = np.zeros(count, np.int32), np.zeros(count, np.int32)
@@ -80,9 +81,9 @@ def labels_by_pixels(
     A Gaussian with a good part of an object in its feature (`PARTLY` of `config.share` or more) is taken if the share
     `config.only` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
     if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much
-    there as Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its
+    there as Gaussians of the object usually have. One that has the label loses it if less than 1 − `config.only` of its
     weight is there. A Gaussian without a feature has the label on whose pixels more than half of its weight is, or,
-    where no view shows it, would be if the objects were taken out. What no view would show stays as it is.
+    where no view shows it, would be if the objects were taken out. Gaussians that no view would show keep their label.
     """
     labels, possible = candidates.labels, candidates.possible
     rows = np.flatnonzero(possible > 0)
@@ -124,7 +125,7 @@ def _weight_on_label(
 def labels_of_hidden(
     gaussians: Gaussians, labels: Labels, possible: Labels, unknown: Bool[np.ndarray, " N"], spacing: float
 ) -> Labels:
-    """Labels in which Gaussians that neither features nor views tell anything of have the label of those around them.
+    """Labels in which Gaussians that have no feature and that no view shows take the label of their neighbors.
 
     A Gaussian of `unknown` within reach of a word gets the word if more than half of its nearest Gaussians that are
     known have it and the nearest of these is within two spacings.
@@ -156,12 +157,12 @@ def grow(
     *,
     track: Track = untracked,
 ) -> tuple[Labels, int]:
-    """The labels of all Gaussians, and how many views were looked at.
+    """The labels of all Gaussians, and the number of views that corrected them.
 
     Args:
         gaussians: the splat.
         features: of the space in which the words were asked.
-        cameras: that look at it; None = features and places alone decide.
+        cameras: of the views that correct the labels; None = features and positions alone decide.
         parts: what each word's selection starts with.
         relevancy: of each word.
         config: settings.

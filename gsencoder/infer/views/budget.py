@@ -37,7 +37,7 @@ class BudgetViews:
         candidates: among how many.
         predicted: seconds.
         seconds: from the beginning to the choice.
-        notes: what is to be said.
+        notes: for the user, about a promise that is not kept.
     """
 
     views: ViewSet

@@ -125,8 +125,7 @@ def _distances(
 
 
 def up_of(scene: Scene) -> Float64[np.ndarray, "3"] | None:
-    """The scene's up, or what its cameras hold for it: the mean of their pictures' upward directions, where these
-    agree; None where nobody knows."""
+    """The scene's up, else the mean of the upward directions of its views where these agree, else None."""
     if scene.up is not None or scene.views is None:
         return scene.up
     mean = -scene.views.cameras.cam_from_world[:, 1, :3].astype(np.float64).mean(axis=0)
