@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 import pytest
 import shape_checks  # noqa: F401  # Before any module of the package.
+from composed_once import compose_once
+from forked_ranks import RankServer, rank_server
 from hypothesis import settings
 from jaxtyping import config as jaxtyping_config
 
@@ -36,6 +38,7 @@ os.fsync = os.fstat  # type: ignore[assignment]
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Modules and collected tests live to the end, so that the collector need not look at them again and again."""
+    compose_once()
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 10, 10)
@@ -56,6 +59,13 @@ def no_jaxtyping() -> Iterator[None]:
     jaxtyping_config.update("jaxtyping_disable", True)
     yield
     jaxtyping_config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="session")
+def ranks() -> Iterator[RankServer]:
+    """Starts the processes of a training."""
+    with rank_server() as started:
+        yield started
 
 
 @pytest.fixture

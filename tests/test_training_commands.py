@@ -368,14 +368,12 @@ def test_sizes_that_nobody_means_are_refused_before_the_work(
 
 
 @pytest.mark.alone
-def test_a_signal_to_all_processes_of_a_training_leaves_a_checkpoint(
-    rooms: Path, trained: Path, tmp_path: Path
-) -> None:
+def test_a_signal_to_all_processes_of_a_training_leaves_a_checkpoint(rooms: Path, tmp_path: Path) -> None:
     """As SLURM and container runtimes end a job: the workers get it, too."""
     scenes = [str(rooms / f"room_{number}") for number in range(2)]
     quick = [word for word in QUICK if not word.startswith(("train.steps", "train.log_every"))]
     common = ["train", *scenes, f"teacher.words={rooms / 'words.safetensors'}", *quick, "train.workers=1"]
-    places = [f"prepared={trained.with_name('encoder.prepared')}", f"out={tmp_path / 'run'}"]
+    places = [f"prepared={tmp_path / 'prepared'}", f"out={tmp_path / 'run'}"]
     words = [*common, *places, "train.steps=5000", "train.log_every=1", "tensorboard=false"]
     running = subprocess.Popen(
         [sys.executable, "-m", "gsencoder", *words], stderr=subprocess.PIPE, text=True, start_new_session=True

@@ -19,7 +19,13 @@ PLANNED = 0.85
 
 
 class Budget:
-    """Promises: a frozen dataclass with fields `error`, `seconds` or `megabytes`, None where nothing is promised."""
+    """Promises: a frozen dataclass with fields `error`, `seconds` or `megabytes`, None where nothing is promised.
+
+    A field `seed`, where there is one, is of what the choice draws.
+
+    Raises:
+        InputError: a promise that means nothing, or a negative seed.
+    """
 
     __slots__ = ()
 
@@ -30,6 +36,8 @@ class Budget:
                 raise InputError(f"error: expected a number between 0 and 1, got {value}")
             if not 0 < value < inf:
                 raise InputError(f"{name}: expected a number above 0, got {value}")
+        if (seed := getattr(self, "seed", 0)) < 0:
+            raise InputError(f"seed: expected 0 or more, got {seed}")
 
     @property
     def promised(self) -> tuple[str, ...]:

@@ -115,8 +115,8 @@ def _largest(
             continue
     needed = bytes_of(len(_indexed(features, 0).features.features))
     raise InputError(
-        f"budget.megabytes={megabytes:g}: the smallest table of these features takes {needed / MEGABYTE + 5e-6:.5f}; "
-        "give more"
+        f"budget.megabytes={megabytes:g}: the smallest table of these features takes {needed / MEGABYTE + 5e-6:.5f} MB"
+        "; give more"
     )
 
 

@@ -188,7 +188,7 @@ def test_jobs_of_submitit_share_the_scenes_and_their_failures_come_back(tmp_path
     assert {path.name for path in out.iterdir()} == {"one", "three", "multirun.yaml", ".submitit"}
     before = (out / "one" / "summary.json").stat().st_mtime_ns
     broken.write_text(good)
-    again = subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)
-    assert (again.returncode, again.stderr) == (0, "")
+    # What the jobs finished, a run without them leaves as it is.
+    assert cli.main(["fuse", str(tmp_path / "scenes"), "teacher=palette", f"out={out}", "worker=0", "quiet=true"]) == 0
     assert (out / "two" / "features.safetensors").is_file()
     assert (out / "one" / "summary.json").stat().st_mtime_ns == before

@@ -15,6 +15,11 @@ class SmallBudget(Budget):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SampledBudget(SmallBudget):
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Inner:
     rank: int = 4
 
@@ -32,6 +37,12 @@ class Outer:
 def test_a_promise_that_means_nothing_is_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"^{name}: expected a number"):
         SmallBudget(**{name: value})
+
+
+def test_a_negative_seed_is_refused_with_a_promise_and_without() -> None:
+    for promised in ({}, {"error": 0.1}):
+        with pytest.raises(InputError, match="^seed: expected 0 or more, got -1$"):
+            SampledBudget(seed=-1, **promised)
 
 
 def test_the_order_of_promises_is_that_of_all_commands_and_not_that_of_the_fields() -> None:

@@ -1,13 +1,11 @@
 """Two processes of one training: one dies, hangs, or has other settings or weights. The other ends and says so."""
 
 import json
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
+from forked_ranks import RankServer
 
 RANKS = """
 import os, sys, time
@@ -68,30 +66,21 @@ os._exit(0)
 """
 
 
-def outcomes(folder: Path, *hows: str) -> dict[str, list[str]]:
-    """What each of two processes said of each fault; an empty text of one that said nothing within a minute."""
-    with_port = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(20_000 + os.getpid() % 20_000), "WORLD_SIZE": "2"}
-    environment = {
-        **os.environ, **with_port, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path),
-    }  # fmt: skip
-    command = [sys.executable, "-W", "ignore", "-c", RANKS, str(folder), *hows]
-    processes = [
-        subprocess.Popen(command, env={**environment, "RANK": str(rank), "LOCAL_RANK": str(rank)}, stderr=-3)
-        for rank in (0, 1)
-    ]
-    try:
-        processes[0].wait(240)
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
+def outcomes(ranks: RankServer, folder: Path, *hows: str) -> dict[str, list[str]]:
+    """What each of two processes said of each fault; an empty text of one that said nothing while the first ran."""
+    (folder / "run.py").write_text(RANKS)
+    processes = ranks.started(folder / "run.py", str(folder), *hows)
+    processes.ended(0, timeout=240)
+    processes.kill()
     files = {how: [folder / f"{how}.{rank}" for rank in (0, 1)] for how in hows}
     return {how: [each.read_text() if each.is_file() else "" for each in pair] for how, pair in files.items()}
 
 
 @pytest.mark.alone
-def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_waited_for(tmp_path: Path) -> None:
-    said = outcomes(tmp_path, "settings", "weights", "settings of training", "hangs")
+def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_waited_for(
+    tmp_path: Path, ranks: RankServer
+) -> None:
+    said = outcomes(ranks, tmp_path, "settings", "weights", "settings of training", "hangs")
     for how, what, advice in (
         ("settings", "the settings differ", "give all processes the same command"),
         ("weights", "the step and the weights that training begins with differ", "give all processes the same files"),
@@ -111,9 +100,9 @@ def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_wai
 
 
 @pytest.mark.alone
-def test_a_process_whose_other_dies_ends_at_once(tmp_path: Path) -> None:
+def test_a_process_whose_other_dies_ends_at_once(tmp_path: Path, ranks: RankServer) -> None:
     began = time.monotonic()
-    said = outcomes(tmp_path, "dies")["dies"]
+    said = outcomes(ranks, tmp_path, "dies")["dies"]
     assert said[0].startswith("training: process 0 of 2: another process has ended")
     assert said[1] == ""
     assert time.time() - (tmp_path / "lost").stat().st_mtime < 30

@@ -89,7 +89,7 @@ def test_megabytes_that_nothing_fits_into_are_refused_with_those_that_something_
 ) -> None:
     with pytest.raises(InputError, match="^budget.megabytes=0.005: one coordinate of each Gaussian takes ") as refused:
         within(gaussians, encoder, megabytes=0.005)
-    smallest = float(str(refused.value).split("takes ")[1].split(";")[0])
+    smallest = float(str(refused.value).split("takes ")[1].split(" MB;")[0])
     assert within(gaussians, encoder, megabytes=smallest).ranks == {"labels": 1}
 
 
@@ -147,7 +147,7 @@ def test_the_same_seed_makes_the_same_choice_and_the_same_features(gaussians: Ga
 def test_nothing_that_a_chunk_does_not_see_is_nearer_than_it_says(halo: float) -> None:
     scene = random_gaussians(2000)
     chunks = cut(scene.means, 500, halo)
-    seen = seen_around(scene, chunks)
+    seen = seen_around(scene.means, chunks)
     assert np.isfinite(seen).all()
     for chunk in chunks:
         unseen = np.setdiff1d(np.arange(len(scene)), chunk.rows)

@@ -1,12 +1,10 @@
 """Processes of one launcher: their devices, and what they do together."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from forked_ranks import RankServer
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.process_rank import ProcessRank, rank_from_environment
@@ -62,12 +60,10 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize("error", ["InputError('its own')", "MemoryError('its own')"])
 @pytest.mark.alone
-def test_if_one_of_two_processes_fails_in_a_block_both_do(tmp_path: Path, error: str) -> None:
+def test_if_one_of_two_processes_fails_in_a_block_both_do(tmp_path: Path, error: str, ranks: RankServer) -> None:
     path = tmp_path / "run.py"
     path.write_text(TOGETHER.format(error=error))
-    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    subprocess.run([*launcher, str(path)], timeout=120, env=environment, capture_output=True, check=True)
+    ranks.started(path).end_well()
     found = [Path(f"{path}.{rank}").read_text() for rank in (0, 1)]
     elsewhere = "InputError: another process stopped; its own message says why"
     assert found == [elsewhere, f"{error.partition('(')[0]}: its own"]
@@ -97,12 +93,10 @@ if __name__ == "__main__":
 
 
 @pytest.mark.alone
-def test_processes_with_different_weights_all_stop_and_name_both_digests(tmp_path: Path) -> None:
+def test_processes_with_different_weights_all_stop_and_name_both_digests(tmp_path: Path, ranks: RankServer) -> None:
     path = tmp_path / "run.py"
     path.write_text(AGREE)
-    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    subprocess.run([*launcher, str(path)], timeout=120, env=environment, capture_output=True, check=True)
+    ranks.started(path).end_well()
     message = (
         "InputError: training: the teacher's weights differ: their digest is 8a1f in process 0 and 77b0 in process 1; "
         "give all processes the same files"

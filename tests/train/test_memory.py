@@ -1,13 +1,12 @@
 """Training of memories: rendered features come near to the teacher's, runs are resumed, processes agree."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked_ranks import RankServer
 from memory_scenes import PREPARE, BlendedTeacher, prepared_wall
 from training_scenes import scene as wall
 
@@ -129,10 +128,8 @@ def test_a_run_that_was_cut_off_goes_on_with_the_same_bits(prepared: MemoryScene
 
 
 SCRIPT = """
-import sys
 from dataclasses import replace
 from pathlib import Path
-sys.path.insert(0, {tests!r})
 from gsencoder.train.distributed import join_processes
 from gsencoder.train.memory import memory_training, train_memory
 from gsencoder.train.memory_network import MemoryConfig
@@ -146,19 +143,17 @@ with join_processes("cpu") as (process, device):
 
 
 @pytest.mark.alone
-def test_two_processes_follow_the_losses_of_one(prepared: MemoryScene, tmp_path: Path) -> None:
+def test_two_processes_follow_the_losses_of_one(prepared: MemoryScene, tmp_path: Path, ranks: RankServer) -> None:
     curves = []
     for name, count, accumulate in (("one", 1, 2), ("two", 2, 1)):
         script = made(tmp_path / name) / "run.py"
         text = SCRIPT.format(
-            tests=str(Path(__file__).resolve().parent.parent),
             prepared=str(prepared.prepared.path.parent),
             work=str(tmp_path / name),
             accumulate=accumulate,
         )
         script.write_text(text)
-        command = [sys.executable, "-m", "torch.distributed.run", f"--nproc_per_node={count}", "--standalone"]
-        subprocess.run([*command, str(script)], check=True, capture_output=True, timeout=300)
+        ranks.started(script, count=count).end_well()
         curves.append([float(row["loss"]) for row in read_log(tmp_path / name / LOG_FILE)])
     assert len(curves[0]) == 6
     np.testing.assert_allclose(curves[1], curves[0], rtol=1e-4)

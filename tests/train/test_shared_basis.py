@@ -1,15 +1,13 @@
 """The space of a dataset is the same for any number of processes, and after a kill, bit for bit."""
 
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from forked_ranks import RankServer
 from training_scenes import DenseSideTeacher, SideTeacher, scene
 
 from gsencoder.core.errors import InputError
@@ -70,10 +68,7 @@ def fitted(folder: Path, open_scene: Callable[[Path], tuple[Scene, Any]], **opti
 
 
 SCRIPT = """
-import sys
 from pathlib import Path
-
-sys.path.insert(0, {tests!r})
 
 from test_shared_basis import NamedTeacher, NoiseTeacher, fitted, opener
 
@@ -89,19 +84,13 @@ if __name__ == "__main__":
 
 
 @pytest.mark.alone
-def test_two_processes_make_each_map_once_and_store_the_bits_of_one(tmp_path: Path) -> None:
-    script, tests = tmp_path / "run.py", str(Path(__file__).resolve().parent)
-    two = tmp_path / "two"
+def test_two_processes_make_each_map_once_and_store_the_bits_of_one(tmp_path: Path, ranks: RankServer) -> None:
+    script, two = tmp_path / "run.py", tmp_path / "two"
     for name in ("dense", "coded"):
         two.mkdir(exist_ok=True)
         PreparedDataset(two / name, {"made": "for a test"})
-    script.write_text(SCRIPT.format(tests=tests, folder=str(two)))
-    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([tests, str(Path(tests).parent), *sys.path])}
-    done = subprocess.run(
-        [*launcher, str(script)], check=False, timeout=300, env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    script.write_text(SCRIPT.format(folder=str(two)))
+    ranks.started(script).end_well()
     made: list[int] = []
     assert (
         fitted(tmp_path / "dense", opener(lambda number: NoiseTeacher(number, made)))

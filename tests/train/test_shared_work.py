@@ -1,14 +1,12 @@
 """What the processes of a training share: counts of classes, validation, and the cores of their machine."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from forked_ranks import RankServer
 from training_scenes import DenseSideTeacher, prepared, small_encoder
 
 from gsencoder.core.runtime.process_rank import ProcessRank, rank_from_environment
@@ -22,10 +20,7 @@ from gsencoder.train.training_scene import TrainingScene
 
 SCRIPT = """
 import json
-import sys
 from pathlib import Path
-
-sys.path.insert(0, {tests!r})
 
 from test_shared_work import counted, scores_of
 
@@ -57,20 +52,14 @@ def scores_of(dataset: PreparedDataset, names: list[str]) -> dict[str, object]:
 
 
 @pytest.mark.alone
-def test_two_processes_count_and_validate_each_scene_once_and_as_one_does(tmp_path: Path) -> None:
+def test_two_processes_count_and_validate_each_scene_once_and_as_one_does(tmp_path: Path, ranks: RankServer) -> None:
     dataset, names = prepared(tmp_path / "one", count=5, teacher=DenseSideTeacher())
     one = {"counts": counted(dataset, names), **scores_of(dataset, names)}
     copy = shutil.copytree(tmp_path / "one", tmp_path / "two")
     (copy / CLASS_BALANCE_FILE).unlink()
     script = tmp_path / "run.py"
-    tests = str(Path(__file__).resolve().parent)
-    script.write_text(SCRIPT.format(tests=tests, folder=str(copy), names=names))
-    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([tests, str(Path(tests).parent), *sys.path])}
-    done = subprocess.run(
-        [*launcher, str(script)], check=False, timeout=300, env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    script.write_text(SCRIPT.format(folder=str(copy), names=names))
+    ranks.started(script).end_well()
     first, second = (json.loads(Path(f"{copy}.{rank}").read_text()) for rank in (0, 1))
     assert first["counts"] == second["counts"] == one["counts"]
     assert first["scores"] == pytest.approx(one["scores"], rel=1e-9)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from archives import header_of
+from forked_ranks import RankServer
 from safetensors.numpy import load_file
 from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
@@ -431,11 +432,11 @@ def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int, befo
 
 @pytest.mark.alone
 def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_one(
-    dataset: Prepared, tmp_path: Path
+    dataset: Prepared, tmp_path: Path, ranks: RankServer
 ) -> None:
     alone = script(dataset, tmp_path / "one", steps=6, accumulate=2)
     pair = script(dataset, tmp_path / "two", steps=6, accumulate=1, before=EIGHT_GPUS)
-    subprocess.run([sys.executable, "-W", "ignore", str(alone)], check=True, timeout=300)
+    ranks.started(alone, count=1).end_well()
     launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
@@ -452,19 +453,18 @@ def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_on
         np.testing.assert_allclose(value, one[name], atol=2e-3)
 
 
-def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path) -> None:
+def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path, ranks: RankServer) -> None:
     whole = script(dataset, tmp_path / "whole", steps=40, accumulate=1)
     cut = script(dataset, tmp_path / "cut", steps=40, accumulate=1)
-    subprocess.run([sys.executable, "-W", "ignore", str(whole)], check=True, timeout=300)
-    running = subprocess.Popen([sys.executable, "-W", "ignore", str(cut)])
+    ranks.started(whole, count=1).end_well()
+    running = ranks.started(cut, count=1)
     log, deadline = tmp_path / "cut" / LOG_FILE, time.monotonic() + 120
     while time.monotonic() < deadline and not (log.is_file() and len(log.read_text().splitlines()) > 5):
         time.sleep(0.02)
-    running.send_signal(signal.SIGKILL)
-    running.wait()
+    running.kill()
     assert len(losses(tmp_path / "cut")) < 40
     assert 0 < steps_in(tmp_path / "cut") < 40
-    subprocess.run([sys.executable, "-W", "ignore", str(cut)], check=True, timeout=300)
+    ranks.started(cut, count=1).end_well()
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
     assert_same_weights(tmp_path / "cut", tmp_path / "whole")
 

@@ -2,7 +2,6 @@
 writes is peft's."""
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from forked_ranks import RankServer
 from safetensors.numpy import load_file
 from tiny_vlm import PATCH, SIDE
 from tuning_pairs import SHORT, make_model, make_pairs
@@ -138,10 +138,10 @@ def test_a_run_with_other_adapters_answers_or_model_is_not_continued(model: Path
 
 
 SCRIPT = """
-import sys
 from dataclasses import replace
 from pathlib import Path
-sys.path.insert(0, {tests!r})
+import peft
+import transformers
 from tuning_pairs import SHORT, make_pairs
 from gsencoder.train.distributed import join_processes
 from gsencoder.train.tuning.run import tune
@@ -154,21 +154,18 @@ with join_processes("cpu") as (process, device):
 
 
 @pytest.mark.alone
-def test_two_processes_follow_the_losses_of_one(model: Path, pairs: Pairs, tmp_path: Path) -> None:
+def test_two_processes_follow_the_losses_of_one(model: Path, pairs: Pairs, tmp_path: Path, ranks: RankServer) -> None:
     for name, count, accumulate in (("one", 1, 4), ("two", 2, 2)):
         script = made(tmp_path / name) / "run.py"
         script.write_text(
             SCRIPT.format(
-                tests=str(Path(__file__).resolve().parent.parent),
                 prompts=str(pairs[1].folder),
                 model=str(model),
                 work=str(tmp_path / name),
                 accumulate=accumulate,
             )
         )
-        command = [sys.executable, "-m", "torch.distributed.run", f"--nproc_per_node={count}", "--standalone"]
-        done = subprocess.run([*command, str(script)], check=False, capture_output=True, timeout=300, text=True)
-        assert done.returncode == 0, done.stderr[-3000:]
+        ranks.started(script, count=count).end_well()
     for column, tolerance in (("loss", 1e-4), ("gradient", 1e-3)):
         one, two = ([float(row[column]) for row in rows(tmp_path / name)] for name in ("one", "two"))
         assert len(one) == 5

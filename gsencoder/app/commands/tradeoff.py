@@ -1,5 +1,6 @@
 """`gsencoder tradeoff SCENE…`: cost and accuracy of the knobs of each stage, as a table and plots."""
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -61,6 +62,11 @@ class LimitConfig:
     error: float | None = field(
         default=None, metadata={"help": "largest error against the reference, 1 − centered cosine"}
     )
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "error"):
+            if (limit := getattr(self, name)) is not None and not 0 < limit < math.inf:
+                raise InputError(f"{name}: expected a number above 0, got {limit}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -82,20 +82,21 @@ class Records:
         identity: what runs must share to be one sweep, as JSON values.
 
         Raises:
-            InputError: the folder holds records of another sweep, or damaged ones.
+            InputError: the folder holds records of another sweep, or damaged ones. One in which nothing was measured is
+                of no sweep.
         """
         self._by_key: dict[tuple[str, str, str], Record] = {}
         self._path = None if folder is None else folder / RECORDS_FILE
         if folder is None:
             return
-        expected = json.dumps(plain(dict(identity)), sort_keys=True)
+        self._identity = json.dumps(plain(dict(identity)), sort_keys=True)
         written = folder / IDENTITY_FILE
-        if written.is_file() and written.read_text(encoding="utf-8") != expected:
+        measured = (folder / RECORDS_FILE).is_file()
+        if measured and written.is_file() and written.read_text(encoding="utf-8") != self._identity:
             raise InputError(
                 f"{folder}: holds measurements of a sweep with other settings; give resume=false to begin anew, or "
                 "another out="
             )
-        write_bytes(written, expected.encode())
         self._read()
 
     def _read(self) -> None:
@@ -160,6 +161,8 @@ class Records:
     def _append(self, line: Mapping[str, Any]) -> None:
         if self._path is None:
             return
+        if not self._path.is_file():
+            write_bytes(self._path.with_name(IDENTITY_FILE), self._identity.encode())
         try:
             # The file is closed after every line, so that a kill loses none.
             with self._path.open("ab") as stream:

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.knobs import describe_values
@@ -48,6 +49,8 @@ class SettingResult:
         mib: growth of peak memory, median over rounds, largest over scenes.
         bytes: mean over scenes.
         scores: by name.
+        differences: of the scores from those of the base on the same scenes, by name; empty for the base. Their errors
+            are smaller than those of the scores, since what is hard about a scene is hard for both.
         on_front: whether no other setting of the stage that was measured on as many scenes beats it in cost and
             accuracy.
     """
@@ -64,6 +67,7 @@ class SettingResult:
     mib: float
     bytes: float
     scores: Mapping[str, Estimate]
+    differences: Mapping[str, Estimate] = field(default_factory=dict)
     on_front: bool = False
 
     @property
@@ -99,23 +103,42 @@ class SettingResult:
         }
         for name, estimate in self.scores.items():
             row |= {name: estimate.value, f"{name}_error": estimate.error, f"{name}_things": estimate.things}
+        for name, estimate in self.differences.items():
+            row |= {f"{name}_difference": estimate.value, f"{name}_difference_error": estimate.error}
         return row
 
 
 def estimate(scores: Sequence[Score]) -> Estimate:
     """The ratio of sums over scenes, with the standard error that scenes drawn at random give it (Cochran 1977,
     sec. 2.11): objects of one scene have its light and its clutter in common, so scenes are what is drawn."""
-    totals = np.array([each.total for each in scores])
-    counts = np.array([each.things for each in scores])
-    if not counts.sum():
-        return Estimate(math.nan, math.nan, 0.0)
-    value = totals.sum() / counts.sum()
-    n = len(scores)
-    if n < 2:
-        return Estimate(float(value), math.nan, float(counts.sum()))
-    residuals = totals - value * counts
-    error = math.sqrt(n / (n - 1) * float((residuals**2).sum())) / counts.sum()
-    return Estimate(float(value), float(error), float(counts.sum()))
+    value, residuals, things = _ratio_of_sums(scores)
+    return Estimate(value, _standard_error(residuals), things)
+
+
+def estimate_difference(scores: Sequence[Score], base: Sequence[Score]) -> Estimate:
+    """The ratio of sums over scenes less that of the base, with its standard error where scenes are drawn at random.
+
+    Args:
+        scores: of the scenes.
+        base: of the same scenes.
+    """
+    (value, residuals, things), (other, of_base, _) = _ratio_of_sums(scores), _ratio_of_sums(base)
+    return Estimate(value - other, _standard_error(residuals - of_base), things)
+
+
+def _ratio_of_sums(scores: Sequence[Score]) -> tuple[float, Float64[np.ndarray, " scenes"], float]:
+    """The ratio, what each scene adds to its deviation, and the number of things; NaN without things."""
+    totals = np.array([each.total for each in scores], np.float64)
+    counts = np.array([each.things for each in scores], np.float64)
+    if not (things := float(counts.sum())):
+        return math.nan, np.full(len(scores), math.nan), 0.0
+    value = float(totals.sum()) / things
+    return value, (totals - value * counts) / things, things
+
+
+def _standard_error(residuals: Float64[np.ndarray, " scenes"]) -> float:
+    n = len(residuals)
+    return math.sqrt(n / (n - 1) * float((residuals**2).sum())) if n > 1 else math.nan
 
 
 def summarize(records: Sequence[Record], base: Sequence[Record], phase: Phase) -> SettingResult:
@@ -131,6 +154,7 @@ def summarize(records: Sequence[Record], base: Sequence[Record], phase: Phase) -
             rounds = min(len(cpu), len(reference))
             logs.append(float(np.median(np.log(np.maximum(cpu[:rounds], 1e-9) / np.maximum(reference[:rounds], 1e-9)))))
     names = list(dict.fromkeys(name for record in records for name in record.scores))
+    differences = {name: _difference(name, records, by_scene) for name in names} if records[0].knobs else {}
     n = len(logs)
     return SettingResult(
         stage=records[0].stage,
@@ -145,7 +169,18 @@ def summarize(records: Sequence[Record], base: Sequence[Record], phase: Phase) -
         mib=max(float(np.median(_column(record, "mib"))) for record in records),
         bytes=float(np.mean([record.bytes for record in records])),
         scores={name: estimate([record.scores[name] for record in records if name in record.scores]) for name in names},
+        differences=differences,
     )
+
+
+def _difference(name: str, records: Sequence[Record], base: Mapping[str, Record]) -> Estimate:
+    """A score less that of the base, over the scenes that both have it of."""
+    both = [
+        (record.scores[name], other.scores[name])
+        for record in records
+        if (other := base.get(record.scene)) is not None and name in record.scores and name in other.scores
+    ]
+    return estimate_difference([score for score, _ in both], [score for _, score in both])
 
 
 def _column(record: Record, name: str) -> np.ndarray:

@@ -108,28 +108,35 @@ def values_of(stage: Stage, sweep: SweepConfig) -> dict[str, tuple[Any, ...]]:
 
 def _given(text: str) -> tuple[str, list[str]]:
     name, colon, listed = text.partition(":")
-    if not colon:
-        raise InputError(f"values: expected KNOB:VALUE/VALUE, got {text!r}")
-    return name, [value for value in listed.split("/") if value]
+    values = [value for value in listed.split("/") if value]
+    if not colon or not values:
+        raise InputError(f"sweep.values: expected KNOB:VALUE/VALUE, got {text!r}")
+    return name, values
 
 
 def check_sweep(stages: Sequence[Stage], sweep: SweepConfig) -> None:
     """Complains about a sweep before hours of work.
 
     Raises:
-        InputError: an unknown knob, one that is given twice, or a value that its stage refuses.
+        InputError: an unknown knob, one that is given twice or left out by `knobs`, no value, or one that its stage
+            refuses.
     """
     knob_names = [knob.name for stage in stages for knob in stage.knobs]
     names = [_given(text)[0] for text in sweep.values]
     if (repeated := first_repeated(names)) is not None:
-        raise InputError(f"values: {repeated[0]} is given twice; give all of its values at once")
+        raise InputError(f"sweep.values: {repeated[0]} is given twice; give all of its values at once")
     for option, listed in (("knobs", sweep.knobs), ("values", names)):
         for name in listed:
             if name not in knob_names:
                 raise InputError(
-                    f"{option}: {name!r} is no knob of {', '.join(stage.name for stage in stages)}; expected some of "
-                    f"{', '.join(knob_names)}"
+                    f"sweep.{option}: {name!r} is no knob of {', '.join(stage.name for stage in stages)}; expected "
+                    f"some of {', '.join(knob_names)}"
                 )
+    if sweep.knobs and (left_out := [name for name in names if name not in sweep.knobs]):
+        raise InputError(
+            f"sweep.values: {left_out[0]} is not among sweep.knobs={','.join(sweep.knobs)}; add it there, or leave its "
+            "values out"
+        )
     for stage in stages:
         for knobs in settings_of(stage, sweep):
             with_knobs(stage.base, stage.knobs, knobs)

@@ -186,7 +186,7 @@ def compact_within(
                 if not allocation.bits.any():
                     raise InputError(
                         f"budget.megabytes={shown_value(largest / MEGABYTE)}: the smallest package of these features "
-                        f"takes {math.ceil(size / 10) / 1e5:.6g}; give more, or another form"
+                        f"takes {math.ceil(size / 10) / 1e5:.6g} MB; give more, or another form"
                     )
                 break
             allocation = more

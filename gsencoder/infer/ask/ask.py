@@ -15,6 +15,7 @@ from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
 from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
 from gsencoder.infer.views.targets import Target, best_boxes, target_of, targets_of
@@ -138,6 +139,7 @@ class Asker:
         self.table = closed_table(words) if words is not None else None
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
         self.word_rules = word_rules
+        self._free: FreeSpace | None = None
         self._lookups: dict[Hashable, Lookup] = {}
         self._picture_cache: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
 
@@ -213,7 +215,9 @@ class Asker:
         config = self.views
         if not targets:
             config = replace(config, method="uniform", source="both")
-        views = choose_views(self.scene, targets, config)
+        if self._free is None and self.scene.gaussians is not None:
+            self._free = FreeSpace(self.scene.gaussians)
+        views = choose_views(self.scene, targets, config, free=self._free)
         # Marks are drawn on pictures of the size that is sent, or their numbers would shrink.
         small = views.cameras.resized(self.vlm.image_side, enlarge=False)
         return Lookup(targets=targets, boxes=boxes, absent=absent, views=replace(views, cameras=small))

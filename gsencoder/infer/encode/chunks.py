@@ -132,7 +132,7 @@ def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chun
     all_rows = np.arange(len(means))
     if chunk == 0 or len(means) <= chunk:
         return [Chunk(core_rows=all_rows, rows=all_rows, low=np.full(3, -np.inf), high=np.full(3, np.inf), halo=halo)]
-    columns = np.ascontiguousarray(means.T)
+    columns, in_core = np.ascontiguousarray(means.T), np.zeros(len(means), bool)
     chunks: list[Chunk] = []
     pending = [(all_rows, all_rows, np.full(3, -np.inf), np.full(3, np.inf))]
     while pending:
@@ -140,19 +140,19 @@ def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chun
         # The surroundings of a box lie within those of the box that it was cut from.
         surroundings = _rows_near(columns, surroundings, low - halo, high + halo)
         if len(surroundings) <= chunk or len(core_rows) <= max(1, chunk // 4):
-            halo_rows, width = np.setdiff1d(surroundings, core_rows, assume_unique=True), halo
+            in_core[core_rows] = True
+            halo_rows, width = surroundings[~in_core[surroundings]], halo
+            in_core[core_rows] = False
             if len(surroundings) > chunk:
                 inside = means[halo_rows].clip(low, high)
-                far = np.square(means[halo_rows] - inside).sum(axis=1)
-                nearest = np.argsort(far, kind="stable")
-                width = math.sqrt(far[nearest[chunk - len(core_rows)]])
-                halo_rows = halo_rows[np.sort(nearest[: chunk - len(core_rows)])]
+                nearest, far = _smallest(np.square(means[halo_rows] - inside).sum(axis=1), chunk - len(core_rows))
+                halo_rows, width = halo_rows[nearest], math.sqrt(far)
             rows = np.concatenate((core_rows, halo_rows))
             chunks.append(Chunk(core_rows=core_rows, rows=rows, low=low, high=high, halo=width))
             continue
         points = [column[core_rows] for column in columns]
         axis = int(np.argmax([values.max() - values.min() for values in points]))
-        lower_half, middle = _lower_half(points[axis])
+        lower_half, middle = _smallest(points[axis], len(core_rows) // 2)
         upper, lower = high.copy(), low.copy()
         upper[axis] = lower[axis] = middle
         pending += [
@@ -173,11 +173,14 @@ def _rows_near(
     return rows
 
 
-def _lower_half(values: Float32[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], float]:
-    """Which values a stable sort would put into the lower half, and the first value of the upper one."""
-    half = len(values) // 2
-    middle = np.partition(values, half)[half]
-    lower = values < middle
-    # Of equal values the first ones are in the lower half.
-    lower[np.flatnonzero(values == middle)[: half - np.count_nonzero(lower)]] = True
-    return lower, float(middle)
+def _smallest(values: Float[np.ndarray, " n"], count: int) -> tuple[Bool[np.ndarray, " n"], float]:
+    """Which values a stable sort would put first, and the one that comes after them.
+
+    Args:
+        values: more than `count` of them.
+        count: how many are wanted.
+    """
+    following = np.partition(values, count)[count]
+    smallest = values < following
+    smallest[np.flatnonzero(values == following)[: count - np.count_nonzero(smallest)]] = True
+    return smallest, float(following)

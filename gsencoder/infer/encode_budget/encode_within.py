@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.even_indices import even_indices
 from gsencoder.core.knobs import shown_value
 from gsencoder.core.promises import MEGABYTE
 from gsencoder.core.runtime.tracking import Track, untracked
@@ -18,7 +19,7 @@ from gsencoder.fusion.store.folder import features_bytes
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
 from gsencoder.infer.encode_budget.config import EncodeBudget, exact_encoding
 from gsencoder.infer.encode_budget.principal_axes import PrincipalAxes, principal_axes
-from gsencoder.infer.encode_budget.sample import Measured, measure_parts, seen_around
+from gsencoder.infer.encode_budget.sample import ROUNDING_ROWS, measure_parts, measure_rounding, seen_around
 from gsencoder.infer.load_encoder import Encoder
 from gsencoder.types import GaussianFeatures, Gaussians
 
@@ -30,6 +31,8 @@ COSTS = {"auto": 1.0, "float32": 1.0, "bfloat16": 0.55}
 """Of precisions. Stated and not measured, so that one scene makes one choice, on a busy machine too."""
 SMALL_SCENE = 20_000
 """Scenes of fewer Gaussians that are not cut are encoded exactly: choosing would cost more than it saves."""
+CUT_ROWS = 100_000
+"""Chunks of larger scenes are counted on so many of their Gaussians, in chunks that are as much smaller."""
 SAFETY, DEVIATIONS = 5.0, 2.0
 """The bound of an error is `SAFETY` times the predicted one plus `DEVIATIONS` of its standard errors: the error that
 parts of a scene predict was a third to five times that of the whole scene."""
@@ -158,32 +161,32 @@ def all_settings(
     precisions, timed = encoder.precisions(exact.device), budget.seconds is not None
     if len(gaussians) < SMALL_SCENE and not is_cut and not timed:
         precisions = precisions[:1]
-    parts: list[Measured] = []
-    if is_cut or len(precisions) > 1 or timed:
-        parts = measure_parts(
-            gaussians,
-            encoder,
-            exact,
-            precisions,
-            is_cut=is_cut,
-            metres_per_unit=metres_per_unit,
-            seed=budget.seed,
-            timed=timed,
-            clock=clock,
-        )
-    settings = []
+    unit, seed = metres_per_unit, budget.seed
+    rounding = measure_rounding(gaussians, encoder, exact, precisions, metres_per_unit=unit, seed=seed)
+    parts = measure_parts(
+        gaussians,
+        encoder,
+        exact,
+        precisions,
+        is_cut=is_cut,
+        metres_per_unit=unit,
+        seed=seed,
+        clock=clock if timed else None,
+    )
+    means, settings = gaussians.means[even_indices(len(gaussians), CUT_ROWS)], []
+    scale = len(gaussians) / len(means)
     for halo in reversed(HALOS) if is_cut else (exact.halo,):
-        chunks = cut(gaussians.means, exact.chunk, halo / metres_per_unit)
-        seen = seen_around(gaussians, chunks) * metres_per_unit
+        chunks = cut(means, math.ceil(exact.chunk / scale), halo / metres_per_unit)
+        sizes = scale * np.array([len(chunk.rows) for chunk in chunks], np.float64)
+        cutting = np.zeros(1)
         # Where the exact setting cuts the scene is right by definition.
-        seen = np.full_like(seen, np.inf) if halo == exact.halo else seen
-        sizes = np.array([len(chunk.rows) for chunk in chunks], np.float64)
+        if halo != exact.halo:
+            seen = seen_around(means, chunks) * metres_per_unit
+            cutting = np.array([part.cutting_error(seen) for part in parts])
         for precision in precisions:
-            errors = np.array([part.error(precision, seen) for part in parts] or [0.0])
-            if halo == exact.halo and precision == precisions[0]:
-                errors = np.zeros(1)
-            error, deviation = float(errors.mean()), float(errors.std() / max(len(errors) - 1, 1) ** 0.5)
-            paces = [part.seconds[precision] * ((sizes / part.rows) ** EXPONENT).sum() for part in parts]
+            error = min(rounding[precision] + float(cutting.mean()), 1.0)
+            deviation = float(cutting.std() / max(len(cutting) - 1, 1) ** 0.5)
+            paces = [part.seconds[precision] * ((sizes / part.rows) ** EXPONENT).sum() for part in parts if timed]
             config = replace(exact, halo=halo, precision=precision)
             settings.append(
                 Setting(
@@ -192,10 +195,12 @@ def all_settings(
                     error=error,
                     bound=min(SAFETY * error + DEVIATIONS * deviation, 1.0),
                     cost=float((sizes**EXPONENT).sum()) * COSTS[precision],
+                    # The first pass of a process loads kernels, which no later one pays for.
                     seconds=float(min(paces, default=0.0)),
                 )
             )
-    return settings, sum(part.rows for part in parts)
+    sampled = sum(part.rows for part in parts) + (ROUNDING_ROWS if len(precisions) > 1 else 0)
+    return settings, min(sampled, len(gaussians))
 
 
 def _check_size(encoder: Encoder, teachers: Sequence[str], count: int, header: Mapping[str, Any], size: float) -> None:
@@ -204,7 +209,7 @@ def _check_size(encoder: Encoder, teachers: Sequence[str], count: int, header: M
     if least > size * MEGABYTE:
         raise InputError(
             f"budget.megabytes={shown_value(size)}: one coordinate of each Gaussian takes "
-            f"{math.ceil(least / 10) / 1e5:.6g}; give more"
+            f"{math.ceil(least / 10) / 1e5:.6g} MB; give more"
         )
 
 

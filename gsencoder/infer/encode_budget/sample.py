@@ -5,12 +5,11 @@ that is. A part of the scene that is encoded whole and in two halves tells by ho
 and the boxes of the chunks how many Gaussians of the scene are how far from theirs.
 """
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int64
 
 from gsencoder.core.runtime.device_names import Precision
 from gsencoder.fusion.feature_error import row_cosines
@@ -19,38 +18,66 @@ from gsencoder.infer.load_encoder import Encoder
 from gsencoder.types import GaussianFeatures, Gaussians
 
 PARTS = 2
-LEAST_ROWS, MOST_ROWS, SHARE = 256, 4096, 16
+LEAST_ROWS, MOST_ROWS, SHARE = 256, 4096, 64
 """A part holds one of so many Gaussians of the scene, within these bounds. Larger parts did not predict better."""
-WARM_ROWS = 256
+ROUNDING_ROWS = 512
+"""Gaussians on which precisions are compared: parts of a scene differ in it by less than a tenth."""
 BINS = 8
-"""Distances that are told apart."""
+"""Number of distances at which the error of cutting is stated."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measured:
-    """One part of the scene.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A part of the scene that was encoded whole, and in halves where the scene is cut.
 
     Attributes:
         rows: its number of Gaussians.
-        seconds: of encoding it whole, by precision.
-        rounding: error of each precision.
-        distances: from which on an error of `cutting` is made, ascending, metres.
+        seconds: of encoding it whole, by precision; empty if they do not matter.
+        distances: from which on an error of `cutting` is made, ascending, metres; empty where the scene is not cut.
         cutting: error where the scene is cut so far away; never rises.
     """
 
     rows: int
     seconds: Mapping[Precision, float]
-    rounding: Mapping[Precision, float]
     distances: Float64[np.ndarray, " b"]
     cutting: Float64[np.ndarray, " b"]
 
-    def error(self, precision: Precision, seen: Float[np.ndarray, " n"]) -> float:
-        """Mean error over Gaussians around which the network sees so far, in metres."""
-        error = self.rounding[precision]
-        if len(self.cutting):
-            number = np.maximum(np.searchsorted(self.distances, seen, side="right") - 1, 0)
-            error += float(np.where(np.isfinite(seen), self.cutting[number], 0).mean())
-        return min(error, 1.0)
+    def cutting_error(self, seen: Float[np.ndarray, " n"]) -> float:
+        """Mean error over Gaussians around which the network sees so far, in metres; infinite = to the end."""
+        if not len(self.cutting):
+            return 0.0
+        number = np.maximum(np.searchsorted(self.distances, seen, side="right") - 1, 0)
+        return float(np.where(np.isfinite(seen), self.cutting[number], 0).mean())
+
+
+def measure_rounding(
+    gaussians: Gaussians,
+    encoder: Encoder,
+    config: EncodeConfig,
+    precisions: Sequence[Precision],
+    *,
+    metres_per_unit: float,
+    seed: int,
+) -> dict[Precision, float]:
+    """The error of each precision, on a small part of the scene.
+
+    Args:
+        gaussians: the splat.
+        encoder: whose teachers count as the worst of them.
+        config: whose device is used.
+        precisions: the exact one first, whose error is 0 by definition.
+        metres_per_unit: see `Encoder.encode`.
+        seed: of the part.
+    """
+    if len(precisions) < 2:
+        return dict.fromkeys(precisions, 0.0)
+    part = gaussians.select(_box_around(gaussians, _centers(gaussians, seed)[0], ROUNDING_ROWS))
+    exact, *others = (
+        encoder.encode_spaces(part, replace(config, chunk=0, precision=precision), metres_per_unit=metres_per_unit)
+        for precision in precisions
+    )
+    errors = (0.0, *(float(_errors(each, exact).mean()) for each in others))
+    return dict(zip(precisions, errors, strict=True))
 
 
 def measure_parts(
@@ -62,55 +89,56 @@ def measure_parts(
     is_cut: bool,
     metres_per_unit: float,
     seed: int,
-    timed: bool = True,
-    clock: Callable[[], float] = time.perf_counter,
-) -> list[Measured]:
-    """Encodes parts of a scene in each precision, and in halves where the scene is cut into chunks.
+    clock: Callable[[], float] | None,
+) -> list[Part]:
+    """Encodes parts of a scene whole, and in halves where the scene is cut into chunks.
 
     Args:
         gaussians: the splat.
         encoder: whose teachers count as the worst of them.
-        config: whose device is used.
-        precisions: the exact one first.
+        config: whose device and precision are used.
+        precisions: whose seconds are measured; the cheapest one last.
         is_cut: whether the scene has several chunks.
         metres_per_unit: see `Encoder.encode`.
         seed: of the parts.
-        timed: whether seconds matter.
-        clock: seconds.
+        clock: seconds; None if they do not matter.
     """
-    rng = np.random.default_rng(seed)
-    for precision in precisions if timed else ():
-        # The first pass of a process loads kernels, which no later one pays for.
-        first = gaussians.select(np.arange(min(WARM_ROWS, len(gaussians))))
-        encoder.encode_spaces(first, replace(config, chunk=0, precision=precision), metres_per_unit=metres_per_unit)
+    if not is_cut and clock is None:
+        return []
     count = max(min(len(gaussians) // SHARE, MOST_ROWS), LEAST_ROWS)
-    parts = []
-    for center in rng.choice(len(gaussians), min(PARTS, len(gaussians)), replace=False):
-        part = gaussians.select(_box_around(gaussians, int(center), count))
-        whole = replace(config, chunk=0)
-        seconds, features = {}, {}
-        for precision in precisions:
+    # What a cut changes is the same in each precision, and the last one is the cheapest.
+    whole, parts = replace(config, chunk=0, precision=precisions[-1]), []
+    for center in _centers(gaussians, seed):
+        part = gaussians.select(_box_around(gaussians, center, count))
+        seconds: dict[Precision, float] = {}
+        for precision in precisions if clock is not None else ():
+            assert clock is not None
             begun = clock()
-            one = replace(whole, precision=precision)
-            features[precision] = encoder.encode_spaces(part, one, metres_per_unit=metres_per_unit)
+            encoder.encode_spaces(part, replace(whole, precision=precision), metres_per_unit=metres_per_unit)
             seconds[precision] = clock() - begun
-        exact = features[precisions[0]]
-        rounding = {name: float(_errors(each, exact).mean()) for name, each in features.items()}
         distances, cutting = np.zeros(0), np.zeros(0)
         if is_cut:
-            halves = replace(whole, chunk=max(len(part) * 2 // 3, 1), halo=0.0, precision=precisions[0])
+            exact = encoder.encode_spaces(part, whole, metres_per_unit=metres_per_unit)
+            halves = replace(whole, chunk=max(len(part) * 2 // 3, 1), halo=0.0)
             halved = encoder.encode_spaces(part, halves, metres_per_unit=metres_per_unit)
-            seen = seen_around(part, cut(part.means, halves.chunk, 0.0)) * metres_per_unit
+            seen = seen_around(part.means, cut(part.means, halves.chunk, 0.0)) * metres_per_unit
             distances, cutting = _never_rising(seen, _errors(halved, exact))
-        parts.append(Measured(rows=len(part), seconds=seconds, rounding=rounding, distances=distances, cutting=cutting))
+        parts.append(Part(rows=len(part), seconds=seconds, distances=distances, cutting=cutting))
     return parts
 
 
-def seen_around(gaussians: Gaussians, chunks: Sequence[Chunk]) -> Float64[np.ndarray, " N"]:
-    """How far the network sees around each Gaussian, world units; infinite where nothing is cut."""
-    seen = np.empty(len(gaussians))
+def _centers(gaussians: Gaussians, seed: int) -> list[int]:
+    """Gaussians around which parts lie."""
+    chosen = np.random.default_rng(seed).choice(len(gaussians), min(PARTS, len(gaussians)), replace=False)
+    return [int(center) for center in chosen]
+
+
+def seen_around(means: Float32[np.ndarray, "N 3"], chunks: Sequence[Chunk]) -> Float64[np.ndarray, " N"]:
+    """How far the network sees around each Gaussian of a scene in chunks, world units; infinite where nothing is
+    cut."""
+    seen = np.empty(len(means))
     for chunk in chunks:
-        seen[chunk.core_rows] = chunk.seen_around(gaussians.means)
+        seen[chunk.core_rows] = chunk.seen_around(means)
     return seen
 
 

@@ -29,7 +29,9 @@ from gsencoder.render import BlendConfig
 from gsencoder.types import Cameras, Gaussians, Scene
 
 
-def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = ViewsConfig()) -> ViewSet:
+def choose_views(
+    scene: Scene, targets: Sequence[Target], config: ViewsConfig = ViewsConfig(), *, free: FreeSpace | None = None
+) -> ViewSet:
     """The views that show targets best.
 
     Args:
@@ -37,6 +39,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
             close-ups cut from them are candidates too.
         targets: what is looked at; all count alike. Evenly spread frames need none.
         config: settings.
+        free: the free space of the scene's Gaussians, for callers that choose more than once; None = it is made.
 
     Warns:
         SceneWarning: fewer views than were asked for, a target that no view shows, no room around one.
@@ -45,7 +48,7 @@ def choose_views(scene: Scene, targets: Sequence[Target], config: ViewsConfig = 
         InputError: no Gaussians; no targets; frames are asked for where there are none; no camera finds room.
     """
     gaussians = checked_gaussians(scene, targets, config)
-    free = FreeSpace(gaussians)
+    free = free or FreeSpace(gaussians)
     return chosen_views(scene, targets, judge_candidates(scene, gaussians, targets, free, config), free, config)
 
 

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("openai")
 
 ROOMS = ("room_000", "room_001")
-QUICK = ("choose.candidates=8", "choose.count=2", "choose.judged_side=60", "choose.width=160", "choose.height=120")
+QUICK = ("choose.candidates=4", "choose.count=2", "choose.judged_side=60", "choose.width=160", "choose.height=120")
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """`gsencoder reconstruct VIDEO`: frames, poses and a splat, which together are a scene."""
 
+from contextlib import redirect_stderr
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +37,19 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def built(video: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("built") / "walk"
-    assert cli.main(["reconstruct", str(video), f"out={out}", *QUICK]) == 0
-    return out
+def folder_run(video: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str]:
+    """A folder with a video and a damaged one: out=, the exit code, and what was said."""
+    folder, said = tmp_path_factory.mktemp("folder"), StringIO()
+    (folder / "walk.mp4").symlink_to(video)
+    (folder / "broken.mov").write_bytes(b"no video")
+    with redirect_stderr(said):
+        code = cli.main(["reconstruct", str(folder), f"out={folder / 'out'}", *QUICK])
+    return folder / "out", code, said.getvalue()
+
+
+@pytest.fixture(scope="module")
+def built(folder_run: tuple[Path, int, str]) -> Path:
+    return folder_run[0] / "walk"
 
 
 def test_the_results_of_a_video_are_a_scene_by_themselves(built: Path) -> None:
@@ -93,18 +104,17 @@ def test_a_run_that_was_cut_off_takes_up_its_frames_and_poses(
     after = {path.name: path.stat().st_mtime_ns for path in (out / "images").iterdir()}
     # shutil.copytree keeps the times.
     assert all(after[name] == stamp for name, stamp in before.items() if name.endswith(".jpg"))
+    assert summary_of(out)["results"]["placed"] >= 14
+    assert not out.with_name("walk.reconstruction").exists()
 
 
 def test_videos_of_a_folder_are_scenes_of_their_own_and_one_that_is_damaged_stops_no_other(
-    video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    folder_run: tuple[Path, int, str],
 ) -> None:
-    (tmp_path / "walk.mp4").symlink_to(video)
-    (tmp_path / "broken.mov").write_bytes(b"no video")
-    out = tmp_path / "out"
-    assert cli.main(["reconstruct", str(tmp_path), f"out={out}", *QUICK]) == 2
+    out, code, said = folder_run
+    assert code == 2
     assert (out / "walk" / "splat.ply").is_file()
     assert not (out / "broken").exists()
-    said = capfd.readouterr().err
     assert "1 of 2 scenes failed" in said
     assert "broken.mov: not a video that can be decoded" in said
 

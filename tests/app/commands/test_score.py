@@ -2,14 +2,13 @@
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from command_runs import refusal, results_of
+from forked_ranks import RankServer
 from named_rooms import write_words
 
 from gsencoder.app import cli
@@ -20,6 +19,13 @@ from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
 
 pytestmark = pytest.mark.slow
 
+COMMAND = """
+import sys
+import gsencoder.app.commands.evaluate
+from gsencoder.app import cli
+
+sys.exit(cli.main())
+"""
 PROTOCOLS = {
     "recognition": (),
     "instances": ("protocol.min_region=20",),
@@ -108,13 +114,14 @@ def test_features_that_were_fused_from_the_labels_name_nearly_all_that_is_there(
 
 @pytest.mark.parametrize("protocol", ["instances", "referring"])
 def test_processes_that_share_the_scenes_score_each_of_them_once(
-    protocol: str, rooms: Path, evaluated: dict[str, Path], tmp_path: Path
+    protocol: str, rooms: Path, evaluated: dict[str, Path], tmp_path: Path, ranks: RankServer
 ) -> None:
-    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=3"]
     scenes = [str(rooms / f"room_{number}") for number in range(2)]
     options = [f"protocol={protocol}", f"teacher.words={rooms / 'words.safetensors'}", *PROTOCOLS[protocol]]
-    command = [*launcher, "-m", "gsencoder", "evaluate", *scenes, *options, f"out={tmp_path / 'out'}", "quiet=true"]
-    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    words = ["evaluate", *scenes, *options, f"out={tmp_path / 'out'}", "quiet=true"]
+    script = tmp_path / "run.py"
+    script.write_text(COMMAND)
+    ranks.started(script, *words, count=3).end_well()
     assert results_of(tmp_path / "out") == results_of(evaluated[protocol])
 
 

@@ -101,7 +101,15 @@ def test_words_packages_and_views_have_scores_of_their_own(scene: Path, tmp_path
 
 @pytest.mark.parametrize(
     "wrong",
-    ["sweep.values=min_weight:2", "sweep.rounds=0", "sweep.values=views:-1", "sweep.values=energy:0", "stages=[]"],
+    [
+        "sweep.values=min_weight:2",
+        "sweep.rounds=0",
+        "sweep.values=views:-1",
+        "sweep.values=energy:0",
+        "stages=[]",
+        "budget.error=-1",
+        "budget.seconds=0",
+    ],
 )
 def test_what_is_out_of_range_is_refused(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: str

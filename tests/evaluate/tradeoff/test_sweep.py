@@ -14,7 +14,7 @@ from gsencoder.core.runtime.peak_memory import Growth
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig
 from gsencoder.evaluate.tradeoff.measure import interleaved, measure
 from gsencoder.evaluate.tradeoff.records import RECORDS_FILE, Record, Records, Timing
-from gsencoder.evaluate.tradeoff.results import estimate, mark_front, pick_within, summarize
+from gsencoder.evaluate.tradeoff.results import estimate, estimate_difference, mark_front, pick_within, summarize
 from gsencoder.evaluate.tradeoff.stage import Judged, Score
 from gsencoder.evaluate.tradeoff.sweep import SweepConfig, check_sweep, settings_of, sweep_stage
 
@@ -87,10 +87,18 @@ def test_a_line_that_a_kill_cut_off_is_measured_again_and_a_damaged_one_refused(
 
 
 def test_measurements_of_another_sweep_are_not_mixed_in(tmp_path: Path) -> None:
-    Records(tmp_path, {"scenes": 1})
-    Records(tmp_path, {"scenes": 1})
+    timing = Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0)
+    Records(tmp_path, {"scenes": 1}).add_timing("fusion", "a", {}, timing)
+    assert len(Records(tmp_path, {"scenes": 1})) == 1
     with pytest.raises(InputError, match="holds measurements of a sweep with other settings; give resume=false"):
         Records(tmp_path, {"scenes": 2})
+
+
+def test_a_sweep_that_measured_nothing_leaves_nothing_and_does_not_stand_in_the_way_of_another(tmp_path: Path) -> None:
+    Records(tmp_path, {"scenes": 1})
+    assert list(tmp_path.iterdir()) == []
+    Records(tmp_path, {"scenes": 2}).add_timing("fusion", "a", {}, Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0))
+    assert len(Records(tmp_path, {"scenes": 2})) == 1
 
 
 def test_numbers_that_are_not_finite_survive_the_file(tmp_path: Path) -> None:
@@ -121,10 +129,12 @@ def test_one_knob_is_changed_at_a_time_and_the_base_comes_first() -> None:
 @pytest.mark.parametrize(
     ("sweep", "message"),
     [
-        (SweepConfig(knobs=("rays",)), "^knobs: 'rays' is no knob of fusion; expected some of effort, color"),
-        (SweepConfig(values=("rays:1",)), "^values: 'rays' is no knob"),
-        (SweepConfig(values=("effort:1", "effort:2")), "^values: effort is given twice"),
-        (SweepConfig(values=("effort",)), "^values: expected KNOB:VALUE/VALUE, got 'effort'"),
+        (SweepConfig(knobs=("rays",)), "^sweep.knobs: 'rays' is no knob of fusion; expected some of effort, color"),
+        (SweepConfig(values=("rays:1",)), "^sweep.values: 'rays' is no knob"),
+        (SweepConfig(values=("effort:1", "effort:2")), "^sweep.values: effort is given twice"),
+        (SweepConfig(values=("effort",)), "^sweep.values: expected KNOB:VALUE/VALUE, got 'effort'"),
+        (SweepConfig(values=("effort:",)), "^sweep.values: expected KNOB:VALUE/VALUE, got 'effort:'"),
+        (SweepConfig(knobs=("color",), values=("effort:1",)), "^sweep.values: effort is not among sweep.knobs=color;"),
         (SweepConfig(values=("effort:much",)), "^effort: expected a whole number, got 'much'"),
         (SweepConfig(values=("effort:0",)), "^effort=0: effort: expected 1 or more"),
     ],
@@ -199,6 +209,25 @@ def test_standard_errors_hold_the_truth_as_often_as_they_say() -> None:
         value, error, _ = estimate([Score(float(h), float(n)) for h, n in zip(hits, things, strict=True)])
         inside += abs(value - 0.8) <= 1.96 * error
     assert 0.92 < inside / 1000 < 0.98
+
+
+def test_a_difference_of_scores_has_the_error_of_differences_of_scenes() -> None:
+    base = [Score(3, 4), Score(1, 4), Score(2, 4)]
+    # Every scene gains one thing, so that nothing about the gain is uncertain, whatever the scenes' scores are.
+    assert estimate_difference([Score(4, 4), Score(2, 4), Score(3, 4)], base) == pytest.approx((0.25, 0.0, 12))
+    value, error, _ = estimate_difference([Score(4, 4), Score(0, 4), Score(3, 4)], base)
+    assert value == pytest.approx(1 / 12)
+    assert error == pytest.approx(np.std([0.25, -0.25, 0.25], ddof=1) / np.sqrt(3))
+    assert np.isnan(estimate_difference([Score(3, 4)], [Score(1, 4)]).error)
+    assert np.isnan(estimate_difference([], []).value)
+
+
+def test_differences_are_of_the_scenes_that_both_have_scores_of() -> None:
+    base = [record("a", [1.0], {"acc_25": Score(1, 2)}), record("b", [1.0])]
+    other = [record("b", [1.0], {"acc_25": Score(2, 2)}, views=1), record("a", [1.0], {"acc_25": Score(2, 2)}, views=1)]
+    row = summarize(other, base, "grid").row()
+    assert (row["acc_25_difference"], row["acc_25_things"]) == (0.5, 4)
+    assert "acc_25_difference" not in summarize(base, base, "base").row()
 
 
 def test_the_front_is_drawn_among_settings_of_as_many_scenes() -> None:
